@@ -28,9 +28,9 @@ from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 FINE = 9
-_SPECTRUM = 1e-5  # of a mean over it: a fiftieth of what the fit allows itself
-_MARGIN = 4  # pixels about the window that blur may reach in from
-_TOGETHER = 1_000_000  # fine samples of the frames that are computed together
+_SPECTRUM = 1e-5  # relative error of the mean over the spectrum: 1/50 of the fit's
+_MARGIN = 4  # pixels about the window whose light is blurred into it
+_BLOCK_SAMPLES = 1_000_000  # fine samples of the frames in one computation
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +54,14 @@ class BenchCamera:
 
     def __post_init__(self) -> None:
         top = 2 ** min(max(self.bits, 1), 16) - 2
-        for name, least, most in (
+        for name, least, largest in (
             ("pixels", 4, 4096),
             ("bits", 1, 16),
             ("offset", 0, top),
         ):
-            if not least <= getattr(self, name) <= most:
+            if not least <= getattr(self, name) <= largest:
                 raise FitError(
-                    f"camera.{name} = {getattr(self, name)}: need {least} to {most}"
+                    f"camera.{name} = {getattr(self, name)}: need {least} to {largest}"
                 )
         for name in ("pixel_um", "gain_e"):
             if not 0 < getattr(self, name) < math.inf:
@@ -114,14 +114,20 @@ class HiddenLens:
     @property
     def stated(self) -> tuple[Array, Array]:
         """(n,) stated depths and (n, 2) field angles in rad of all frames."""
-        pairs = [(z, math.radians(a)) for a in self.angles_deg for z in self.depths_um]
-        return np.array([z for z, _ in pairs]), np.array([(a, 0.0) for _, a in pairs])
+        pairs = [
+            (depth, math.radians(angle))
+            for angle in self.angles_deg
+            for depth in self.depths_um
+        ]
+        return np.array([depth for depth, _ in pairs]), np.array(
+            [(angle, 0.0) for _, angle in pairs]
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SimulatedFrames:
-    """What the bench hands over: frames, dark, flat (counts), and the noise-free
-    electrons that the fit never sees.
+    """Output of the bench: (n, y, x) frames, dark and flat in counts, and the frames'
+    noise-free electrons, which the fit does not get.
     """
 
     frames: Array
@@ -133,35 +139,44 @@ class SimulatedFrames:
 def simulate_frames(
     lens: Lens, truth: HiddenLens, response: Sensitivity
 ) -> SimulatedFrames:
-    """Frames with noise; the same seed gives the same frames.
+    """Simulated frames, dark frames and flats with noise, in counts; reproducible by
+    the seed.
 
     Args:
         lens: the design.
         truth: the hidden lens and its captures.
         response: what height, index and sidewall do to the pillars.
     """
-    random = np.random.default_rng(truth.seed)
+    generator = np.random.default_rng(truth.seed)
     light = bench_irradiance(lens, truth, response)
     electrons = light * (truth.peak_e / light.max()) + background_plane(truth)
     camera = truth.camera
-    hot = random.random(electrons.shape[1:]) < camera.hot_share
-    frames = np.stack([_read(frame, camera, random, hot) for frame in electrons])
-    nothing = np.zeros(electrons.shape[1:])
-    half = np.full(
+    hot = generator.random(electrons.shape[1:]) < camera.hot_share
+    frames = np.stack([_read(frame, camera, generator, hot) for frame in electrons])
+    no_light = np.zeros(electrons.shape[1:])
+    half_range = np.full(
         electrons.shape[1:], 0.5 * (2**camera.bits - camera.offset) * camera.gain_e
     )
     dark = np.stack(
-        [_read(nothing, camera, random, hot) for _ in range(max(truth.dark_frames, 1))]
+        [
+            _read(no_light, camera, generator, hot)
+            for _ in range(max(truth.dark_frames, 1))
+        ]
     )
     flat = np.stack(
-        [_read(half, camera, random, hot) for _ in range(max(truth.flat_frames, 2))]
+        [
+            _read(half_range, camera, generator, hot)
+            for _ in range(max(truth.flat_frames, 2))
+        ]
     )
     return SimulatedFrames(frames, dark, flat, electrons)
 
 
 def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Array:
-    """(n, y, x) noise-free light in the pixels, in units of its own; background left
-    out.
+    """(n, y, x) noise-free light in the pixels without background, in arbitrary units.
+
+    Sum over the lines of the spectrum, each by the sum over all pillars, divided by the
+    square of the apparent source distance.
 
     Args:
         lens: the design.
@@ -170,28 +185,36 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
     """
     x = truth.vector()
     stated, angles = truth.stated
-    middle = float(stated.mean())
+    mean_depth = float(stated.mean())
     depth = (
-        stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - middle)
+        stated
+        + x[PLACE["stage_zero_um"]]
+        + x[PLACE["stage_scale"]] * (stated - mean_depth)
     )
     if depth.min() <= 0:
         raise FitError(
             f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens"
         )
-    random = np.random.default_rng(truth.seed + 1)
-    noise = random.standard_normal(lens.diameters.diameter_um.shape)
+    generator = np.random.default_rng(truth.seed + 1)
+    noise = generator.standard_normal(lens.diameters.diameter_um.shape)
     noise_um = noise * (truth.diameter_noise_nm * 1e-3)
     frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
-    line = SpectralLine.of(lens, depth, angles, tolerance=_SPECTRUM)
-    for offset_nm, weight in line.colours(x[PLACE["bandwidth_nm"]]):
+    source = SpectralLine.of(lens, depth, angles, tolerance=_SPECTRUM)
+    for offset_nm, weight in source.colours(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
-        for way, index in _alike(lens, truth, colour, depth, angles):
-            t = made.as_built_transmission(
-                lens, response, colour, noise_um=noise_um, angle_rad=way.incidence_rad
+        for incidence, index in _frame_groups(lens, truth, colour, depth, angles):
+            transmission = made.as_built_transmission(
+                lens,
+                response,
+                colour,
+                noise_um=noise_um,
+                angle_rad=incidence.incidence_rad,
             )
-            seen = _frames(lens, truth, colour, t, way, depth[index])
-            frames[index] += weight * seen
+            irradiance = _irradiance(
+                lens, truth, colour, transmission, incidence, depth[index]
+            )
+            frames[index] += weight * irradiance
     return np.asarray(
         frames
         / FilmStack.of(lens.layers, lens.wavelength_um).apparent_um(
@@ -202,9 +225,9 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
-    """How light comes in and where the window lies: tangents (x, y) of the source,
-    window off its chief ray, um.
+class _Incidence:
+    """Incidence of a frame: tangents (x, y) of the source direction, shift of the
+    window from the chief ray, um, and angle of incidence.
     """
 
     source: tuple[float, float]
@@ -212,102 +235,130 @@ class _Way:
     incidence_rad: float
 
 
-def _alike(
+def _frame_groups(
     lens: Lens, truth: HiddenLens, x: Array, depth_um: Array, angles_rad: Array
-) -> Iterator[tuple[_Way, list[int]]]:
-    """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold;
-    through glass one by one.
+) -> Iterator[tuple[_Incidence, list[int]]]:
+    """(incidence, frame numbers) of groups of frames with equal incidence.
+
+    A group has at most ``_BLOCK_SAMPLES`` fine samples, and one frame where light
+    passes a glass plate.
+
+    Args:
+        x: (p,) true parameters.
+        depth_um: (n,) true source depths.
+        angles_rad: (n, 2) stated field angles.
     """
     distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
     films = FilmStack.of(lens.layers, lens.wavelength_um)
-    ways: dict[_Way, list[int]] = {}
-    for i, (z, angle) in enumerate(
+    groups: dict[_Incidence, list[int]] = {}
+    for i, (depth, angle) in enumerate(
         zip(depth_um.tolist(), angles_rad.tolist(), strict=True)
     ):
         chief = [
-            math.tan(a) + math.tan(math.radians(x[PLACE[f"tilt_{n}_deg"]]))
-            for a, n in zip(angle, "xy", strict=True)
+            math.tan(axis_angle) + math.tan(math.radians(x[PLACE[f"tilt_{axis}_deg"]]))
+            for axis_angle, axis in zip(angle, "xy", strict=True)
         ]
         source = [
-            c - x[PLACE[f"source_{a}_um"]] / films.apparent_um(z)
-            for c, a in zip(chief, "xy", strict=True)
+            c - x[PLACE[f"source_{axis}_um"]] / films.apparent_um(depth)
+            for c, axis in zip(chief, "xy", strict=True)
         ]
-        ends = zip(
-            *(films.chief_um(distance, (one[0], one[1])) for one in (chief, source)),
+        crossings = zip(
+            *(
+                films.chief_um(distance, (direction[0], direction[1]))
+                for direction in (chief, source)
+            ),
             strict=True,
         )
         shift = [
-            c - s + x[PLACE[f"decentre_{a}_um"]]
-            for (c, s), a in zip(ends, "xy", strict=True)
+            c - s + x[PLACE[f"decentre_{axis}_um"]]
+            for (c, s), axis in zip(crossings, "xy", strict=True)
         ]
-        incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
-        ways.setdefault(
-            _Way((source[0], source[1]), (shift[0], shift[1]), incidence), []
+        incidence_angle = incidence_rad(lens.proxy, [math.atan(s) for s in source])
+        groups.setdefault(
+            _Incidence((source[0], source[1]), (shift[0], shift[1]), incidence_angle),
+            [],
         ).append(i)
-    fine = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
-    most = 1 if x[PLACE["glass_um"]] else max(1, _TOGETHER // fine)
-    for way, index in ways.items():
-        for first in range(0, len(index), most):
-            yield way, index[first : first + most]
+    samples = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
+    block_size = 1 if x[PLACE["glass_um"]] else max(1, _BLOCK_SAMPLES // samples)
+    for incidence, index in groups.items():
+        for first in range(0, len(index), block_size):
+            yield incidence, index[first : first + block_size]
 
 
-def _frames(
-    lens: Lens, truth: HiddenLens, x: Array, t: Array, way: _Way, depth_um: Array
+def _irradiance(
+    lens: Lens,
+    truth: HiddenLens,
+    x: Array,
+    transmission: Array,
+    incidence: _Incidence,
+    depth_um: Array,
 ) -> Array:
-    """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
+    """(n, y, x) light in the pixels at one wavelength: sum over every pillar, then
+    blur, then pixels.
+
+    Args:
+        x: (p,) true parameters at this wavelength.
+        transmission: (y, x) complex transmission of the pillars.
+        incidence: direction of the light and shift of the window.
+        depth_um: (n,) source depths.
+    """
     camera = truth.camera
     distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
     wavelength_um = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
-    across, down = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
-    uneven = x[[PLACE[name] for name in LIGHT]]
-    if uneven.any():
+    x_um, y_um = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
+    unevenness = x[[PLACE[name] for name in LIGHT]]
+    if unevenness.any():
         radius = lens.diameters.radius_um
-        t = t * np.exp(
-            np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2
+        transmission = transmission * np.exp(
+            np.tensordot(unevenness, light_maps(x_um / radius, y_um / radius), 1) / 2
         )
     films = FilmStack.of(lens.layers, wavelength_um)
-    near, far = films.reduced_um(distance), films.apparent_um(depth_um)
+    image_distance = films.reduced_um(distance)
+    source_distances = films.apparent_um(depth_um)
     if x[PLACE["glass_um"]]:
         path = extra_path(
-            across, down, tangents=way.source, depth_um=float(far[0]), values=x
+            x_um,
+            y_um,
+            tangents=incidence.source,
+            depth_um=float(source_distances[0]),
+            values=x,
         )
-        t = t * np.exp(2j * math.pi / wavelength_um * path)
+        transmission = transmission * np.exp(2j * math.pi / wavelength_um * path)
     side = camera.pixels + 2 * _MARGIN
     stack = psf.psf_stack(
-        np.angle(t),
-        np.abs(t),
+        np.angle(transmission),
+        np.abs(transmission),
         **lens.diameters.grid._asdict(),
         wavelength_um=wavelength_um,
         sensor_distance_um=distance,
         depths_um=depth_um,
-        angle_rad=(math.atan(way.source[0]), math.atan(way.source[1])),
+        angle_rad=(math.atan(incidence.source[0]), math.atan(incidence.source[1])),
         window_um=side * camera.pixel_um,
         samples=side * FINE,
         tolerance=1e-5,
-        offset_um=way.shift_um,
+        offset_um=incidence.shift_um,
         layers=lens.layers,
     )
-    step, out = camera.pixel_um / FINE, []
-    for light, energy, z in zip(stack.intensity, stack.energy_um2, far, strict=True):
-        disc_px = x[PLACE["pinhole_um"]] * near / z / step
+    step_um = camera.pixel_um / FINE
+    frames = []
+    for light, energy, source_distance in zip(
+        stack.intensity, stack.energy_um2, source_distances, strict=True
+    ):
+        disc_px = x[PLACE["pinhole_um"]] * image_distance / source_distance / step_um
         light = _cell_means(
             _blur(light * energy, disc_px, x[PLACE["crosstalk_px"]] * FINE)
         )
-        out.append(
-            light.reshape(side, FINE, side, FINE).sum((1, 3))[
-                _MARGIN:-_MARGIN, _MARGIN:-_MARGIN
-            ]
-        )
-    return np.stack(out)
+        pixels = light.reshape(side, FINE, side, FINE).sum((1, 3))
+        frames.append(pixels[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
+    return np.stack(frames)
 
 
 def _cell_means(light: Array) -> Array:
-    """Means over fine cells from samples at their middles, f + h² f'' / 24 along each
-    axis; the rest is of order h⁴.
+    """Means over fine cells from samples at their middles: f + h² f'' / 24 along each
+    axis, to order h⁴.
 
-    Sums of the samples themselves would make light of f cycles/um too strong by (pi f
-    h)² / 6 in a pixel: 0.3 % of the
-    peak for a lens of NA 0.24 on 3 um pixels.
+    The samples themselves would be too strong by (pi f h)² / 6 at a frequency f: 0.3 %
+    of the peak for a lens of NA 0.24 on 3 um pixels.
     """
     for axis in (-2, -1):
         light = ndimage.convolve1d(
@@ -317,11 +368,18 @@ def _cell_means(light: Array) -> Array:
 
 
 def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:
+    """(y, x) light convolved with a uniform disc of a diameter, then with a Gaussian of
+    a standard deviation, both in samples.
+    """
     if disc_px > 0.2:
-        reach = math.ceil(disc_px / 2) + 1
-        fine = (np.arange((2 * reach + 1) * 8) - ((2 * reach + 1) * 8 - 1) / 2) / 8
-        inside = (fine[:, None] ** 2 + fine**2 <= disc_px**2 / 4).astype(float)
-        kernel = inside.reshape(2 * reach + 1, 8, 2 * reach + 1, 8).sum((1, 3))
+        half_width = math.ceil(disc_px / 2) + 1
+        offsets = (
+            np.arange((2 * half_width + 1) * 8) - ((2 * half_width + 1) * 8 - 1) / 2
+        ) / 8
+        inside = (offsets[:, None] ** 2 + offsets**2 <= disc_px**2 / 4).astype(float)
+        kernel = inside.reshape(2 * half_width + 1, 8, 2 * half_width + 1, 8).sum(
+            (1, 3)
+        )
         light = signal.fftconvolve(light, kernel / kernel.sum(), mode="same")
     return np.asarray(
         ndimage.gaussian_filter(light, gauss_px, truncate=6) if gauss_px > 0 else light
@@ -334,24 +392,25 @@ def background_plane(truth: HiddenLens) -> Array:
     Args:
         truth: the hidden lens and its captures.
     """
-    x, camera = truth.vector(), truth.camera
+    x = truth.vector()
+    camera = truth.camera
     n = camera.pixels
-    edge = (np.arange(n) - (n - 1) / 2) / (n / 2)
+    coordinate = (np.arange(n) - (n - 1) / 2) / (n / 2)
     plane = (
         x[PLACE["background_e"]]
-        + x[PLACE["background_x_e"]] * edge
-        + x[PLACE["background_y_e"]] * edge[:, None]
+        + x[PLACE["background_x_e"]] * coordinate
+        + x[PLACE["background_y_e"]] * coordinate[:, None]
     )
     return np.asarray(np.maximum(plane, 0))
 
 
 def _read(
-    electrons: Array, camera: BenchCamera, random: np.random.Generator, hot: Array
+    electrons: Array, camera: BenchCamera, generator: np.random.Generator, hot: Array
 ) -> Array:
     """Counts of one read-out: photon noise, read noise, offset, quantisation, clipping."""
     top = 2**camera.bits - 1
-    seen = random.poisson(np.maximum(electrons, 0)) + random.normal(
+    signal = generator.poisson(np.maximum(electrons, 0)) + generator.normal(
         0, camera.read_noise_e, electrons.shape
     )
-    counts = np.clip(np.round(seen / camera.gain_e + camera.offset), 0, top)
+    counts = np.clip(np.round(signal / camera.gain_e + camera.offset), 0, top)
     return np.asarray(np.where(hot, 0.97 * top, counts).astype(np.uint16))

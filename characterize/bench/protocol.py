@@ -1,5 +1,5 @@
-"""Which frames to take: source depths, field angles and exposures that tell most about
-the lens (optimal design).
+"""Optimal design of captures: source depths, field angles and exposures of most Fisher
+information on the lens.
 """
 
 import math
@@ -34,11 +34,10 @@ from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 REACH = uncertainty.REACH
-# depths and angles, from which on a fit is tested on frames left out; one frame is
-# refused
+# (depth, angle) pairs that a fit needs to be tested on frames left out
 _LEAST_PLACES = 4
-# at the rim: below, images are those of the focus, in which even errors act in second
-# order
+# defocus at the rim below which images count as in focus: there, even errors change
+# them in second order only
 _DEFOCUS_WAVES = 0.5
 
 
@@ -99,8 +98,8 @@ class BenchProtocol:
     wanted: tuple[IntervalRequirement, ...] = ()
 
     def __post_init__(self) -> None:
-        near, far = self.depths_um
-        if not (0 < near < far and self.depth_count >= 2 and self.frames >= 1):
+        nearest, farthest = self.depths_um
+        if not (0 < nearest < farthest and self.depth_count >= 2 and self.frames >= 1):
             raise FitError(
                 f"depths_um {self.depths_um}, depth_count {self.depth_count}, frames {self.frames}: need "
                 "0 < nearest < farthest, two depths or more and one frame or more"
@@ -118,16 +117,15 @@ class BenchProtocol:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CapturePlan:
-    """Frames to take, in the order of what each adds.
+    """Frames to take, the most informative first, with expected standard errors.
 
-    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,)
-    expected standard errors with them,
-    within the model. untold: (p,) standard deviation of what causes that nobody states
-    may add.
-    even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and
-    the first angle.
-    gain: (n,) criterion after each frame, relative to the last (1 at the end).
-    warnings: what these frames will not tell, in words.
+    depth_um, angle_deg, exposure: (n,) of the frames.
+    names, sigma: (p,) parameters and their standard errors within the model.
+    even_sigma: (p,) standard errors with as many frames evenly spread over the depths,
+    at the first exposure and angle.
+    untold: (p,) standard deviation by causes that nobody states.
+    gain: (n,) criterion after each frame over that after the last.
+    warnings: sentences on what these frames leave open.
     """
 
     depth_um: Array
@@ -144,14 +142,18 @@ class CapturePlan:
 def plan_captures(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity
 ) -> CapturePlan:
-    """D-optimal capture plan of a lens: the frames of most Fisher information, with the
-    expected intervals.
+    """Optimal capture plan of a lens: the frames of most Fisher information, with the
+    expected standard errors.
+
+    Frames are chosen by :func:`choose_frames` and cut to those that the required
+    intervals need. Standard errors are sqrt(diag((prior + sum of information)^-1)).
 
     Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change
     the weights in second order.
 
     Args:
-        protocol: what the bench can do.
+        lens: the design.
+        protocol: range of the bench and aim of the plan.
         response: what height, index and sidewall do to the pillars.
 
     Raises:
@@ -159,23 +161,28 @@ def plan_captures(
     """
     names, prior = _parameters(lens, protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
-    place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
+    place_of = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
     chosen = choose_frames(
         information,
         prior,
         protocol.frames,
         criterion=protocol.criterion,
         names=names,
-        place=place,
+        place=place_of,
     )
-    unstated = _unstated(lens, protocol, response, candidates[chosen])
-    wanted = _left(names, unstated.sigma, protocol.wanted)
+    unstated = _unstated_shifts(lens, protocol, response, candidates[chosen])
+    requirements = _remaining_requirements(names, unstated.sigma, protocol.wanted)
     chosen = chosen[
-        : _needed(
-            information, prior, chosen, names, wanted, least=_least(candidates[chosen])
+        : _sufficient_count(
+            information,
+            prior,
+            chosen,
+            names,
+            requirements,
+            least=_least_count(candidates[chosen]),
         )
     ]
-    even = _even(candidates, protocol, len(chosen))
+    even = _even_frames(candidates, protocol, len(chosen))
     values = [
         design_criterion(
             prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names
@@ -183,28 +190,32 @@ def plan_captures(
         for i in range(len(chosen))
     ]
     covariances = [
-        invert_information(prior + information[pick].sum(0)) for pick in (chosen, even)
+        invert_information(prior + information[frames].sum(0))
+        for frames in (chosen, even)
     ]
-    sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
+    sigma, even_sigma = (np.sqrt(np.diag(covariance)) for covariance in covariances)
     depth, angle, exposure = candidates[chosen].T
-    words = (
-        *_short(names, sigma, unstated, protocol.wanted, len(chosen)),
-        *_few(candidates[chosen]),
-        *_blind(lens, protocol, depth),
+    warnings = (
+        *_missed_requirements(names, sigma, unstated, protocol.wanted, len(chosen)),
+        *_place_warnings(candidates[chosen]),
+        *_focus_warnings(lens, protocol, depth),
     )
     gain = np.array(values) / values[-1]
     return CapturePlan(
-        depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, words
+        depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, warnings
     )
 
 
-def _unstated(
+def _unstated_shifts(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
 ) -> UnmodelledShifts:
-    """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as
-    asked for, will allow for.
+    """Expected shifts of the parameters by causes outside the model, for a fit of
+    frames of peak ``peak_e``.
+
+    Args:
+        frames: (n, 3) depth in um, angle in degrees, relative exposure.
     """
-    known = {k.name: k for k in protocol.known}
+    known = {value.name: value for value in protocol.known}
     sizes = unfitted_sizes(known, lens)
     angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
     setting = FrameSetting(
@@ -216,12 +227,13 @@ def _unstated(
         protocol.pixels,
     )
     model = ForwardModel(lens, setting, response)
-    x = parameter_vector({name: k.value for name, k in known.items()})
+    x = parameter_vector({name: value.value for name, value in known.items()})
     brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
     image = model.images(x)[0]
-    full, ones = image >= protocol.full_well_e, np.ones_like(image)
-    data = FitImages(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
+    saturated = image >= protocol.full_well_e
+    ones = np.ones_like(image)
+    data = FitImages(image, ones > 0, saturated, ones * protocol.read_noise_e**2, ones)
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
@@ -230,145 +242,176 @@ def _unstated(
     )
 
 
-def _left(
-    names: tuple[str, ...], untold: Array, wanted: Sequence[IntervalRequirement]
+def _remaining_requirements(
+    names: tuple[str, ...],
+    unstated_sigma: Array,
+    requirements: Sequence[IntervalRequirement],
 ) -> list[IntervalRequirement]:
-    """What the model's own errors may take of the wanted intervals; all where what
-    is unstated takes more.
+    """Required intervals less the unstated causes: sqrt(within² - (REACH sigma)²).
+
+    Unchanged where the unstated causes alone exceed the interval.
+
+    Args:
+        unstated_sigma: (p,) standard deviation by unstated causes.
     """
-    left = []
-    for one in wanted:
-        beside = (
-            REACH * float(untold[names.index(one.name)]) if one.name in names else 0.0
+    remaining = []
+    for requirement in requirements:
+        unstated = (
+            REACH * float(unstated_sigma[names.index(requirement.name)])
+            if requirement.name in names
+            else 0.0
         )
-        rest = one.within**2 - beside**2
-        left.append(IntervalRequirement(one.name, math.sqrt(rest)) if rest > 0 else one)
-    return left
+        variance = requirement.within**2 - unstated**2
+        remaining.append(
+            IntervalRequirement(requirement.name, math.sqrt(variance))
+            if variance > 0
+            else requirement
+        )
+    return remaining
 
 
-def _least(frames: Array) -> int:
-    """How many of (n, 3) frames, in their order, lie at ``_LEAST_PLACES`` depths and
-    angles; all where none do.
+def _least_count(frames: Array) -> int:
+    """Number of leading frames that lie at ``_LEAST_PLACES`` pairs of depth and angle;
+    all frames where there are fewer pairs.
     """
     places = [
-        len({tuple(place) for place in frames[: n + 1, :2].tolist()})
-        for n in range(len(frames))
+        len({tuple(place) for place in frames[: number + 1, :2].tolist()})
+        for number in range(len(frames))
     ]
     return next(
-        (n + 1 for n, count in enumerate(places) if count >= _LEAST_PLACES), len(frames)
+        (number + 1 for number, count in enumerate(places) if count >= _LEAST_PLACES),
+        len(frames),
     )
 
 
-def _needed(
+def _sufficient_count(
     information: Array,
     prior: Array,
     chosen: list[int],
     names: tuple[str, ...],
-    wanted: Sequence[IntervalRequirement],
+    requirements: Sequence[IntervalRequirement],
     *,
     least: int,
 ) -> int:
-    """How many of the chosen frames, in their order, give all intervals that are
-    wanted; all of them where none do.
+    """Number of leading chosen frames that reach all required intervals, at least
+    ``least``; all frames where they do not reach them.
+
+    Args:
+        information: (candidates, p, p) of each frame.
+        prior: (p, p) information known beforehand.
     """
-    places = [(names.index(w.name), w.within) for w in wanted if w.name in names]
-    if not places:
+    limits = [
+        (names.index(requirement.name), requirement.within)
+        for requirement in requirements
+        if requirement.name in names
+    ]
+    if not limits:
         return len(chosen)
     for count in range(least, len(chosen)):
         sigma = np.sqrt(
             np.diag(invert_information(prior + information[chosen[:count]].sum(0)))
         )
-        if all(REACH * sigma[i] <= within for i, within in places):
+        if all(REACH * sigma[index] <= within for index, within in limits):
             return count
     return len(chosen)
 
 
-def _short(
+def _missed_requirements(
     names: tuple[str, ...],
     sigma: Array,
     unstated: UnmodelledShifts,
-    wanted: Sequence[IntervalRequirement],
+    requirements: Sequence[IntervalRequirement],
     count: int,
 ) -> list[str]:
-    """Intervals that are wanted and not reached, with the light that they would take,
-    or what must be stated.
+    """Sentences on required intervals that are not reached: by how much more light, or
+    which causes to state.
+
+    Args:
+        sigma: (p,) standard errors within the model.
+        count: number of chosen frames.
     """
-    words = []
-    for one in wanted:
-        if one.name not in names:
-            words.append(
-                f"{one.name} is held, not fitted: no frame changes its interval"
+    sentences = []
+    for requirement in requirements:
+        if requirement.name not in names:
+            sentences.append(
+                f"{requirement.name} is held, not fitted: no frame changes its interval"
             )
             continue
-        i = names.index(one.name)
-        own = REACH * float(sigma[i])
-        untold = REACH * float(unstated.sigma[i])
-        expected = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
-        if untold >= one.within:
-            most = [
-                unstated.causes[k] for k in np.argsort(-unstated.by_cause[:, i])[:3]
+        index = names.index(requirement.name)
+        within_model = REACH * float(sigma[index])
+        unstated_half = REACH * float(unstated.sigma[index])
+        total = math.hypot(within_model, unstated_half)
+        expected = f"{requirement.name} will be known to +- {total:.2g}, wanted +- {requirement.within:.2g}"
+        if unstated_half >= requirement.within:
+            causes = [
+                unstated.causes[cause]
+                for cause in np.argsort(-unstated.by_cause[:, index])[:3]
             ]
-            words.append(
-                f"{expected}: within the model it is +- {own:.2g}, more frames do not help; state what else there is or is "
-                f"not, first of all {', '.join(most)} (capture.toml, [[known]])"
+            sentences.append(
+                f"{expected}: within the model it is +- {within_model:.2g}, more frames do not help; state what else there "
+                f"is or is not, first of all {', '.join(causes)} (capture.toml, [[known]])"
             )
-        elif math.hypot(own, untold) > one.within * (1 + 1e-9):
-            more = own**2 / (one.within**2 - untold**2)
-            words.append(
-                f"{expected}: {more:.1f} times the light "
-                f"({math.ceil(count * more)} such frames), other depths or angles, or an independent measurement"
+        elif total > requirement.within * (1 + 1e-9):
+            light_factor = within_model**2 / (requirement.within**2 - unstated_half**2)
+            sentences.append(
+                f"{expected}: {light_factor:.1f} times the light "
+                f"({math.ceil(count * light_factor)} such frames), other depths or angles, or an independent measurement"
             )
-    return words
+    return sentences
 
 
-def _few(frames: Array) -> list[str]:
-    """That (n, 3) frames lie at too few depths and angles for a fit to test itself, or
-    for one at all.
+def _place_warnings(frames: Array) -> list[str]:
+    """Warning that (n, 3) frames lie at fewer than ``_LEAST_PLACES`` pairs of depth and
+    angle; empty otherwise.
     """
     places = len({tuple(place) for place in frames[:, :2].tolist()})
     if places >= _LEAST_PLACES:
         return []
-    fate = "is refused" if places == 1 else "cannot be tested on frames left out"
+    consequence = "is refused" if places == 1 else "cannot be tested on frames left out"
     return [
-        f"frames at {places} of the depths and angles: a fit of fewer than {2 if places == 1 else 4} {fate}; "
+        f"frames at {places} of the depths and angles: a fit of fewer than {2 if places == 1 else 4} {consequence}; "
         "allow more frames"
     ]
 
 
-def _blind(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> list[str]:
-    """Ranges of depth whose images hide what is to be found: all in focus, or on one
-    side of it.
+def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> list[str]:
+    """Warning that all frames are in focus, or all on one side of it; empty otherwise.
+
+    Defocus at the rim in waves: radius² / 2 * |1/z - 1/z_focus| / wavelength.
     """
     focus = lens.source_distance_um
     if not (math.isfinite(focus) and focus > 0):
         return []
-    ends = np.array([*protocol.depths_um, chosen_um.min(), chosen_um.max()])
+    extremes = np.array([*protocol.depths_um, chosen_um.min(), chosen_um.max()])
     waves = (
         lens.diameters.radius_um**2
         / 2
-        * np.abs(1 / ends - 1 / focus)
+        * np.abs(1 / extremes - 1 / focus)
         / lens.wavelength_um
     )
-    words = []
+    sentences = []
     if waves.max() < _DEFOCUS_WAVES:
-        words.append(
+        sentences.append(
             f"all depths are in focus (defocus of {waves.max():.2g} waves at most): a symmetric lens in focus fixes "
             "its bias, height and even aberrations poorly; go on to half a wave or more on both sides"
         )
     elif chosen_um.min() > focus or chosen_um.max() < focus:
         side = "farther" if chosen_um.min() > focus else "nearer"
-        words.append(
+        sentences.append(
             f"all frames are {side} than the focus at {focus:.4g} um: the signs of astigmatism, of spherical "
             "aberration and of the bias hang on defocus alone; take some on the other side"
         )
-    return words
+    return sentences
 
 
 def candidate_information(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity, names: tuple[str, ...]
 ) -> tuple[Array, Array]:
-    """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every
-    candidate frame.
+    """((c, 3) depth in um, angle in degrees, exposure; (c, p, p) Fisher information) of
+    every candidate frame.
+
+    Information: sum over unsaturated pixels of t² dI/dp dI/dq / (t I + read noise²),
+    with image I in electrons at exposure 1 and relative exposure t.
 
     Args:
         lens: the design.
@@ -376,9 +419,11 @@ def candidate_information(
         response: what height, index and sidewall do to the pillars.
         names: of the parameters.
     """
-    near, far = protocol.depths_um
-    depths = 1 / np.linspace(1 / near, 1 / far, protocol.depth_count)
-    pairs = np.array([(z, a) for a in protocol.angles_deg for z in depths])
+    nearest, farthest = protocol.depths_um
+    depths = 1 / np.linspace(1 / nearest, 1 / farthest, protocol.depth_count)
+    pairs = np.array(
+        [(depth, angle) for angle in protocol.angles_deg for depth in depths]
+    )
     angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
     setting = FrameSetting(
         pairs[:, 0],
@@ -389,7 +434,9 @@ def candidate_information(
         protocol.pixels,
     )
     model = ForwardModel(lens, setting, response)
-    x = parameter_vector({k.name: k.value for k in protocol.known if k.name in PLACE})
+    x = parameter_vector(
+        {known.name: known.value for known in protocol.known if known.name in PLACE}
+    )
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
     images, slopes = model.images(x, names)
     if slopes is None:
@@ -418,47 +465,50 @@ def choose_frames(
     names: tuple[str, ...],
     place: Array | None = None,
 ) -> list[int]:
-    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as
-    long as they help.
+    """Indices of ``count`` candidates by greedy choice, then exchanges until none
+    helps; a candidate may be chosen again.
 
-    place: (c,) equal for candidates of one depth and angle; ``_LEAST_PLACES`` of them
-    are kept, where there are so
-    many. An optimum has hardly more places than its model needs, and nothing to test
-    that model with.
+    An optimum has hardly more places than its model has parameters, and none to test
+    the model with. So the first choices go to new places until there are
+    ``_LEAST_PLACES``.
 
     Args:
         information: (candidates, p, p) of each frame.
         prior: (p, p) information known beforehand.
-        criterion: which optimality is asked for.
+        count: frames to choose.
+        criterion: D or A, as :func:`design_criterion`.
         names: (p,) names of the fitted parameters.
+        place: (candidates,) number of the depth and angle; None without that rule.
     """
     chosen: list[int] = []
     total = prior.copy()
-    where = np.arange(len(information)) if place is None else place
-    least = 0 if place is None else min(_LEAST_PLACES, count, len(set(where.tolist())))
+    places = np.arange(len(information)) if place is None else place
+    least = 0 if place is None else min(_LEAST_PLACES, count, len(set(places.tolist())))
 
-    def best(base: Array, others: list[int]) -> int:
-        taken = np.unique(where[others])
-        new = (
-            ~np.isin(where, taken) if len(taken) < least else np.ones(len(where), bool)
+    def best_candidate(base: Array, other_frames: list[int]) -> int:
+        used = np.unique(places[other_frames])
+        allowed = (
+            ~np.isin(places, used) if len(used) < least else np.ones(len(places), bool)
         )
         return int(
             np.argmax(
                 [
-                    design_criterion(base + one, criterion, names) if some else -np.inf
-                    for one, some in zip(information, new, strict=True)
+                    design_criterion(base + candidate, criterion, names)
+                    if is_allowed
+                    else -np.inf
+                    for candidate, is_allowed in zip(information, allowed, strict=True)
                 ]
             )
         )
 
     for _ in range(count):
-        chosen.append(best(total, chosen))
+        chosen.append(best_candidate(total, chosen))
         total = total + information[chosen[-1]]
     for _ in range(10):
         before = list(chosen)
-        for i, old in enumerate(before):
-            base = total - information[old]
-            chosen[i] = best(base, chosen[:i] + chosen[i + 1 :])
+        for i, previous in enumerate(before):
+            base = total - information[previous]
+            chosen[i] = best_candidate(base, chosen[:i] + chosen[i + 1 :])
             total = base + information[chosen[i]]
         if chosen == before:
             break
@@ -468,13 +518,13 @@ def choose_frames(
 def design_criterion(
     information: Array, criterion: str, names: tuple[str, ...]
 ) -> float:
-    """What is to be large: det^(1/p) in typical units (D), or p over the sum of
-    variances in typical units (A).
+    """Figure of merit of a design: det(F)^(1/p) (D), or p / trace(F^-1) (A), with the
+    information F in typical units of the parameters.
 
     Args:
         information: (p, p) of all frames.
-        criterion: which optimality is asked for.
-        names: of the parameters.
+        criterion: D or A.
+        names: (p,) names of the parameters.
     """
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values = np.maximum(np.linalg.eigvalsh(information * np.outer(unit, unit)), 1e-12)
@@ -486,27 +536,30 @@ def design_criterion(
 
 
 def _parameters(lens: Lens, protocol: BenchProtocol) -> tuple[tuple[str, ...], Array]:
-    """Names of what will be fitted, and what is known of it beforehand as (p, p)
-    information.
+    """Names of the fitted parameters, and their (p, p) prior information,
+    diag(sigma^-2).
     """
     known = {k.name: k for k in protocol.known}
-    held = {k.name for k in protocol.known if k.sigma == 0}
-    wanted = (
+    exact = {k.name for k in protocol.known if k.sigma == 0}
+    fitted = (
         {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)
-    )  # the unfitted are in no NAMES
-    names = tuple(name for name in NAMES if name in wanted - held)
+    )  # NAMES has no unfitted ones
+    names = tuple(name for name in NAMES if name in fitted - exact)
     sigma = [
         known[row.name].sigma if row.name in known else row.sigma
         for row in usual_parameters(names, lens)
     ]
-    return names, np.diag([s**-2.0 for s in sigma])
+    return names, np.diag([value**-2.0 for value in sigma])
 
 
-def _even(candidates: Array, protocol: BenchProtocol, count: int) -> list[int]:
-    usual = np.flatnonzero(
+def _even_frames(candidates: Array, protocol: BenchProtocol, count: int) -> list[int]:
+    """Indices of ``count`` candidates evenly spread over the depths, at the first angle
+    and exposure.
+    """
+    plain = np.flatnonzero(
         (candidates[:, 1] == protocol.angles_deg[0])
         & (candidates[:, 2] == protocol.exposures[0])
     )
     return [
-        int(usual[i]) for i in np.linspace(0, len(usual) - 1, count).round().astype(int)
+        int(plain[i]) for i in np.linspace(0, len(plain) - 1, count).round().astype(int)
     ]

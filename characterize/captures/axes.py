@@ -53,10 +53,10 @@ def frames_first(
         return stack, ""
     first, second, last = stack.shape[:3]
     if order == "yxn":
-        return _moved(stack, path, "as stated")
+        return _last_to_first(stack, path, "as stated")
     if count is not None:
         if count == last != first:
-            return _moved(stack, path, f"since {count} frames of it are listed")
+            return _last_to_first(stack, path, f"since {count} frames of it are listed")
         return stack, ""
     if last < min(first, second):
         raise CaptureError(
@@ -86,11 +86,12 @@ def as_large(
         return all(abs(a - pitch * b) < pitch for a, b in zip(shape, size, strict=True))
 
     if stack.ndim >= 3 and not fits(stack.shape[1:3]) and fits(stack.shape[:2]):
-        return _moved(stack, path, "since frames are as large")
+        return _last_to_first(stack, path, "since frames are as large")
     return stack, ""
 
 
-def _moved(stack: Array, path: Path, why: str) -> tuple[Array, str]:
+def _last_to_first(stack: Array, path: Path, why: str) -> tuple[Array, str]:
+    """A (y, x, n) stack as (n, y, x), and a note."""
     first, second, last = stack.shape[:3]
     name = reading.to_valid_utf8(path.name)
     note = (

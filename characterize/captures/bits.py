@@ -37,16 +37,18 @@ def right_align(
             highest of 16, or are real and above the stated bits; shares of full scale
             of which no counts can be made; unsigned words saved as signed ones.
     """
-    every = [images, *beside]
-    _check_signs(every, where)
+    stacks = [images, *beside]
+    _check_signs(stacks, where)
     note = ""
-    if bits is not None and _is_share(images):
+    if bits is not None and _is_fraction(images):
         scale = _full_scale(images, bits, where)
-        every = [a * scale if _is_share(a) else a for a in every]
+        stacks = [stack * scale if _is_fraction(stack) else stack for stack in stacks]
         note = f"shares of full scale multiplied by {scale}; "
-    counts = [_whole(a) for a in every]
-    whole = [a for a in counts if a.dtype.kind != "f" and a.min() >= 0]
-    if not whole or whole[0] is not counts[0]:
+    counts = [_as_integers(stack) for stack in stacks]
+    integers = [
+        stack for stack in counts if stack.dtype.kind != "f" and stack.min() >= 0
+    ]
+    if not integers or integers[0] is not counts[0]:
         if bits is not None and images.max() >= 1 << bits:
             raise CaptureError(
                 f"{where}: counts are real numbers up to {images.max():.6g}, the "
@@ -55,18 +57,18 @@ def right_align(
             )
         note += "counts are real numbers: taken as they are"
         return counts[0], bits or 16, note, tuple(counts[1:])
-    factor, depth, said = _stretch(whole, bits)
-    if not said:
-        shift, depth, said = _alignment(whole, bits, where)
+    factor, depth, text = _stretch(integers, bits)
+    if not text:
+        shift, depth, text = _alignment(integers, bits, where)
         factor = 0.5**shift
     if factor < 1:
         counts = [
-            np.rint(a * factor).astype(a.dtype)
-            if a.dtype.kind != "f" and a.min() >= 0
-            else a * factor
-            for a in counts
+            np.rint(stack * factor).astype(stack.dtype)
+            if stack.dtype.kind != "f" and stack.min() >= 0
+            else stack * factor
+            for stack in counts
         ]
-    return counts[0], depth, note + said, tuple(counts[1:])
+    return counts[0], depth, note + text, tuple(counts[1:])
 
 
 def _alignment(
@@ -74,65 +76,87 @@ def _alignment(
 ) -> tuple[int, int, str]:
     """(shift to undo, bits of the converter, note in words) of whole counts."""
     used = 0
-    for a in whole:
-        used |= int(np.bitwise_or.reduce(a.astype(np.int64), axis=None))
+    for stack in whole:
+        used |= int(np.bitwise_or.reduce(stack.astype(np.int64), axis=None))
     shift = (used & -used).bit_length() - 1  # -1 where all is dark
-    width, item_bytes = used.bit_length(), whole[0].dtype.itemsize
-    if bits is not None and width <= bits:
+    used_bits = used.bit_length()
+    word_bytes = whole[0].dtype.itemsize
+    if bits is not None and used_bits <= bits:
         return 0, bits, f"{bits} bits as stated"
-    if bits is not None and not 16 - bits <= shift < width <= 16:
+    if bits is not None and not 16 - bits <= shift < used_bits <= 16:
         raise CaptureError(
-            f"{where}: counts use {width - shift} bits above the lowest {shift}, the "
-            f"capture states {bits}; correct bits, or the bit shift"
+            f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, "
+            f"the capture states {bits}; correct bits, or the bit shift"
         )
     if bits is not None:
-        said = f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
-        return 16 - bits, bits, said
-    if shift > 0 and width > 12 and item_bytes == 2:
-        said = f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
-        return shift, 16 - shift, said
-    depth = next((d for d in _DEPTHS if width <= d), 16) if item_bytes > 1 else 8
-    return 0, depth, f"counts of {width} bits: taken as a {depth}-bit converter"
+        text = f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
+        return 16 - bits, bits, text
+    if shift > 0 and used_bits > 12 and word_bytes == 2:
+        text = f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
+        return shift, 16 - shift, text
+    depth = (
+        next(
+            (
+                depth_candidate
+                for depth_candidate in _DEPTHS
+                if used_bits <= depth_candidate
+            ),
+            16,
+        )
+        if word_bytes > 1
+        else 8
+    )
+    return 0, depth, f"counts of {used_bits} bits: taken as a {depth}-bit converter"
 
 
 def _stretch(whole: Sequence[Array], bits: int | None) -> tuple[float, int, str]:
-    """(factor that undoes it, bits, note in words) of counts that are stretched from
-    the stated bits over words of 16; no note where they are not.
+    """(factor, bits, note) that undo a stretch of counts from ``bits`` over 16 bits.
+
+    A stretch repeats the highest bits in the lowest, or multiplies by
+    65535 / (2**bits - 1). The note is empty where there is none.
     """
-    if bits is None or bits >= 16 or any(a.dtype.itemsize != 2 for a in whole):
+    if bits is None or bits >= 16 or any(stack.dtype.itemsize != 2 for stack in whole):
         return 1.0, 0, ""
-    levels = np.unique(np.concatenate([np.unique(a) for a in whole]))
-    step = 65_535 / ((1 << bits) - 1)
-    count = levels >> (16 - bits)
-    repeated = (count << (16 - bits)) | (count >> max(2 * bits - 16, 0))
-    scaled = np.rint(np.rint(levels / step) * step)
-    over = levels[-1] >= 1 << bits
-    if not over or not (
+    levels = np.unique(np.concatenate([np.unique(stack) for stack in whole]))
+    stretch = 65_535 / ((1 << bits) - 1)
+    top_bits = levels >> (16 - bits)
+    repeated = (top_bits << (16 - bits)) | (top_bits >> max(2 * bits - 16, 0))
+    scaled = np.rint(np.rint(levels / stretch) * stretch)
+    exceeds = levels[-1] >= 1 << bits
+    if not exceeds or not (
         np.array_equal(levels, repeated) or np.array_equal(levels, scaled)
     ):
         return 1.0, 0, ""
-    return 1 / step, bits, f"{bits}-bit counts were stretched over 16 bits: taken back"
+    return (
+        1 / stretch,
+        bits,
+        f"{bits}-bit counts were stretched over 16 bits: taken back",
+    )
 
 
-def _check_signs(every: Sequence[Array], where: str) -> None:
+def _check_signs(stacks: Sequence[Array], where: str) -> None:
     """Refuse 16-bit counts that lie in signed words: their brighter half is below 0, or
     all are moved by 32768.
     """
-    least = min(
-        (int(a.min()) for a in every if a.dtype.kind == "i" and a.dtype.itemsize == 2),
+    smallest = min(
+        (
+            int(stack.min())
+            for stack in stacks
+            if stack.dtype.kind == "i" and stack.dtype.itemsize == 2
+        ),
         default=0,
     )
-    if least < _WRAPPED:
+    if smallest < _WRAPPED:
         raise CaptureError(
-            f"{where}: signed counts down to {least}: words of 16 bits without a sign "
-            "that were saved as signed, or with 32768 taken off; save them as unsigned "
+            f"{where}: signed counts down to {smallest}: words of 16 bits without a "
+            "sign that were saved as signed, or with 32768 taken off; save them as unsigned "
             "(uint16)"
         )
 
 
-def _whole(image: Array) -> Array:
-    """Real numbers as the whole counts of up to 16 bits that they are, to the digits of
-    float32; else as they are.
+def _as_integers(image: Array) -> Array:
+    """Real numbers that are integers of up to 16 bits, to the digits of float32, as
+    uint16; others unchanged.
     """
     if (
         image.dtype.kind != "f"
@@ -141,11 +165,11 @@ def _whole(image: Array) -> Array:
     ):
         return image
     counts = np.rint(image)
-    near = np.abs(image - counts).max() < _ROUNDING
-    return counts.astype(np.uint16) if near else image
+    is_integer = np.abs(image - counts).max() < _ROUNDING
+    return counts.astype(np.uint16) if is_integer else image
 
 
-def _is_share(image: Array) -> bool:
+def _is_fraction(image: Array) -> bool:
     """Whether real numbers are shares of full scale: up to 1, and not all 0 or 1."""
     return bool(
         image.dtype.kind == "f"
@@ -155,7 +179,7 @@ def _is_share(image: Array) -> bool:
 
 
 def _full_scale(images: Array, bits: int, where: str) -> int:
-    """What shares of full scale are to be multiplied by."""
+    """Factor from shares of full scale to counts: 2**bits - 1 or 2**bits."""
     shares = np.asarray(images, float)
     for scale in ((1 << bits) - 1, 1 << bits):
         if np.abs(shares * scale - np.rint(shares * scale)).max() < _ROUNDING:

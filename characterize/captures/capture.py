@@ -33,8 +33,8 @@ Stack = tuple[Array, str]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Capture:
-    """Frames of a bench run in counts, right-aligned, and all that was written down
-    with them.
+    """Frames of a bench run in right-aligned counts, with their stage, camera and
+    description.
 
     frames: (n, y, x) counts, +x right, +y down.
     position_um: (n,) of the stage as read (the depth of the source on a lens bench);
@@ -66,19 +66,20 @@ class Capture:
     fill: float = 1.0
 
     def __post_init__(self) -> None:
-        n, shape = len(self.frames), self.frames.shape[1:]
+        n = len(self.frames)
+        shape = self.frames.shape[1:]
         if self.frames.ndim != 3 or n == 0 or min(shape) < 3:
             raise CaptureError(
                 f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3"
             )
-        for name, wanted in (
+        for name, expected_shape in (
             ("position_um", (n,)),
             ("angle_rad", (n, 2)),
             ("exposure_s", (n,)),
         ):
-            if getattr(self, name).shape != wanted:
+            if getattr(self, name).shape != expected_shape:
                 raise CaptureError(
-                    f"{name} has shape {getattr(self, name).shape}, need {wanted} for {n} frames"
+                    f"{name} has shape {getattr(self, name).shape}, need {expected_shape} for {n} frames"
                 )
         for name in ("dark", "flat"):
             image = getattr(self, name)
@@ -96,22 +97,20 @@ class Capture:
 def load(path: str | Path) -> Capture:
     """Read a capture: a TIFF, PNG or HDF5 file, or a folder of them.
 
-    A folder holds frames (named in ``stage.csv`` or ``stage.json``, else every image
-    that is not dark or flat, in
-    the order of their names, numbers counted), and may hold ``dark.tif``, ``flat.tif``
-    and ``capture.toml`` or
-    ``capture.json`` (pixel_um, step_um, wavelength_um, bits, and what else is known;
-    ``voxel_um`` as z, y, x). A single
-    file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its
-    ImageJ or OME tags.
+    A folder holds frames: those of ``stage.csv`` or ``stage.json``, else every image
+    that is not dark or flat, by name (frame_2 before frame_10). It may hold
+    ``dark.tif``, ``flat.tif`` and ``capture.toml`` or ``capture.json`` (pixel_um,
+    step_um, wavelength_um, bits, and others; ``voxel_um`` as z, y, x). A single file
+    has the same entries in ``NAME.toml`` or ``NAME.json``, else in its ImageJ or OME
+    tags.
 
     Args:
         path: the file or folder.
 
     Raises:
-        CaptureError: nothing there, lossy or truncated images, frames of different
-            size, non-finite values,
-            stage rows that do not match the frames; file, row and frame are named.
+        CaptureError: no such path, lossy or truncated images, frames of different size,
+            non-finite values, stage rows that do not match the frames; file, row and
+            frame are named.
     """
     path = Path(path)
     if not path.exists():
@@ -149,10 +148,15 @@ def read_images(path: Path) -> Array:
     return check_images(_PLAIN.pick(read_all(path), path), path)
 
 
-def _stack(
+def _file_frames(
     path: Path, colours: ColourChannels, order: str | None, *, count: int | None = None
 ) -> Stack:
-    """Frames of one file and what to say of their axes."""
+    """(n, y, x) frames of one file in one colour, and a note on their axes.
+
+    Args:
+        order: stated order of the axes, or None.
+        count: number of frames that the stage file lists, or None.
+    """
     images = read_all(path, colours)
     if order is None and path.suffix.lower() in TIFF:
         order = tiff_pages.page_order(path)
@@ -160,8 +164,10 @@ def _stack(
     return check_images(colours.pick(images, path, grey=False), path), note
 
 
-def _beside(path: Path, colours: ColourChannels, size: tuple[int, ...]) -> Stack:
-    """Dark or flat of frames of a size, and what to say of its axes."""
+def _companion_frames(
+    path: Path, colours: ColourChannels, size: tuple[int, ...]
+) -> Stack:
+    """(k, y, x) dark or flat frames for frames of a size, and a note on their axes."""
     images, note = axes.as_large(
         read_all(path, colours), path, size, pitch=colours.pitch
     )
@@ -223,19 +229,24 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
 
 
 def _load_file(path: Path) -> Capture:
-    about = stage.read_beside(path)
-    colours = ColourChannels.of(about, str(path))
-    images, said = _stack(path, colours, axes.stated_axes(about, str(path)))
+    """Capture of a single stack, with the metadata of its TOML file or its tags."""
+    description = stage.read_beside(path)
+    colours = ColourChannels.of(description, str(path))
+    images, axes_note = _file_frames(
+        path, colours, axes.stated_axes(description, str(path))
+    )
     tags = (
         tiff_tags.read_tags(path)
         if path.suffix.lower() in TIFF
         else tiff_tags.TiffTags()
     )
-    images, bits, note, _ = right_align(images, about.pop("bits", None), str(path))
+    images, bits, note, _ = right_align(
+        images, description.pop("bits", None), str(path)
+    )
     n = len(images)
-    step = about.get("step_um", math.nan)
+    step = description.get("step_um", math.nan)
     position = np.arange(n) * step if math.isfinite(step) else tags.position_um
-    notes = [note, *([said] if said else []), *tags.notes, *colours.notes()]
+    notes = [note, *([axes_note] if axes_note else []), *tags.notes, *colours.notes()]
     return Capture(
         images,
         position if len(position) == n else np.full(n, np.nan),
@@ -243,55 +254,61 @@ def _load_file(path: Path) -> Capture:
         np.full(n, np.nan),
         tuple(f"{reading.to_valid_utf8(path.name)}[{i}]" for i in range(n)),
         bits,
-        pixel_um=about.pop("pixel_um", tags.pixel_um) * colours.pitch,
-        wavelength_um=about.pop("wavelength_um", math.nan),
-        about=about,
+        pixel_um=description.pop("pixel_um", tags.pixel_um) * colours.pitch,
+        wavelength_um=description.pop("wavelength_um", math.nan),
+        about=description,
         corrections=tuple(notes),
         fill=1 / colours.pitch,
     )
 
 
-def _load_folder(at: Path) -> Capture:
-    transaction.check_manifest(at)
-    about = stage.read_about(at)
-    rows = stage.read_stage(at)
-    files = folder.list_images(at, TIFF + PNG + HDF5 + LOSSY)
-    special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
-    files = [p for p in files if p not in special.values()]
-    colours = ColourChannels.of(about, str(at))
-    order = axes.stated_axes(about, str(at))
-    said = [
+def _load_folder(path: Path) -> Capture:
+    """Capture of a folder: frames, stage table, description, dark and flat frames."""
+    transaction.check_manifest(path)
+    description = stage.read_about(path)
+    rows = stage.read_stage(path)
+    files = folder.list_images(path, TIFF + PNG + HDF5 + LOSSY)
+    companion_files = {
+        file.stem.lower(): file
+        for file in files
+        if file.stem.lower() in ("dark", "flat")
+    }
+    files = [file for file in files if file not in companion_files.values()]
+    colours = ColourChannels.of(description, str(path))
+    order = axes.stated_axes(description, str(path))
+    texts = [
         *(stage.left_out(files, rows) if rows else ()),
-        *stage.unread_keys_text(about),
-        *folder.unread_images_text(at, special),
+        *stage.unread_keys_text(description),
+        *folder.unread_images_text(path, companion_files),
     ]
     if rows is None:
-        names, frames, notes = _all_frames(files, at, colours, order)
+        names, frames, notes = _all_frames(files, path, colours, order)
         rows = stage.StageRows.unknown(names)
     else:
         frames, notes = _listed_frames(
-            {stage.normalize_spelling(p.name): p for p in files},
-            at,
+            {stage.normalize_spelling(file.name): file for file in files},
+            path,
             rows,
             colours,
             order,
         )
-    beside = {
-        name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()
+    companions = {
+        name: _companion_frames(file, colours, frames.shape[1:])
+        for name, file in companion_files.items()
     }
-    stacks = {name: images for name, (images, _) in beside.items()}
-    said += [
-        words for words in (*notes, *(words for _, words in beside.values())) if words
+    stacks = {name: images for name, (images, _) in companions.items()}
+    texts += [
+        text for text in (*notes, *(text for _, text in companions.values())) if text
     ]
-    bits = about.pop("bits", None)
+    bits = description.pop("bits", None)
     frames, depth, note, aligned = right_align(
-        frames, bits, str(at), beside=tuple(stacks.values())
+        frames, bits, str(path), beside=tuple(stacks.values())
     )
-    extra = dict(zip(stacks, aligned, strict=True))
-    if "step_um" in about and not np.isfinite(rows.position_um).any():
-        folder.check_steps(files if not rows.source else (), at)
+    aligned_companions = dict(zip(stacks, aligned, strict=True))
+    if "step_um" in description and not np.isfinite(rows.position_um).any():
+        folder.check_steps(files if not rows.source else (), path)
         rows = dataclasses.replace(
-            rows, position_um=np.arange(len(frames)) * float(about["step_um"])
+            rows, position_um=np.arange(len(frames)) * float(description["step_um"])
         )
     return Capture(
         frames,
@@ -300,26 +317,28 @@ def _load_folder(at: Path) -> Capture:
         rows.exposure_s,
         rows.files,
         depth,
-        pixel_um=about.pop("pixel_um", math.nan) * colours.pitch,
-        wavelength_um=about.pop("wavelength_um", math.nan),
-        dark=extra.get("dark"),
-        flat=extra.get("flat"),
-        about=about,
-        corrections=(note, *colours.notes(), *said),
+        pixel_um=description.pop("pixel_um", math.nan) * colours.pitch,
+        wavelength_um=description.pop("wavelength_um", math.nan),
+        dark=aligned_companions.get("dark"),
+        flat=aligned_companions.get("flat"),
+        about=description,
+        corrections=(note, *colours.notes(), *texts),
         fill=1 / colours.pitch,
     )
 
 
 def _all_frames(
-    files: Sequence[Path], at: Path, colours: ColourChannels, order: str | None
+    files: Sequence[Path], folder_path: Path, colours: ColourChannels, order: str | None
 ) -> tuple[tuple[str, ...], Array, list[str]]:
-    """Names, frames, and what to say of their axes."""
+    """Names, (n, y, x) frames and notes on the axes of all image files, in order."""
     if not files:
-        raise CaptureError(f"{at}: no frames; need TIFF, PNG or HDF5 images in it")
+        raise CaptureError(
+            f"{folder_path}: no frames; need TIFF, PNG or HDF5 images in it"
+        )
     names: list[str] = []
     stacks, notes = [], []
     for path in files:
-        images, note = _stack(path, colours, order)
+        images, note = _file_frames(path, colours, order)
         notes.append(note)
         names += (
             [f"{path.name}[{i}]" for i in range(len(images))]
@@ -331,35 +350,42 @@ def _all_frames(
 
 
 def _listed_frames(
-    there: Mapping[str, Path],
-    at: Path,
+    files_by_name: Mapping[str, Path],
+    folder_path: Path,
     rows: stage.StageRows,
     colours: ColourChannels,
     order: str | None,
 ) -> tuple[Array, list[str]]:
-    """The frames that the stage file names, in its order; without a column of pages,
-    those of a stack in turn.
+    """(n, y, x) frames in the order of the stage file, and notes on their axes.
 
-    With them what to say of their axes.
+    Without a page column, rows of one file take its pages one after the other.
+
+    Args:
+        files_by_name: image files of the folder by their normalized names.
+        folder_path: folder of the capture.
+        rows: rows of the stage file.
+        order: stated order of the axes, or None.
     """
     stacks: dict[str, Stack] = {}
     images = []
-    rows_of, met = Counter(rows.files), Counter[str]()
+    row_count = Counter(rows.files)
+    pages_taken = Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
-        path = there.get(stage.normalize_spelling(name), at / name)
+        path = files_by_name.get(stage.normalize_spelling(name), folder_path / name)
         if not path.is_file():
             raise CaptureError(
-                f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.similar_name_hint(name, there)}"
+                f"{rows.source}, row {row}: frame {name!r} is not in {folder_path}"
+                f"{folder.similar_name_hint(name, files_by_name)}"
             )
         if name not in stacks:
-            count = rows_of[name] if stated is None else None
-            stacks[name] = _stack(path, colours, order, count=count)
+            count = row_count[name] if stated is None else None
+            stacks[name] = _file_frames(path, colours, order, count=count)
         stack = stacks[name][0]
-        page = min(met[name], len(stack) - 1) if stated is None else stated
-        met[name] += 1
-        if stated is None and len(stack) not in (1, rows_of[name]):
+        page = min(pages_taken[name], len(stack) - 1) if stated is None else stated
+        pages_taken[name] += 1
+        if stated is None and len(stack) not in (1, row_count[name]):
             raise CaptureError(
-                f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and stands in {rows_of[name]} rows; say "
+                f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and stands in {row_count[name]} rows; say "
                 f"with a column page (from 0) which one each row means, or, if its {stack.shape} are not (n, y, x) but "
                 '(y, x, n), axes = "yxn" in capture.toml'
             )
@@ -368,12 +394,13 @@ def _listed_frames(
                 f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which holds {len(stack)}"
             )
         images.append(stack[page][None])
-    return _join(images, [at / name for name in rows.files]), [
+    return _join(images, [folder_path / name for name in rows.files]), [
         note for _, note in stacks.values()
     ]
 
 
 def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
+    """Stacks as one (n, y, x) array; refuses frames of different size or type."""
     for stack, path in zip(stacks, files, strict=True):
         if stack.shape[1:] != stacks[0].shape[1:] or stack.dtype != stacks[0].dtype:
             raise CaptureError(
@@ -383,6 +410,7 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
 
 
 def _read_hdf5(path: Path) -> Array:
+    """Data set ``frames`` of an HDF5 file; refuses a damaged file."""
     try:
         if not path.is_file():  # a pipe would be waited for
             raise CaptureError(f"{path}: {reading.missing_reason(path)}")
@@ -412,6 +440,7 @@ def _frames_of(path: Path, file: h5py.File) -> Array:
 
 
 def _check_values(images: Array, path: Path) -> None:
+    """Refuse types that hold no counts, half precision, and non-finite values."""
     if images.dtype.kind not in "uif" or images.dtype.itemsize > 8:
         raise CaptureError(
             f"{path}: values of type {images.dtype}; need whole or real numbers"

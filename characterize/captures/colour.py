@@ -34,7 +34,11 @@ class ColourChannels:
 
     @classmethod
     def of(cls, about: dict[str, Any], where: str) -> "ColourChannels":
-        """As the capture's description says; its entries are taken out.
+        """Channel and mosaic of a capture's description, removed from it.
+
+        Args:
+            about: entries of the description.
+            where: file or folder, for messages.
 
         Raises:
             CaptureError: an unknown channel or mosaic, a mosaic without a channel.
@@ -58,7 +62,7 @@ class ColourChannels:
 
     @property
     def pitch(self) -> int:
-        """Pixels from one of the channel's to the next."""
+        """Distance of the channel's pixels, in pixels of the sensor."""
         return 2 if self.mosaic else 1
 
     def pick(self, images: Array, path: Path, *, grey: bool = True) -> Array:
@@ -105,7 +109,7 @@ class ColourChannels:
         return images
 
     def notes(self) -> list[str]:
-        """What to say of frames that were a channel."""
+        """Notes on the use of one colour channel; empty for grey frames."""
         if self.mosaic:
             return [
                 f"channel {self.channel} used: one pixel in four of a mosaic {self.mosaic}, at twice the pitch"

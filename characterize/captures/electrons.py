@@ -13,13 +13,11 @@ from characterize.captures.rounding import DarkStatistics
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
-# counts of noise from which on rounding is off by a twentieth of a count at most
-_HIDES = 0.3
-# counts²: variance between dark frames up to which noise may be below that, wherever
-# their level lies
-_ROUGH = 0.35
-_SURE = 3.0  # standard errors from which on noise is taken to grow with light
-# of a camera that nobody describes, where no two dark frames tell
+# least noise in counts at which the mean of rounded counts errs by 1/20 count at most
+_ROUNDING_NOISE = 0.3
+# largest variance between dark frames, counts², at which the noise may be below that
+_DARK_VARIANCE = 0.35
+_SIGMA_LIMIT = 3.0  # standard errors by which the noise must grow with light
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +25,10 @@ class SensorNoise:
     """Noise model of a sensor: variance in counts = mean / gain + (read noise / gain)²
     + 1/12.
 
-    gain_e: electrons a count. gain_sigma_e: standard error of it.
-    read_noise_e: electrons; read_known: False where nobody says so and no two dark
-    frames do.
-    known: False where the gain was assumed, not measured.
+    gain_e: electrons a count. gain_sigma_e: its standard error.
+    read_noise_e: read noise, electrons.
+    known: False where the gain is assumed, neither stated nor measured.
+    read_known: False where the read noise is neither stated nor from dark frames.
     """
 
     gain_e: float
@@ -41,14 +39,15 @@ class SensorNoise:
 
     @property
     def coarse(self) -> bool:
-        """Whether counts are too coarse for their noise to hide it.
+        """Whether rounding to counts biases their mean, because the noise is small.
 
-        With s counts of noise rounding is off by up to exp(-2 pi² s²) / pi of a count
-        on average, alike wherever light
-        is alike.
+        At s counts of noise the bias is up to exp(-2 pi² s²) / pi of a count, equal at
+        equal light.
         """
         return (
-            self.known and self.read_known and self.read_noise_e < _HIDES * self.gain_e
+            self.known
+            and self.read_known
+            and self.read_noise_e < _ROUNDING_NOISE * self.gain_e
         )
 
 
@@ -57,22 +56,21 @@ class ElectronFrames:
     """Frames ready for a fit, in electrons above the dark level.
 
     electrons: (n, y, x), flat-fielded.
-    usable: (n, y, x) False where a pixel is hot, dead or cropped: it takes no part in a
-    fit.
+    usable: (n, y, x) False for hot, dead or cropped pixels, which a fit leaves out.
     saturated: (n, y, x) True where the converter or the well is full: the light is at
     least ``electrons``.
     variance_e2: (n, y, x) variance at zero light: read noise, quantisation, dark
     subtraction.
-    scale: (n, y, x) or (1, 1, 1): electrons counted for each electron given here (flat
-    field), for the shot noise.
+    scale: (n, y, x) or (1, 1, 1) flat field: detected electrons per unit of
+    ``electrons``, for the shot noise.
+    gain: noise model of the sensor.
     corrections: every step in words.
-    common_floor: share of ``variance_e2`` that is the same error in all frames, that of
-    the dark level.
-    common_light: relative error of a pixel's light that is the same in all frames, that
-    of the flat (not in the
-        variance).
-    count_e: electrons of a count where pixels are rounded counts, ``count_e / scale``
-    apart; 0 where they are means.
+    common_floor: share of ``variance_e2`` that is common to all frames: that of the
+    dark level.
+    common_light: relative error of a pixel's light that is common to all frames: that
+    of the flat (not in the variance).
+    count_e: electrons of a count where pixels are rounded counts, in steps of
+    ``count_e / scale``; 0 where they are means.
     """
 
     electrons: Array
@@ -88,12 +86,11 @@ class ElectronFrames:
 
 
 def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
-    """Gain and read noise from repeated flat frames (mean-variance method, Janesick
-    2007).
+    """Gain and read noise by photon transfer (mean-variance method, Janesick 2007).
 
-    Differences of frames of like exposure cancel the fixed pattern; a line variance =
-    mean / gain + floor goes
-    through the levels. With one level the floor comes from the dark frames.
+    Differences of frames of equal exposure cancel the fixed pattern. A weighted line
+    variance = mean / gain + floor is fitted to all exposures; with dark frames the
+    floor is theirs.
 
     Args:
         flat: (k, y, x) counts, k >= 2; frames of several exposures may follow each
@@ -101,10 +98,9 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
         dark: (k, y, x) counts; the offset, and with k >= 2 the read noise.
 
     Raises:
-        CaptureError: fewer than two flats, flats without noise (one frame copied), or
-            saturated ones: their noise
-            does not grow with light, or is above that of the dark by less than three
-            standard errors.
+        CaptureError: fewer than two flats, flats without noise (copies of one frame),
+            or saturated flats, whose noise does not grow with light by three standard
+            errors.
     """
     flat = np.asarray(flat, float)
     if len(flat) < 2:
@@ -112,43 +108,47 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
             f"photon transfer: {len(flat)} flat frame; need two or more of one level"
         )
     offset = float(np.mean(dark)) if dark is not None else 0.0
-    floor = _floor(dark) if dark is not None and len(dark) > 1 else None
-    order = np.argsort([_middle(f) for f in flat], kind="stable")
+    floor = _dark_variance(dark) if dark is not None and len(dark) > 1 else None
+    order = np.argsort([_typical_level(frame) for frame in flat], kind="stable")
     pairs = [
-        (flat[a], flat[b]) for a, b in zip(order[:-1:2], order[1::2], strict=False)
+        (flat[first], flat[second])
+        for first, second in zip(order[:-1:2], order[1::2], strict=False)
     ]
-    mean = np.array([(_middle(a) + _middle(b)) / 2 - offset for a, b in pairs])
+    mean = np.array(
+        [
+            (_typical_level(first) + _typical_level(second)) / 2 - offset
+            for first, second in pairs
+        ]
+    )
     variance = np.array([_pair_variance(np.stack(pair)) for pair in pairs])
     if not (variance > 0).all() or not (mean > 0).all():
         raise CaptureError(
             "photon transfer: flats without noise or light; take them anew, evenly lit to half the well"
         )
-    base = floor or 0.0
+    dark_part = floor or 0.0
     expected = (
-        base + mean * (variance - base).sum() / mean.sum()
-    )  # of the variance: its own would favour low ones
-    dark_known = floor is not None
-    inverse, sigma, floor = _line(
+        dark_part + mean * (variance - dark_part).sum() / mean.sum()
+    )  # its own variance as weight would favour low variances
+    has_dark = floor is not None
+    inverse, sigma, floor = _noise_line(
         mean, variance, expected * math.sqrt(2 / flat[0].size), floor
     )
-    if inverse <= (_SURE * sigma if dark_known else 0):
+    if inverse <= (_SIGMA_LIMIT * sigma if has_dark else 0):
         raise CaptureError(
             "photon transfer: the noise does not grow with light (by "
             f"{inverse:.2g} +- {sigma:.2g} counts² a count); the flats are saturated or processed"
         )
     gain = 1 / inverse
-    read = math.sqrt(max(floor - 1 / 12, 0)) * gain
-    return SensorNoise(gain, gain**2 * sigma, read, read_known=dark_known)
+    read_noise_e = math.sqrt(max(floor - 1 / 12, 0)) * gain
+    return SensorNoise(gain, gain**2 * sigma, read_noise_e, read_known=has_dark)
 
 
 def to_electrons(capture: Capture) -> ElectronFrames:
-    """Frames in electrons with masks; the gain from the flats, else one electron a
-    count, and so said.
+    """Frames in electrons with masks: (counts - dark) / flat * gain.
 
-    Brackets (frames of one position and angle with different exposure) are merged by
-    :func:`merge_brackets`
-    beforehand by whoever wants one frame a position; without that every exposure is
-    fitted as its own frame.
+    The gain is stated, else measured in the flats, else assumed as one electron a count
+    with a note. Exposure brackets stay separate frames; :func:`merge_brackets` merges
+    them.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -165,39 +165,39 @@ def to_electrons(capture: Capture) -> ElectronFrames:
     notes.append(
         f"{int(bad.sum())} of {bad.size} pixels hot, dead or in a dead row: masked"
     )
-    top = saturation_level(capture)
-    saturated = raw >= top
+    level = saturation_level(capture)
+    saturated = raw >= level
     if not saturated.any() and gain.known:
         well = full_well(raw - dark, gain)
         saturated = raw - dark >= well
-        top = well
+        level = well
     if saturated.any():
         notes.append(
-            f"{saturated.mean():.2%} of the pixels saturated at {top:g} counts: taken as lower bounds"
+            f"{saturated.mean():.2%} of the pixels saturated at {level:g} counts: taken as lower bounds"
         )
     if bad.all() or (saturated | bad).all():
         raise CaptureError(
             "no usable pixel: all are saturated, hot or dead; lower the exposure"
         )
-    once = gain.read_noise_e**2 + gain.gain_e**2 / 12
+    frame_e2 = gain.read_noise_e**2 + gain.gain_e**2 / 12
     dark_e2 = (gain.gain_e * dark_error) ** 2
     return ElectronFrames(
         (raw - dark) / flat * gain.gain_e,
         np.broadcast_to(~bad, raw.shape).copy(),
         saturated,
-        np.broadcast_to((once + dark_e2) / flat**2, raw.shape),
+        np.broadcast_to((frame_e2 + dark_e2) / flat**2, raw.shape),
         np.broadcast_to(flat, raw.shape),
         gain,
         tuple(notes),
-        common_floor=dark_e2 / (once + dark_e2),
+        common_floor=dark_e2 / (frame_e2 + dark_e2),
         common_light=flat_error,
         count_e=gain.gain_e,
     )
 
 
 def saturation_level(capture: Capture) -> float:
-    """Count at which pixels clip: full scale, or a lower plateau at the maximum shared
-    by many pixels (full well).
+    """Count at which pixels clip: the maximum where many pixels share it (a full well),
+    else full scale.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -205,10 +205,10 @@ def saturation_level(capture: Capture) -> float:
     frames = capture.frames
     highest = float(frames.max())
     plateau = int((frames == frames.max()).sum())
-    near = int((frames >= 0.98 * highest).sum())
+    near_top = int((frames >= 0.98 * highest).sum())
     clipped = (
         plateau >= 4
-        and plateau > 0.5 * near
+        and plateau > 0.5 * near_top
         and highest > float(np.median(frames)) + 16
     )
     clipped |= (
@@ -218,44 +218,48 @@ def saturation_level(capture: Capture) -> float:
 
 
 def full_well(counts: Array, gain: SensorNoise) -> float:
-    """Counts above the dark level from which on pixels are full; inf where none shows
-    it.
+    """Counts above the dark level at which wells are full; inf where no pixel is.
 
-    Light that fills no well scatters by s = sqrt(counts / gain) at least, so that two
-    pixels alike are within w of each
-    other by a chance of w / (sqrt(pi) s); wells that are full all read the same, to
-    within rounding and the error of
-    the dark level. So: three pixels or more within w = 2 counts, most of those within
-    1.5 s of the highest, by a chance
-    below a hundredth; not a quarter of all, which is even light and no image.
+    Unsaturated light scatters by s = sqrt(counts / gain) or more: two pixels of equal
+    light differ by less than w with probability w / (sqrt(pi) s). Full wells read
+    equal. A well is full where three or more pixels lie within w = 2 counts of the
+    highest, and are most of those within 1.5 s. The probability must be below 0.01, and
+    they must be less than a quarter of all pixels, which would be even light.
+
+    Args:
+        counts: (n, y, x) counts above the dark level.
+        gain: noise model of the sensor.
     """
-    highest, width = float(counts.max()), 2.0
+    highest = float(counts.max())
+    width = 2.0
     shot = math.sqrt(max(highest, 1e-9) / gain.gain_e)
-    alike, near = (
-        int((counts >= highest - reach).sum()) for reach in (width, 1.5 * shot)
+    full, close = (
+        int((counts >= highest - range_counts).sum())
+        for range_counts in (width, 1.5 * shot)
     )
-    chance = min(width / (math.sqrt(math.pi) * shot), 1.0) ** (alike - 1)
-    some = 3 <= alike < counts.size / 4 and highest > 2 * abs(float(np.median(counts)))
+    chance = min(width / (math.sqrt(math.pi) * shot), 1.0) ** (full - 1)
+    is_plateau = 3 <= full < counts.size / 4 and highest > 2 * abs(
+        float(np.median(counts))
+    )
     return (
-        highest - width if some and alike > 0.5 * near and chance < 0.01 else math.inf
+        highest - width
+        if is_plateau and full > 0.5 * close and chance < 0.01
+        else math.inf
     )
 
 
 def bad_pixels(capture: Capture) -> Array:
     """(y, x) True where a pixel is hot, stuck or dead, or lies in a dead row or column.
 
-    From dark (8 robust sigma above the rest) and flat (outside 0.3 to 3 of the median)
-    where there are any; always
-    from the frames: the same single pixel far above its eight neighbours, or constant,
-    in every one of >= 3 frames.
-    Constant pixels count where they differ from those around them: a dark background of
-    few bits is constant too.
+    Dark frames: beyond 8 robust sigma of the median. Flats: outside 0.3 to 3 of the
+    median. Frames: single pixels well above their eight neighbours, and in three or
+    more frames pixels that stay constant and differ from those around them.
 
     Args:
         capture: frames in counts with their stage and camera.
     """
     frames = np.asarray(capture.frames, float)
-    bad = _lonely(frames)
+    bad = _isolated_pixels(frames)
     if capture.dark is not None:
         level = np.asarray(capture.dark, float).mean(0)
         bad |= np.abs(level - np.median(level)) > 8 * max(_robust_sigma(level), 0.5)
@@ -263,11 +267,11 @@ def bad_pixels(capture: Capture) -> Array:
         level = np.asarray(capture.flat, float).mean(0)
         bad |= ~((level > 0.3 * np.median(level)) & (level < 3 * np.median(level)))
     level = frames.mean(0)
-    apart = np.abs(level - ndimage.median_filter(level, 5, mode="nearest")) > 1
+    differs = np.abs(level - ndimage.median_filter(level, 5, mode="nearest")) > 1
     if len(frames) >= 3:
-        bad |= (np.ptp(frames, axis=0) == 0) & apart
+        bad |= (np.ptp(frames, axis=0) == 0) & differs
     for axis in (0, 1):
-        dead = np.all(bad | ((frames.max(0) == 0) & apart), axis=1 - axis)
+        dead = np.all(bad | ((frames.max(0) == 0) & differs), axis=1 - axis)
         bad |= dead[:, None] if axis == 0 else dead[None, :]
     return np.asarray(bad)
 
@@ -275,14 +279,14 @@ def bad_pixels(capture: Capture) -> Array:
 def merge_brackets(
     frames: ElectronFrames, exposure_s: Array, group: Array
 ) -> tuple[ElectronFrames, Array]:
-    """One frame for each value of ``group``: the brackets' rates averaged by inverse
-    variance, saturated ones left out.
+    """One frame for each value of ``group``: the inverse-variance mean of the brackets'
+    rates, without saturated pixels.
 
-    The weights come from the light of all brackets together, not from each one's own
-    noisy count, so that the mean
-    is unbiased.
+    The weights come from the light of all brackets together, not from each bracket's
+    own noisy count, so that the mean is unbiased.
 
     Args:
+        frames: (n, y, x) frames of all brackets.
         exposure_s: (n,) above 0.
         group: (n,) equal for frames of one position and angle.
 
@@ -309,82 +313,105 @@ def merge_brackets(
 
 
 def _merge(frames: ElectronFrames, index: Array, exposure_s: Array) -> list[Array]:
-    time = exposure_s[index][:, None, None] / exposure_s[index].max()
-    open_ = frames.usable[index] & ~frames.saturated[index]
-    total = np.maximum((open_ * time).sum(0), 1e-12)
-    rate = np.maximum((frames.electrons[index] * open_).sum(0) / total, 0)
-    noise = frames.variance_e2[index] + rate * time / frames.scale[index]
-    weight = open_ * time**2 / noise
-    some = weight.sum(0) > 0
+    """(y, x) electrons, usable, saturated, variance and scale of one merged frame.
+
+    Args:
+        frames: frames of all brackets.
+        index: (k,) numbers of the frames to merge.
+        exposure_s: (n,) exposures of all frames.
+    """
+    exposure = exposure_s[index][:, None, None] / exposure_s[index].max()
+    valid = frames.usable[index] & ~frames.saturated[index]
+    total = np.maximum((valid * exposure).sum(0), 1e-12)
+    rate = np.maximum((frames.electrons[index] * valid).sum(0) / total, 0)
+    noise = frames.variance_e2[index] + rate * exposure / frames.scale[index]
+    weight = valid * exposure**2 / noise
+    has_weight = weight.sum(0) > 0
     shortest = index[np.argmin(exposure_s[index])]
-    norm = np.where(some, weight.sum(0), 1)
-    value = np.where(some, (weight * frames.electrons[index] / time).sum(0) / norm, 0)
-    value = np.where(some, value, frames.electrons[shortest] / time.min())
+    norm = np.where(has_weight, weight.sum(0), 1)
+    value = np.where(
+        has_weight, (weight * frames.electrons[index] / exposure).sum(0) / norm, 0
+    )
+    value = np.where(has_weight, value, frames.electrons[shortest] / exposure.min())
     # the merged noise is 1 / norm = floor + rate / scale: both parts are weighted means
     # of the brackets' own
-    floor = (weight**2 * frames.variance_e2[index] / time**2).sum(0) / norm**2
-    shot = (weight**2 / time / frames.scale[index]).sum(0) / norm**2
-    floor = np.where(some, floor, frames.variance_e2[shortest] / time.min() ** 2)
-    clipped = ~some & frames.saturated[index].any(0)
+    floor = (weight**2 * frames.variance_e2[index] / exposure**2).sum(0) / norm**2
+    shot = (weight**2 / exposure / frames.scale[index]).sum(0) / norm**2
+    floor = np.where(
+        has_weight, floor, frames.variance_e2[shortest] / exposure.min() ** 2
+    )
+    clipped = ~has_weight & frames.saturated[index].any(0)
     return [
-        np.asarray(a)
-        for a in (
+        np.asarray(part)
+        for part in (
             value,
             frames.usable[index].any(0),
             clipped,
             floor,
-            1 / np.where(some, shot, 1),
+            1 / np.where(has_weight, shot, 1),
         )
     ]
 
 
 def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
-    """Gain and read noise as stated, else as measured, else assumed; notes say which.
+    """Gain and read noise of a capture's sensor; appends where they come from to
+    ``notes``.
 
-    Read noise comes from the description, else from two dark frames or more, else from
-    the photon-transfer line of the flats.
+    Gain: stated, else by photon transfer of the flats, else 1 e a count. Read noise:
+    stated, else from two or more dark frames, else from the photon-transfer line, else
+    2 e.
     """
-    stated, dark = capture.about, capture.dark
+    description = capture.about
+    dark = capture.dark
     flats = 0 if capture.flat is None else len(capture.flat)
     measured = None
-    if "gain_e" in stated:
-        gain, sigma, known = float(stated["gain_e"]), 0.0, True
+    if "gain_e" in description:
+        gain = float(description["gain_e"])
+        sigma = 0.0
+        has_gain = True
         notes.append(f"gain {gain:g} e/count as stated")
     elif capture.flat is not None and flats > 1:
         measured = photon_transfer(capture.flat, dark)
         gain = measured.gain_e
         sigma = measured.gain_sigma_e
-        known = True
+        has_gain = True
         notes.append(
             f"gain {gain:.3g} +- {sigma:.1g} e/count, measured in {flats} flat frames"
         )
     else:
-        gain, sigma, known = 1.0, math.inf, False
+        gain = 1.0
+        sigma = math.inf
+        has_gain = False
         notes.append(
             "no flats, no stated gain: 1 e/count assumed, chi-square has no absolute "
             "meaning"
         )
-    read_known = True
-    if "read_noise_e" in stated:
-        read, origin = float(stated["read_noise_e"]), "as stated"
+    has_read_noise = True
+    if "read_noise_e" in description:
+        read_noise_e = float(description["read_noise_e"])
+        origin = "as stated"
     elif dark is not None and len(dark) > 1:
-        read = gain * math.sqrt(max(_floor(dark) - 1 / 12, 0.0))
+        read_noise_e = gain * math.sqrt(max(_dark_variance(dark) - 1 / 12, 0.0))
         origin = f"measured in {len(dark)} dark frames"
     elif measured is not None:
-        read = measured.read_noise_e
+        read_noise_e = measured.read_noise_e
         origin = "from the flats' photon-transfer line"
-        read_known = False
+        has_read_noise = False
     else:
-        read, origin, read_known = 2.0, "assumed", False  # electrons, of a usual sensor
-    notes.append(f"read noise {read:.2g} e, {origin}")
-    return SensorNoise(gain, sigma, read, known=known, read_known=read_known)
+        read_noise_e = 2.0  # of a usual sensor
+        origin = "assumed"
+        has_read_noise = False
+    notes.append(f"read noise {read_noise_e:.2g} e, {origin}")
+    return SensorNoise(
+        gain, sigma, read_noise_e, known=has_gain, read_known=has_read_noise
+    )
 
 
 def _dark_level(
     capture: Capture, gain: SensorNoise, notes: list[str]
 ) -> tuple[Array | float, Array | float]:
-    """(counts without light, their standard error), of every pixel where there are dark
-    frames.
+    """(counts without light, their standard error): (y, x) from dark frames, else the
+    stated offset, else 0; appends a note.
     """
     if capture.dark is None and "offset" in capture.about:
         notes.append(f"offset {capture.about['offset']:g} counts as stated, subtracted")
@@ -395,10 +422,10 @@ def _dark_level(
             "fit's background and weigh as light; add dark.tif or state offset"
         )
         return 0.0, 0.0
-    level = np.mean(capture.dark, axis=0)
+    mean = np.mean(capture.dark, axis=0)
     error = math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5)
-    offset = level
-    errors = np.full_like(level, error / math.sqrt(len(capture.dark)))
+    offset = mean
+    errors = np.full_like(mean, error / math.sqrt(len(capture.dark)))
     if gain.coarse:
         rounded = DarkStatistics.of(capture.dark)
         offset, errors = rounded.level, rounded.error
@@ -412,8 +439,8 @@ def _dark_level(
 def _flat_field(
     capture: Capture, dark: Array | float, notes: list[str]
 ) -> tuple[Array, float]:
-    """(flat, relative error of one of its pixels); ones where there is none to divide
-    by.
+    """((y, x) flat of median 1, relative error of its pixels); ones of shape (1, 1)
+    without a flat, or where it is even to within its noise. Appends a note.
     """
     if capture.flat is None:
         return np.ones((1, 1)), 0.0
@@ -433,28 +460,37 @@ def _flat_field(
     return np.where((flat > 0.3) & (flat < 3), flat, 1.0), noise
 
 
-def _lonely(frames: Array) -> Array:
+def _isolated_pixels(frames: Array) -> Array:
+    """(y, x) True for single pixels far above all eight neighbours in most of three or
+    more frames; False everywhere with fewer frames.
+    """
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
-    around = np.stack([ndimage.median_filter(f, footprint=ring) for f in frames])
+    neighbours = np.stack(
+        [ndimage.median_filter(frame, footprint=ring) for frame in frames]
+    )
     spread = np.stack(
         [
-            np.full(f.shape, max(_robust_sigma(f - a), 0.5))
-            for f, a in zip(frames, around, strict=True)
+            np.full(frame.shape, max(_robust_sigma(frame - median), 0.5))
+            for frame, median in zip(frames, neighbours, strict=True)
         ]
     )
-    brightest = np.stack([ndimage.maximum_filter(f, footprint=ring) for f in frames])
+    brightest = np.stack(
+        [ndimage.maximum_filter(frame, footprint=ring) for frame in frames]
+    )
     spike = (frames - brightest > 6 * spread) & (frames > 1.5 * brightest)
     return np.asarray(spike.mean(0) > (0.8 if len(frames) >= 3 else 2))
 
 
-def _floor(dark: Array) -> float:
-    """Variance of a count without light where noise hides rounding: 1/12 more than
-    before rounding.
+def _dark_variance(dark: Array) -> float:
+    """Variance of a dark count, counts²: between frames, or for coarse counts that
+    before rounding plus 1/12.
     """
     variance = _pair_variance(dark)
     return (
-        variance if variance > _ROUGH else DarkStatistics.of(dark).noise ** 2 + 1 / 12
+        variance
+        if variance > _DARK_VARIANCE
+        else DarkStatistics.of(dark).noise ** 2 + 1 / 12
     )
 
 
@@ -464,36 +500,45 @@ def _pair_variance(frames: Array) -> float:
     """
     steps = np.diff(np.asarray(frames, float), axis=0) / math.sqrt(2)
     steps = steps - steps.mean((1, 2), keepdims=True)
-    keep = np.abs(steps) <= 6 * max(_robust_sigma(steps), 0.5)
+    regular = np.abs(steps) <= 6 * max(_robust_sigma(steps), 0.5)
     return float(
-        np.mean(steps[keep] ** 2) * frames[0].size / max(frames[0].size - 1, 1)
+        np.mean(steps[regular] ** 2) * frames[0].size / max(frames[0].size - 1, 1)
     )
 
 
-def _line(
+def _noise_line(
     mean: Array, variance: Array, spread: Array, floor: float | None
 ) -> tuple[float, float, float]:
-    """Weighted line through (mean, variance): (slope, its error, intercept); a known or
-    zero intercept if one level.
+    """(slope, standard error, intercept) of a weighted line variance = slope mean +
+    intercept.
+
+    The intercept is ``floor`` where stated, and 0 where the means span less than 20 %.
+
+    Args:
+        mean: (k,) counts. variance: (k,) counts².
+        spread: (k,) standard errors of ``variance``.
+        floor: intercept, or None to fit it.
     """
     if floor is not None or np.ptp(mean) < 0.2 * mean.max():
-        base = floor or 0.0
+        intercept = floor or 0.0
         weight = (mean / spread) ** 2
         return (
-            float((weight * (variance - base) / mean).sum() / weight.sum()),
+            float((weight * (variance - intercept) / mean).sum() / weight.sum()),
             float(weight.sum() ** -0.5),
-            base,
+            intercept,
         )
     design = np.stack([mean, np.ones_like(mean)], 1) / spread[:, None]
     covariance = np.linalg.inv(design.T @ design)
-    slope, base = covariance @ design.T @ (variance / spread)
-    return float(slope), float(covariance[0, 0] ** 0.5), max(float(base), 0.0)
+    slope, intercept = covariance @ design.T @ (variance / spread)
+    return float(slope), float(covariance[0, 0] ** 0.5), max(float(intercept), 0.0)
 
 
-def _middle(frame: Array) -> float:
-    keep = np.abs(frame - np.median(frame)) <= 8 * max(_robust_sigma(frame), 0.5)
-    return float(frame[keep].mean())
+def _typical_level(frame: Array) -> float:
+    """Mean of the pixels within 8 robust sigma of the median."""
+    regular = np.abs(frame - np.median(frame)) <= 8 * max(_robust_sigma(frame), 0.5)
+    return float(frame[regular].mean())
 
 
 def _robust_sigma(values: Array) -> float:
+    """Standard deviation from the median absolute deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))

@@ -1,5 +1,5 @@
-"""What lies in a capture folder by its names: frames in their order, tables, and what
-other programs left there.
+"""Files of a capture folder by their names: frames in order, tables, and files that are
+not read.
 """
 
 import difflib
@@ -20,7 +20,7 @@ _MATLAB = (
     'in MATLAB: imwrite(frames(:,:,k), "frames.tif", WriteMode="append") for each k'
 )
 _PROGRAM = "as TIFF, from the program that wrote it or from ImageJ"
-_CURES = {
+_CONVERSIONS = {
     **dict.fromkeys((".npy", ".npz"), _NUMPY),
     ".mat": _MATLAB,
     **dict.fromkeys(
@@ -54,28 +54,28 @@ _CURES = {
 
 
 def conversion_hint(suffix: str) -> str:
-    """How to save anew what is held in a kind of file that is not read; empty where
-    that is not known.
+    """How to convert a kind of file that is not read; empty for an unfamiliar suffix.
 
     Args:
         suffix: ending of the file's name.
     """
-    return f": save it {_CURES[suffix]}" if suffix in _CURES else ""
+    return f": save it {_CONVERSIONS[suffix]}" if suffix in _CONVERSIONS else ""
 
 
 def list_images(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Image files of a folder with one of ``suffixes`` in the order of their names, numbers counted (frame_2
-    before frame_10).
+    """Image files of a folder with one of ``suffixes``, in natural order of their names
+    (frame_2 before frame_10).
 
-    Files that a system keeps hidden (._frame.tif of a disk that a Mac wrote to) are
-    none.
+    Hidden files (._frame.tif on a disk that a Mac wrote to) are left out.
     """
-    found = (
+    images = (
         path
         for path in folder.iterdir()
         if path.suffix.lower() in suffixes and not path.name.startswith(".")
     )
-    return sorted(found, key=lambda path: [part[::-1] for part in _parts(path.name)])
+    return sorted(
+        images, key=lambda path: [part[::-1] for part in _name_parts(path.name)]
+    )
 
 
 def find_table(folder: Path, kind: str) -> Path | None:
@@ -89,19 +89,20 @@ def find_table(folder: Path, kind: str) -> Path | None:
         CaptureError: there is one in another format (``stage.xlsx``), which nothing
             would read.
     """
-    right, others = _TABLES[kind]
-    named = {
+    suffixes, other_suffixes = _TABLES[kind]
+    files = {
         path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()
     }
     if found := next(
-        (named[kind + suffix] for suffix in right if kind + suffix in named), None
+        (files[kind + suffix] for suffix in suffixes if kind + suffix in files), None
     ):
         return found
-    if strange := next(
-        (named[kind + suffix] for suffix in others if kind + suffix in named), None
+    if unread := next(
+        (files[kind + suffix] for suffix in other_suffixes if kind + suffix in files),
+        None,
     ):
         raise CaptureError(
-            f"{strange}: not read, and nothing else says what it may say; save it as {kind}{right[0]}"
+            f"{unread}: not read, and nothing else says what it may say; save it as {kind}{suffixes[0]}"
         )
     return None
 
@@ -116,74 +117,81 @@ def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]
     Raises:
         CaptureError: a dark frame or a flat is among them.
     """
-    rest = sorted(
+    unread = sorted(
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in _CURES and not path.name.startswith(".")
+        if path.suffix.lower() in _CONVERSIONS and not path.name.startswith(".")
     )
-    for path in rest:
+    for path in unread:
         if path.stem.lower() in {"dark", "flat"} - set(beside):
             raise CaptureError(
                 f"{path}: cannot read {path.suffix}, and it would not be used{conversion_hint(path.suffix.lower())}"
             )
-    names = ", ".join(reading.to_valid_utf8(path.name) for path in rest[:5])
+    names = ", ".join(reading.to_valid_utf8(path.name) for path in unread[:5])
     return (
-        (f"{len(rest)} files left out, of kinds that are not read: {names}",)
-        if rest
+        (f"{len(unread)} files left out, of kinds that are not read: {names}",)
+        if unread
         else ()
     )
 
 
 def check_steps(files: Sequence[Path], folder: Path) -> None:
-    """Refuse numbered frames of which one is missing, where their order alone would say
-    their depths.
+    """Refuse numbered frames with a gap, where the depths follow from their order.
 
     Args:
+        files: image files in their order.
         folder: the capture folder.
 
     Raises:
-        CaptureError: numbers that go by unlike steps, in files that differ in one
+        CaptureError: unequal steps of the numbers, in files whose names differ in one
             number alone.
     """
-    parts = [_parts(path.stem) for path in files]
-    if len({tuple(word for word, _ in of) for of in parts}) != 1:
+    parts = [_name_parts(path.stem) for path in files]
+    if len({tuple(word for word, _ in name_parts) for name_parts in parts}) != 1:
         return
-    counted = [
+    sequences = [
         numbers
-        for numbers in zip(*([number for _, number in of] for of in parts), strict=True)
+        for numbers in zip(
+            *([number for _, number in name_parts] for name_parts in parts), strict=True
+        )
         if len(set(numbers)) > 1
     ]
-    if len(counted) != 1:
+    if len(sequences) != 1:
         return
     steps = [
         after - before
-        for before, after in zip(counted[0], counted[0][1:], strict=False)
+        for before, after in zip(sequences[0], sequences[0][1:], strict=False)
     ]
-    least = min(steps)
-    if max(steps) > least:
+    smallest = min(steps)
+    if max(steps) > smallest:
         gap = steps.index(max(steps))
         raise CaptureError(
-            f"{folder}: {files[gap + 1].name} is {steps[gap]} numbers after {files[gap].name}, others {least}: is a "
+            f"{folder}: {files[gap + 1].name} is {steps[gap]} numbers after {files[gap].name}, others {smallest}: is a "
             "frame missing? step_um would give the next one its place; list frames and depths in stage.csv"
         )
 
 
 def similar_name_hint(name: str, there: Collection[str]) -> str:
-    """A hint for the name of a file that is not there: the one that is most like it."""
-    close = difflib.get_close_matches(
+    """Hint with the most similar name of an existing file; empty without one.
+
+    Args:
+        name: name of the missing file.
+        there: names of the files that exist.
+    """
+    similar = difflib.get_close_matches(
         name.lower(), [other.lower() for other in there], n=1
     )
     return next(
         (
             f"; did you mean {other!r}?"
             for other in there
-            if close and other.lower() == close[0]
+            if similar and other.lower() == similar[0]
         ),
         "",
     )
 
 
-def _parts(name: str) -> list[tuple[str, int]]:
+def _name_parts(name: str) -> list[tuple[str, int]]:
     """A name as words (small letters) and numbers in turn: (word, -1) or ("", number)."""
     return [
         ("", int(part)) if part.isdigit() else (part, -1)

@@ -24,8 +24,8 @@ def orient_frames(frames: Array, orientation: int) -> Array:
 
 
 def relative_orientation(first: int, second: int) -> int:
-    """The orientation that makes of frames turned by the first those turned by the
-    second.
+    """Orientation that turns frames of the ``first`` orientation into those of the
+    ``second``.
 
     Args:
         first: orientation, 0 to 7, as :func:`orient_frames` takes it.
@@ -36,21 +36,23 @@ def relative_orientation(first: int, second: int) -> int:
     """
     frame = np.arange(4).reshape(1, 2, 2)
     return next(
-        k
-        for k in range(8)
+        orientation
+        for orientation in range(8)
         if np.array_equal(
-            orient_frames(orient_frames(frame, first), k), orient_frames(frame, second)
+            orient_frames(orient_frames(frame, first), orientation),
+            orient_frames(frame, second),
         )
     )
 
 
 def above_rim(frames: Array) -> Array:
-    """Frames less a plane through their rim, holes filled by the frame's median.
+    """(n, y, x) frames less a plane fitted to their two outermost pixels; nan becomes
+    the frame's median.
 
     Args:
         frames: (n, y, x) frames.
     """
-    out = np.empty(frames.shape)
+    result = np.empty(frames.shape)
     ny, nx = frames.shape[1:]
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     rim = np.ones((ny, nx), bool)
@@ -59,12 +61,12 @@ def above_rim(frames: Array) -> Array:
         filled = np.where(np.isfinite(frame), frame, np.nanmedian(frame))
         design = np.stack([np.ones(rim.sum()), x[rim], y[rim]], 1)
         plane = np.linalg.lstsq(design, filled[rim], rcond=None)[0]
-        out[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
-    return out
+        result[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
+    return result
 
 
 def _norm(frames: Array, noise: Array | float) -> Array:
-    """Of frames (..., y, x), freed of that of their noise (...)."""
+    """(...) norm of (..., y, x) frames less that of their noise (...), in quadrature."""
     power = (frames**2).sum((-2, -1))
     return np.asarray(np.sqrt(np.maximum(power - noise**2, 0.1 * power)))
 
@@ -72,23 +74,28 @@ def _norm(frames: Array, noise: Array | float) -> Array:
 def normalized_cross_correlation(
     a: Array, b: Array, noise: float
 ) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a
+    """Largest normalised cross-correlation over all shifts, and that shift (y, x) of a
     against b in pixels.
 
-    The norm of a is freed of that of its noise, so that weak light is not taken for
-    another lens.
+    The norm of ``a`` is reduced by that of its noise, so that weak light does not lower
+    the correlation.
+
+    Args:
+        a: (y, x) measured frame.
+        b: (y, x) expected frame.
+        noise: norm of the noise of ``a``.
     """
     norm = float(_norm(a, noise)) * float(np.linalg.norm(b))
     if norm == 0:
         return 0.0, (0.0, 0.0)
-    shape = [2 * s for s in a.shape]
-    cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
-    row, column = np.unravel_index(int(cross.argmax()), cross.shape)
+    shape = [2 * size for size in a.shape]
+    correlation = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
+    row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
     shift = [
-        int(i) - s if i >= s // 2 else int(i)
-        for i, s in ((row, shape[0]), (column, shape[1]))
+        int(index) - size if index >= size // 2 else int(index)
+        for index, size in ((row, shape[0]), (column, shape[1]))
     ]
-    return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
+    return min(float(correlation.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
 def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
@@ -98,13 +105,13 @@ def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
         light: (..., y, x) light.
         shift: (y, x) pixels.
     """
-    out = np.zeros_like(light)
+    shifted = np.zeros_like(light)
     rows, columns = light.shape[-2:]
     dy, dx = shift
-    out[..., max(dy, 0) : rows + min(dy, 0), max(dx, 0) : columns + min(dx, 0)] = light[
-        ..., max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)
-    ]
-    return out
+    shifted[..., max(dy, 0) : rows + min(dy, 0), max(dx, 0) : columns + min(dx, 0)] = (
+        light[..., max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)]
+    )
+    return shifted
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,13 +132,22 @@ class FrameSpectra:
         return cls(fft.rfft2(frames, sides), _norm(frames, noise), sides)
 
     def alike(self, expected: "FrameSpectra", index: Array) -> float:
-        """Mean likeness of the frames, taken in some order, to those expected."""
-        cross = fft.irfft2(
+        """Mean normalised cross-correlation with expected frames, each at its best
+        shift.
+
+        Args:
+            expected: spectra of the expected frames.
+            index: order of these frames.
+        """
+        correlation = fft.irfft2(
             self.spectrum[index] * np.conj(expected.spectrum), self.sides
         ).max((1, 2))
         norm = self.norm[index] * expected.norm
         return float(
             np.minimum(
-                np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0
+                np.divide(
+                    correlation, norm, out=np.zeros_like(correlation), where=norm > 0
+                ),
+                1.0,
             ).mean()
         )

@@ -9,7 +9,7 @@ from characterize.captures.tiff_pages import DENSEST
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
-_LEAST = 33  # bytes of a PNG's mark and head
+_HEAD_BYTES = 33  # bytes of a PNG's mark and head
 
 
 def read_png(path: Path) -> Array:
@@ -24,7 +24,7 @@ def read_png(path: Path) -> Array:
     """
     import cv2
 
-    _check(path)
+    _check_blocks(path)
     try:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -35,27 +35,32 @@ def read_png(path: Path) -> Array:
     return image[None] if image.ndim == 3 else image
 
 
-def _check(path: Path) -> None:
-    """Refuse what claims more than the file holds: its pixels, or a block that the
-    library would make room for.
+def _check_blocks(path: Path) -> None:
+    """Refuse a file whose head or blocks claim more bytes than it has.
+
+    The PNG blocks are walked from the head to IEND by their lengths.
     """
-    size, ends, begun = path.stat().st_size, 8, b""
+    size = path.stat().st_size
+    offset = 8
+    block = b""
     with open(path, "rb") as file:
-        while size >= _LEAST and ends + 8 <= size and begun != b"IEND":
-            file.seek(ends)
-            head = file.read(24 if not begun else 8)
-            length, name = int.from_bytes(head[:4], "big"), head[4:8]
-            if not begun and (
+        while size >= _HEAD_BYTES and offset + 8 <= size and block != b"IEND":
+            file.seek(offset)
+            head = file.read(24 if not block else 8)
+            length = int.from_bytes(head[:4], "big")
+            name = head[4:8]
+            if not block and (
                 name != b"IHDR"
                 or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size
             ):
                 raise CaptureError(
                     f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)"
                 )
-            if begun and name == b"IHDR":
+            if block and name == b"IHDR":
                 raise CaptureError(f"{path}: not a PNG file (a second head)")
-            ends, begun = ends + 12 + length, name
-    if begun != b"IEND" or ends > size:
+            offset = offset + 12 + length
+            block = name
+    if block != b"IEND" or offset > size:
         raise CaptureError(
-            f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})"
+            f"{path}: truncated or not a PNG file (a block ends at byte {offset}, the file at {size})"
         )

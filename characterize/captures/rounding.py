@@ -1,5 +1,5 @@
-"""Counts that are coarser than their noise: what a rounded count says of the light, in
-closed form.
+"""Likelihood of rounded counts whose noise is below a count: score, information and
+dark level, in closed form.
 """
 
 import math
@@ -12,67 +12,68 @@ from metalens.core.arrays import Array
 
 _SMOOTH = 1.0  # counts of noise from which on rounding is a variance of 1/12 to 1e-8
 _REACH = 9.0  # sigma to the farthest count that is summed
-_LEAST = 1e-6  # information of a count on its light, counts⁻²: less says nothing
-_NEAR, _LEVELS = (
-    3,
-    61,
-)  # counts about the middle that are no hot pixel; levels of a pixel that are summed
-_USUAL = (
-    0.15,
-    0.1,
-)  # counts of noise and of the scatter of pixels' levels where frames do not tell
+_LEAST_INFORMATION = 1e-6  # least information of a count on its light, counts⁻²
+# counts from the median of pixels that are not hot; levels of a pixel that are summed
+_NORMAL_RANGE, _LEVELS = 3, 61
+_TYPICAL = (0.15, 0.1)  # prior medians of noise and of the scatter of levels, counts
 
 
 def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
-    """What a count says of the light under it: (score, expected information), counts⁻¹
-    and counts⁻².
+    """(score, expected information) of a rounded count on its expected light m,
+    counts⁻¹ and counts⁻².
 
-    d ln P / dm at the count, and the sum of (dP/dm)² / P over all counts there could
-    be.
+    Score: d ln P / dm at the count. Information: sum of (dP/dm)² / P over all counts.
+    From ``_SMOOTH`` counts of noise on, rounding adds a variance of 1/12.
 
     Args:
-        off: count less expected light, in counts. noise: standard deviation before
-            rounding, in counts, above 0.
+        off: count less expected light, in counts.
+        noise: standard deviation before rounding, in counts, above 0.
     """
     off, noise = np.broadcast_arrays(np.asarray(off, float), np.asarray(noise, float))
     score = np.asarray(off / (noise**2 + 1 / 12))
     information = np.asarray(1 / (noise**2 + 1 / 12))
-    some = noise < _SMOOTH
-    if some.any():
-        x, s = off[some], noise[some]
-        score[some] = _score(x, s)[0]
-        known, nearest = np.zeros_like(x), x - np.rint(x)
-        for other in range(
-            -math.ceil(_REACH * s.max()) - 1, math.ceil(_REACH * s.max()) + 2
+    coarse = noise < _SMOOTH
+    if coarse.any():
+        offset = off[coarse]
+        sigma = noise[coarse]
+        score[coarse] = _score(offset, sigma)[0]
+        fisher = np.zeros_like(offset)
+        nearest = offset - np.rint(offset)
+        for shift in range(
+            -math.ceil(_REACH * sigma.max()) - 1, math.ceil(_REACH * sigma.max()) + 2
         ):
-            slope, log_chance = _score(nearest + other, s)
-            known += slope**2 * np.exp(log_chance)
-        information[some] = np.maximum(known, _LEAST)
+            slope, log_chance = _score(nearest + shift, sigma)
+            fisher += slope**2 * np.exp(log_chance)
+        information[coarse] = np.maximum(fisher, _LEAST_INFORMATION)
     return score, information
 
 
 def _score(off: Array, noise: Array) -> tuple[Array, Array]:
-    """d ln P / dm and ln P of counts that stand ``off`` from the light."""
-    far = np.abs(off)
-    near, beyond = (
-        (far - 0.5) / noise,
-        (far + 0.5) / noise,
-    )  # sigma to both edges of the count
-    log_near = special.log_ndtr(-near)
-    log_beyond = special.log_ndtr(-beyond)
-    log_chance = log_near + np.log1p(-np.exp(log_beyond - log_near))
-    log_edge = -(near**2) / 2 - math.log(2 * math.pi) / 2
-    edges = np.exp(log_edge - log_chance) * -np.expm1(-far / noise**2)
-    return np.sign(off) * edges / noise, log_chance
+    """(d ln P / dm, ln P) of rounded counts, P = Phi((d + 1/2)/s) - Phi((d - 1/2)/s).
+
+    Args:
+        off: count less expected light d, in counts.
+        noise: standard deviation s before rounding, in counts.
+    """
+    distance = np.abs(off)
+    # distance of both edges of the count, in sigma
+    lower_edge = (distance - 0.5) / noise
+    upper_edge = (distance + 0.5) / noise
+    log_lower = special.log_ndtr(-lower_edge)
+    log_upper = special.log_ndtr(-upper_edge)
+    log_chance = log_lower + np.log1p(-np.exp(log_upper - log_lower))
+    log_edge = -(lower_edge**2) / 2 - math.log(2 * math.pi) / 2
+    density_ratio = np.exp(log_edge - log_chance) * -np.expm1(-distance / noise**2)
+    return np.sign(off) * density_ratio / noise, log_chance
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DarkStatistics:
-    """Mean and variance of repeated dark frames, in counts.
+    """Level and noise of repeated dark frames before rounding, in counts.
 
-    level: (y, x) of every pixel before rounding. error: (y, x) standard deviation of
-    it, one in all frames.
-    noise: standard deviation of a pixel from frame to frame before rounding.
+    level: (y, x) of every pixel. error: (y, x) standard error of it, common to all
+    frames.
+    noise: standard deviation of a pixel from frame to frame.
     """
 
     level: Array
@@ -81,65 +82,70 @@ class DarkStatistics:
 
     @classmethod
     def of(cls, frames: Array) -> "DarkStatistics":
-        """Of (n, y, x) counts whose noise is below one, by the likelihood of all
-        pixels' counts together.
+        """Maximum-likelihood level and noise of (n, y, x) counts whose noise is below
+        one.
 
-        Pixels' levels scatter about a common one. Frames of one or two values tell only
-        how noise, scatter and distance
-        to the edge of a count compare, so ``_USUAL`` noise and scatter, each to a
-        factor of two, are taken as known.
-        Pixels farther off than ``_NEAR`` counts are hot: as they read.
+        Pixels' levels scatter normally about a common level; common level, noise and
+        scatter are fitted. Few values do not fix noise and scatter, so both have a
+        log-normal prior about ``_TYPICAL``, a factor of two wide. Pixels more than
+        ``_NORMAL_RANGE`` counts off are hot: their level is their mean.
+
+        Args:
+            frames: (n, y, x) counts.
         """
         counts = np.asarray(frames, float)
         middle = float(np.rint(np.median(counts)))
-        values = np.arange(-_NEAR, _NEAR + 1)
-        often = np.stack([(counts == middle + v).sum(0) for v in values], -1).reshape(
-            -1, len(values)
+        values = np.arange(-_NORMAL_RANGE, _NORMAL_RANGE + 1)
+        histograms = np.stack(
+            [(counts == middle + value).sum(0) for value in values], -1
+        ).reshape(-1, len(values))
+        is_normal = histograms.sum(1) == len(counts)
+        patterns, pattern_of, pattern_counts = np.unique(
+            histograms[is_normal], axis=0, return_inverse=True, return_counts=True
         )
-        near = often.sum(1) == len(counts)
-        kinds, kind, many = np.unique(
-            often[near], axis=0, return_inverse=True, return_counts=True
-        )
-        start = float((counts.mean(0).ravel()[near] - middle).mean())
-        usual = np.array([start, math.log(_USUAL[0]), math.log(_USUAL[1])])
+        start = float((counts.mean(0).ravel()[is_normal] - middle).mean())
+        typical = np.array([start, math.log(_TYPICAL[0]), math.log(_TYPICAL[1])])
 
         def unlikely(x: Array) -> float:
-            away = (x[1:] - usual[1:]) / math.log(2)
-            return float(away @ away) / 2 - float(
-                many @ special.logsumexp(_levels(x, kinds, values)[1], axis=1)
+            deviation = (x[1:] - typical[1:]) / math.log(2)
+            return float(deviation @ deviation) / 2 - float(
+                pattern_counts
+                @ special.logsumexp(_levels(x, patterns, values)[1], axis=1)
             )
 
-        found = optimize.minimize(
+        solution = optimize.minimize(
             unlikely,
-            usual,
+            typical,
             method="Nelder-Mead",
             options={"xatol": 1e-3, "fatol": 1e-3},
         )
-        place, weight = _levels(found.x, kinds, values)
-        share = special.softmax(weight, axis=1)
-        mean = share @ place
-        spread = np.sqrt(np.maximum(share @ place**2 - mean**2, 0.0))
+        levels, log_weight = _levels(solution.x, patterns, values)
+        share = special.softmax(log_weight, axis=1)
+        mean = share @ levels
+        spread = np.sqrt(np.maximum(share @ levels**2 - mean**2, 0.0))
         level = counts.mean(0).ravel()
-        error = np.full(near.shape, counts.std() / math.sqrt(len(counts)))
-        level[near], error[near] = middle + mean[kind.ravel()], spread[kind.ravel()]
+        error = np.full(is_normal.shape, counts.std() / math.sqrt(len(counts)))
+        level[is_normal] = middle + mean[pattern_of.ravel()]
+        error[is_normal] = spread[pattern_of.ravel()]
         return cls(
             level.reshape(counts.shape[1:]),
             error.reshape(counts.shape[1:]),
-            math.exp(found.x[1]),
+            math.exp(solution.x[1]),
         )
 
 
-def _levels(x: Array, kinds: Array, values: Array) -> tuple[Array, Array]:
-    """(levels,) a pixel may have, and (kinds, levels) ln of each one's share with what
-    was read there.
+def _levels(x: Array, patterns: Array, values: Array) -> tuple[Array, Array]:
+    """(levels,) levels that a pixel may have, and (patterns, levels) log-likelihood
+    plus log-prior of each.
 
     Args:
-        x: common level, ln noise, ln scatter of the levels. kinds: (kinds, values) how
-            often each value was read.
+        x: common level, ln noise, ln scatter of the levels.
+        patterns: (patterns, values) how often a pixel read each value.
+        values: (values,) counts relative to the middle.
     """
-    normal = np.linspace(-4, 4, _LEVELS)
-    place = x[0] + math.exp(x[2]) * normal
+    normals = np.linspace(-4, 4, _LEVELS)
+    levels = x[0] + math.exp(x[2]) * normals
     log_chance = np.maximum(
-        _score(values - place[:, None], np.full((1, 1), math.exp(x[1])))[1], -1e4
+        _score(values - levels[:, None], np.full((1, 1), math.exp(x[1])))[1], -1e4
     )
-    return place, kinds @ log_chance.T - normal**2 / 2
+    return levels, patterns @ log_chance.T - normals**2 / 2

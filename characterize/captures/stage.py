@@ -1,5 +1,5 @@
-"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or
-.json with what else is known.
+"""Stage table (stage.csv, stage.json) and description (capture.toml, capture.json) of a
+capture folder.
 """
 
 import csv
@@ -68,7 +68,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 }
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MICRO = str.maketrans("\u00b5\u03bc", "uu")
-_MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
+_SIMILARITY = 0.75  # least similarity of a misspelt name
 _COLUMNS = {"file", "page", *_EXPOSURES, *_ANGLES_Y, *_POSITIONS, *_ANGLES}
 
 
@@ -105,21 +105,19 @@ class StageRows:
 def read_stage(folder: Path) -> StageRows | None:
     """The stage file of a capture folder; None where there is none.
 
-    Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in
-    turn), one of depth/z/position
-    with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``,
-    ``angle_y_deg``, ``exposure_s`` (or ``_ms``, ``_us``).
-    JSON: a list of such objects.
+    Columns: ``file``; ``page`` (from 0; without it a stack has a row for each page in
+    turn); one of depth/z/position with unit, nm to m (``depth_um``, ``z_nm``,
+    ``position_mm``); ``angle_deg``, ``angle_y_deg``; ``exposure_s`` (or ``_ms``,
+    ``_us``). JSON: a list of such objects.
 
     Raises:
-        CaptureError: unknown column, one without its unit, two of depth or of one
-            angle, no column ``file``, columns
-            not parted by commas, more values than columns, a value that is no number, a
-            page that is not whole; file
-            and row are named. A table in another format (``stage.xlsx``).
+        CaptureError: an unknown column, one without its unit, two of depth or of one
+            angle, no column ``file``, another separator than commas, more values than
+            columns, a value that is no number, a page that is not whole; file and row
+            are named. A table in another format (``stage.xlsx``).
     """
     if path := naming.find_table(folder, "stage"):
-        return _rows(
+        return _parse_rows(
             _read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path
         )
     return None
@@ -132,7 +130,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     Raises:
         CaptureError: not TOML or JSON, a misspelt name, or an impossible number.
     """
-    return _about(naming.find_table(folder, "capture"))
+    return _read_description(naming.find_table(folder, "capture"))
 
 
 def read_beside(path: Path) -> dict[str, Any]:
@@ -146,15 +144,18 @@ def read_beside(path: Path) -> dict[str, Any]:
         CaptureError: as :func:`read_about`.
     """
     paths = [path.with_suffix(suffix) for suffix in (".toml", ".json")]
-    return _about(next((p for p in paths if p.is_file()), None))
+    return _read_description(next((p for p in paths if p.is_file()), None))
 
 
-def _about(path: Path | None) -> dict[str, Any]:
+def _read_description(path: Path | None) -> dict[str, Any]:
+    """Checked entries of a TOML or JSON description in the standard units; empty
+    without a file.
+    """
     if path is None:
         return {}
     try:
         text = reading.read_text(path)
-        about = (
+        description = (
             tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
         )
     except (
@@ -164,43 +165,50 @@ def _about(path: Path | None) -> dict[str, Any]:
         raise CaptureError(
             f"{path}: not valid {path.suffix[1:].upper()}: {error}"
         ) from None
-    if not isinstance(about, dict):
+    if not isinstance(description, dict):
         raise CaptureError(
             f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)"
         )
     for name, (entry, scale) in _ALIASES.items():
-        if name in about and entry not in about:
-            value = about.pop(name)
-            about[entry] = value * scale if isinstance(value, int | float) else value
-    if "voxel_um" in about:
-        voxel = about.pop("voxel_um")
+        if name in description and entry not in description:
+            value = description.pop(name)
+            description[entry] = (
+                value * scale if isinstance(value, int | float) else value
+            )
+    if "voxel_um" in description:
+        voxel = description.pop("voxel_um")
         if not isinstance(voxel, list) or len(voxel) != 3:
             raise CaptureError(f"{path}: voxel_um = {voxel!r}, need [z, y, x]")
-        about = {"step_um": voxel[0], "pixel_um": voxel[2]} | about
-    return _checked(about, path)
+        description = {"step_um": voxel[0], "pixel_um": voxel[2]} | description
+    return _check_entries(description, path)
 
 
-def _checked(about: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Entries as they are, whole bits; misspelt names and impossible numbers refused,
-    notes of the user's own kept.
+def _check_entries(description: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The entries, with ``bits`` as an integer.
+
+    Misspelt names and impossible numbers are refused; unfamiliar names stay as notes.
     """
-    for name, value in about.items():
-        close = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=_MISSPELT)
-        if name not in _KNOWN and close:
+    for name, value in description.items():
+        similar = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=_SIMILARITY)
+        if name not in _KNOWN and similar:
             raise CaptureError(
-                f"{path}: unknown entry {name!r}; did you mean {close[0]!r}?"
+                f"{path}: unknown entry {name!r}; did you mean {similar[0]!r}?"
             )
         if name not in _NUMBERS:
             continue
-        need, right = _NUMBERS[name]
+        requirement, is_valid = _NUMBERS[name]
         number = (
             isinstance(value, int | float)
             and not isinstance(value, bool)
             and math.isfinite(value)
         )
-        if not number or not right(value):
-            raise CaptureError(f"{path}: {name} = {value!r}, need a number {need}")
-    return about | ({"bits": int(about["bits"])} if "bits" in about else {})
+        if not number or not is_valid(value):
+            raise CaptureError(
+                f"{path}: {name} = {value!r}, need a number {requirement}"
+            )
+    return description | (
+        {"bits": int(description["bits"])} if "bits" in description else {}
+    )
 
 
 def ome_entries(xml: str, name: str) -> Iterator[dict[str, str]]:
@@ -234,12 +242,12 @@ def ome_positions(xml: str) -> Array:
         ElementTree.ParseError: no XML.
     """
     order = next(ome_entries(xml, "Pixels"), {}).get("DimensionOrder", "XYZCT")
-    slow, fast = (
+    slow_axis, fast_axis = (
         ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
     )
     planes = sorted(
         ome_entries(xml, "Plane"),
-        key=lambda plane: (int(plane.get(slow, 0)), int(plane.get(fast, 0))),
+        key=lambda plane: (int(plane.get(slow_axis, 0)), int(plane.get(fast_axis, 0))),
     )
     units = [plane.get("PositionZUnit", "um").translate(_MICRO) for plane in planes]
     if not all(
@@ -278,15 +286,25 @@ def _read_json(path: Path) -> list[dict[str, Any]]:
     return table
 
 
-def _rows(table: list[dict[str, Any]], path: Path) -> StageRows:
+def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
+    """Rows of a stage table in um, rad and s; refuses wrong or ambiguous columns.
+
+    Args:
+        table: one record a row, by column names.
+        path: the stage file, for messages.
+    """
     if not table:
         raise CaptureError(f"{path}: no rows; need one a frame")
-    parted = next((mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None)
-    if parted:
+    separator = next(
+        (mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None
+    )
+    if separator:
         raise CaptureError(
-            f"{path}: columns parted by {parted!r}; save it with commas, and points in the numbers"
+            f"{path}: columns parted by {separator!r}; save it with commas, and points in the numbers"
         )
-    table = [_plain_keys(entries, path, row) for row, entries in enumerate(table, 2)]
+    table = [
+        _normalized_keys(entries, path, row) for row, entries in enumerate(table, 2)
+    ]
     for row, entries in enumerate(table, 2):
         for key in entries:
             if key in _BARE:
@@ -313,36 +331,37 @@ def _rows(table: list[dict[str, Any]], path: Path) -> StageRows:
             )
     head = table[0].keys()
     for kind in (_POSITIONS, _ANGLES, _ANGLES_Y, _EXPOSURES):
-        if len(stated := [key for key in kind if key in head]) > 1:
+        if len(duplicates := [key for key in kind if key in head]) > 1:
             raise CaptureError(
-                f"{path}: columns {' and '.join(stated)} say the same; leave the one that holds"
+                f"{path}: columns {' and '.join(duplicates)} say the same; leave the one that holds"
             )
-    place = next((key for key in _POSITIONS if key in head), None)
-    timed = next((key for key in _EXPOSURES if key in head), None)
-    angle = [
+    position_column = next((key for key in _POSITIONS if key in head), None)
+    exposure_column = next((key for key in _EXPOSURES if key in head), None)
+    angle_columns = [
         next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)
     ]
-    scales = [_ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle]
+    scales = [
+        _ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle_columns
+    ]
     columns = [
-        _column(table, key, path) * s for key, s in zip(angle, scales, strict=True)
+        _column(table, key, path) * scale
+        for key, scale in zip(angle_columns, scales, strict=True)
     ]
     return StageRows(
         files=tuple(str(entries["file"]) for entries in table),
         page=_pages(table, path) if "page" in head else (None,) * len(table),
-        position_um=_column(table, place, path, np.nan)
-        * _POSITIONS.get(place or "", 1.0),
+        position_um=_column(table, position_column, path, np.nan)
+        * _POSITIONS.get(position_column or "", 1.0),
         angle_rad=np.stack(columns, 1),
         exposure_s=np.full(len(table), np.nan)
-        if timed is None
-        else _exposures(table, timed, path) * _EXPOSURES[timed],
+        if exposure_column is None
+        else _exposures(table, exposure_column, path) * _EXPOSURES[exposure_column],
         source=str(path),
     )
 
 
-def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
-    """A row by column names in small letters, without blanks about them, the micro sign
-    or a Greek letter as u.
-    """
+def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
+    """A row with column names in small letters, without blanks, micro signs as u."""
     if None in entries:
         raise CaptureError(
             f"{path}, row {row}: more values than columns ({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
@@ -370,8 +389,10 @@ def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
         CaptureError: they are called as dark frames or flats, and would not be used.
     """
     named = {normalize_spelling(Path(name).name) for name in rows.files}
-    rest = [path.name for path in files if normalize_spelling(path.name) not in named]
-    for name in rest:
+    unlisted = [
+        path.name for path in files if normalize_spelling(path.name) not in named
+    ]
+    for name in unlisted:
         if kind := re.match(r"(dark|flat)s?(?![a-z])", name.lower()):
             raise CaptureError(
                 f"{rows.source}: {name!r} is not named there and would not be used; put all {kind[1]} frames into one "
@@ -379,9 +400,9 @@ def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
             )
     return (
         (
-            f"{len(rest)} images that {rows.source} does not name left out: {', '.join(rest[:5])}",
+            f"{len(unlisted)} images that {rows.source} does not name left out: {', '.join(unlisted[:5])}",
         )
-        if rest
+        if unlisted
         else ()
     )
 
@@ -392,12 +413,12 @@ def unread_keys_text(about: dict[str, Any]) -> tuple[str, ...]:
     Args:
         about: entries of the capture's description.
     """
-    rest = [reading.to_valid_utf8(name) for name in about if name not in _KNOWN]
+    unread = [reading.to_valid_utf8(name) for name in about if name not in _KNOWN]
     return (
         (
-            f"entries of the description that change nothing, kept as notes: {', '.join(rest[:8])}",
+            f"entries of the description that change nothing, kept as notes: {', '.join(unread[:8])}",
         )
-        if rest
+        if unread
         else ()
     )
 
@@ -410,6 +431,7 @@ def normalize_spelling(name: str) -> str:
 
 
 def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
+    """Page numbers of all rows; refuses fractions."""
     pages = _column(table, "page", path)
     for row, page in enumerate(pages, 2):
         if page != round(page):
@@ -420,6 +442,7 @@ def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
 
 
 def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
+    """(n,) exposures of all rows in the column's unit; refuses 0 and less."""
     times = _column(table, key, path)
     for row, time in enumerate(times, 2):
         if time <= 0:
@@ -432,6 +455,7 @@ def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
 def _column(
     table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0
 ) -> Array:
+    """(n,) finite numbers of a column; ``default`` everywhere where ``key`` is None."""
     if key is None:
         return np.full(len(table), default)
     values = []
@@ -439,14 +463,14 @@ def _column(
         try:
             value = float(entries[key])
         except (TypeError, ValueError, KeyError):
-            found = entries.get(key)
+            text = entries.get(key)
             hint = (
                 " with a point, as 0.73"
-                if isinstance(found, str) and "," in found
+                if isinstance(text, str) and "," in text
                 else ""
             )
             raise CaptureError(
-                f"{path}, row {row}: {key} is {found!r}, need a number{hint}"
+                f"{path}, row {row}: {key} is {text!r}, need a number{hint}"
             ) from None
         if not math.isfinite(value):
             raise CaptureError(

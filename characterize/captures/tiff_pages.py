@@ -19,19 +19,19 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
 DENSEST = 1040  # values' bytes for a byte of the file, at best
-_MOST_BYTES = 1 << 34  # of all frames of a file
+_MOST_BYTES = 1 << 34  # largest size of all frames of a file
 _LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
-_CFA = 32803  # what its values mean: a raw mosaic of colours
-_MEANING = {
+_CFA = 32803  # photometric interpretation of a raw mosaic of colours
+_REFUSED = {
     0: "says that white is 0 (photometric 0)",
     3: "holds places in a table of colours",
 }
-_OPENCV = {
+_OPENCV_CODECS = {
     5: "LZW",
     32773: "PackBits",
 }  # what OpenCV's reader unpacks and tifffile leaves to a package of its own
-_ELSEWHERE = {34925: "LZMA", 50000: "Zstandard"}  # only that package
-_TURNED = 274  # the tag that says which way up an image is
+_IMAGECODECS_ONLY = {34925: "LZMA", 50000: "Zstandard"}  # only that package
+_ORIENTATION_TAG = 274  # the tag that says which way up an image is
 
 
 def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
@@ -40,26 +40,23 @@ def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Ar
     Args:
         path: the file.
         coloured: separate planes are the colours of an image; else they are images,
-            since some writers take a stack of
-            three or four for colours.
-        mosaic: whether it is known how a raw mosaic of colours lies.
+            since some writers take a stack of three or four for colours.
+        mosaic: whether the layout of a raw mosaic of colours is stated.
 
     Raises:
         CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be
-            read, values packed without
-            gaps, pages of different size or type; values where more is less light,
-            places in a table of colours (a
-            table of greys in order gives light), a raw mosaic of which nothing is
-            known.
+            read, values packed without gaps, pages of different size or type; inverted
+            values, colour tables (except of greys in order), a raw mosaic without its
+            layout.
     """
     import tifffile
 
     try:
         with tifffile.TiffFile(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            _check(path, file)
+            _check_pages(path, file)
             _check_meaning(path, file, mosaic=mosaic)
-            images = _images(path, file)
+            images = _read_images(path, file)
             planar = file.pages.first.planarconfig == 2
             if planar and coloured and images.ndim == 4:
                 return np.moveaxis(images, 1, -1)
@@ -80,22 +77,22 @@ def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Ar
 
 
 def count_images(file: Any) -> int:
-    """How many images a file holds: its pages, or what ImageJ laid behind the head of
-    one (stacks above 4 GB).
+    """Number of images of a file: its pages, or of a one-page ImageJ file (stacks above
+    4 GB) the number in its metadata.
     """
-    about = (file.imagej_metadata or {}) if file.is_imagej else {}
+    metadata = (file.imagej_metadata or {}) if file.is_imagej else {}
     return (
-        max(int(str(about.get("images", 1))), 1)
+        max(int(str(metadata.get("images", 1))), 1)
         if len(file.pages) == 1
         else len(file.pages)
     )
 
 
 def page_order(path: Path) -> str | None:
-    """How the images of a file lie where that is sure: "nyx" of pages written one by
-    one, as cameras and image programs
-    do; None of an array that was written at once (tifffile), whose axes may be any,
-    unless it says them.
+    """Order of the axes of a file's images, where it is certain.
+
+    "nyx" for pages written one by one, as cameras and image programs do. An array that
+    tifffile wrote at once may have any order: that of its metadata, else None.
 
     Args:
         path: the file.
@@ -103,79 +100,93 @@ def page_order(path: Path) -> str | None:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
-        about = file.shaped_metadata or ({},)
-        at_once = (
+        metadata = file.shaped_metadata or ({},)
+        is_array = (
             str(file.pages.first.tags.valueof(305, "")).startswith("tifffile")
             or file.is_shaped
         )
-        axes = str(about[0].get("axes", ""))
-        if not at_once or (len(axes) > 2 and axes.endswith("YX")):
+        axes = str(metadata[0].get("axes", ""))
+        if not is_array or (len(axes) > 2 and axes.endswith("YX")):
             return "nyx"
         return "yxn" if axes[:2] == "YX" and len(axes) == 3 else None
 
 
-def _images(path: Path, file: Any) -> Array:
-    count, first = count_images(file), file.pages.first
+def _read_images(path: Path, file: Any) -> Array:
+    """(n, ...) images of all pages, or of ImageJ's large stacks the values after the
+    head of the only page.
+    """
+    count = count_images(file)
+    first = file.pages.first
     if count == len(file.pages):
-        return np.stack(_alike(_pages(path, file), path))
-    begins, size = first.dataoffsets[0], path.stat().st_size
-    if int(first.compression) != 1 or begins + count * first.nbytes > size:
+        return np.stack(_check_equal(_page_images(path, file), path))
+    offset = first.dataoffsets[0]
+    size = path.stat().st_size
+    if int(first.compression) != 1 or offset + count * first.nbytes > size:
         raise CaptureError(
             f"{path}: says {count} images, as ImageJ writes large stacks, and has room for "
-            f"{max((size - begins) // first.nbytes, 1)} ({size} bytes): truncated, or cut out of a stack; save it anew"
+            f"{max((size - offset) // first.nbytes, 1)} ({size} bytes): truncated, or cut out of a stack; save it anew"
         )
-    kind = first.dtype.newbyteorder(file.byteorder)
-    values = np.fromfile(path, kind, count * math.prod(first.shape), offset=begins)
+    dtype = first.dtype.newbyteorder(file.byteorder)
+    values = np.fromfile(path, dtype, count * math.prod(first.shape), offset=offset)
     return values.astype(first.dtype, copy=False).reshape(count, *first.shape)
 
 
-def _pages(path: Path, file: Any) -> list[Array]:
-    """The image of every page, in the file's own order of colours."""
-    packed = {
-        n for n, page in enumerate(file.pages) if int(page.compression) in _OPENCV
+def _page_images(path: Path, file: Any) -> list[Array]:
+    """Image of every page, in the file's own order of colours.
+
+    Without imagecodecs, LZW and PackBits pages are read by OpenCV.
+    """
+    compressed = {
+        n
+        for n, page in enumerate(file.pages)
+        if int(page.compression) in _OPENCV_CODECS
     }
-    if not packed or importlib.util.find_spec("imagecodecs") is not None:
+    if not compressed or importlib.util.find_spec("imagecodecs") is not None:
         return [page.asarray() for page in file.pages]
-    found = _unpacked(path)
+    unpacked = _opencv_images(path)
     images = []
     for number, page in enumerate(file.pages):
-        if number not in packed:
+        if number not in compressed:
             images.append(page.asarray())
             continue
-        image = found[number] if len(found) == len(file.pages) else np.empty(0)
-        turned = page.tags.valueof(_TURNED, 1) != 1  # which OpenCV turns upright
-        if turned or image.shape != page.shape or image.dtype != page.dtype:
+        image = unpacked[number] if len(unpacked) == len(file.pages) else np.empty(0)
+        is_turned = (
+            page.tags.valueof(_ORIENTATION_TAG, 1) != 1
+        )  # which OpenCV turns upright
+        if is_turned or image.shape != page.shape or image.dtype != page.dtype:
             raise CaptureError(
-                f"{path}: frame {number} is compressed ({_OPENCV[int(page.compression)]}) and damaged, turned or of a "
-                f"kind ({page.dtype}) that is not read so; save it plain or deflated, or install imagecodecs"
+                f"{path}: frame {number} is compressed ({_OPENCV_CODECS[int(page.compression)]}) and damaged, "
+                f"turned or of a kind ({page.dtype}) that is not read so; save it plain or deflated, or install imagecodecs"
             )
         images.append(red_first(image))
     return images
 
 
-def _unpacked(path: Path) -> Sequence[Array]:
-    """All images of a file as OpenCV reads them, without its own words on what it
-    cannot.
-    """
+def _opencv_images(path: Path) -> Sequence[Array]:
+    """All images of a file as OpenCV reads them, with its log switched off."""
     import cv2
 
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    previous_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         return tuple(cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)[1])
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        cv2.utils.logging.setLogLevel(previous_level)
 
 
-def _check(path: Path, file: Any) -> None:
+def _check_pages(path: Path, file: Any) -> None:
+    """Refuse pages that form a ring, claim more values than the file can hold, are
+    truncated, lossy, or need imagecodecs that is not installed.
+    """
     size = path.stat().st_size
-    claimed, begun = 0, set[int]()
+    claimed = 0
+    offsets = set[int]()
     for number, page in enumerate(file.pages):
         claimed += page.nbytes
-        if page.offset in begun:  # the library would go round for ever
+        if page.offset in offsets:  # the library would go round for ever
             raise CaptureError(
                 f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring"
             )
-        begun.add(page.offset)
+        offsets.add(page.offset)
         if (
             page.nbytes > DENSEST * sum(page.databytecounts) + 65536
             or claimed > _MOST_BYTES
@@ -184,22 +195,30 @@ def _check(path: Path, file: Any) -> None:
                 f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes"
             )
         end = max(
-            (a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)),
+            (
+                start + length
+                for start, length in zip(
+                    page.dataoffsets, page.databytecounts, strict=True
+                )
+            ),
             default=0,
         )
         if not 0 < end <= size:
             raise CaptureError(
                 f"{path}: truncated in frame {number} ({size} bytes, need {end})"
             )
-        packed = int(page.compression)
-        if packed in _LOSSY:
+        compression = int(page.compression)
+        if compression in _LOSSY:
             raise CaptureError(
                 f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain"
             )
-        if packed in _ELSEWHERE and importlib.util.find_spec("imagecodecs") is None:
+        if (
+            compression in _IMAGECODECS_ONLY
+            and importlib.util.find_spec("imagecodecs") is None
+        ):
             raise CaptureError(
-                f"{path}: frame {number} is compressed ({_ELSEWHERE[packed]}); save it plain or deflated, or install "
-                "imagecodecs"
+                f"{path}: frame {number} is compressed ({_IMAGECODECS_ONLY[compression]}); save it plain or "
+                "deflated, or install imagecodecs"
             )
         if (
             page.bitspersample not in (8, 16, 32, 64)
@@ -212,12 +231,14 @@ def _check(path: Path, file: Any) -> None:
 
 
 def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
-    """Refuse what values are not light, or not the same light in each pixel."""
+    """Refuse pages whose values are not light (white is 0, colour tables), or a raw
+    mosaic that the description does not state.
+    """
     for number, page in enumerate(file.pages):
         meaning = int(getattr(page, "photometric", 1))
-        if meaning in _MEANING and not _grey_table(page):
+        if meaning in _REFUSED and not _grey_table(page):
             raise CaptureError(
-                f"{path}: frame {number} {_MEANING[meaning]}, so that its values are not light; save grey frames in "
+                f"{path}: frame {number} {_REFUSED[meaning]}, so that its values are not light; save grey frames in "
                 "which black is 0"
             )
         if meaning == _CFA and not mosaic:
@@ -228,17 +249,20 @@ def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
 
 
 def _grey_table(page: Any) -> bool:
-    """Whether a table of colours gives every value the grey in proportion to it, as
-    some microscopes write theirs.
+    """Whether a page's colour table maps every value to the grey proportional to it, as
+    some microscopes write.
     """
     table = getattr(page, "colormap", None)
     if table is None:
         return False
-    grey = np.arange(table.shape[1]) * (65_535 / (table.shape[1] - 1))
-    return bool((np.abs(table - grey) <= grey[1]).all())  # 257 or 256 a step of 8 bits
+    linear = np.arange(table.shape[1]) * (65_535 / (table.shape[1] - 1))
+    return bool(
+        (np.abs(table - linear) <= linear[1]).all()
+    )  # 257 or 256 a step of 8 bits
 
 
-def _alike(pages: Sequence[Array], path: Path) -> Sequence[Array]:
+def _check_equal(pages: Sequence[Array], path: Path) -> Sequence[Array]:
+    """The pages; refuses pages of different size or type."""
     for number, page in enumerate(pages):
         if page.shape != pages[0].shape:
             raise CaptureError(

@@ -40,41 +40,44 @@ def run(options: Options) -> int:
 
 
 def _plan(options: Options, path: Path) -> int:
+    """Plan the captures of a protocol, write them as a stage table, print; exit 0."""
     if options.spread:
         raise ConfigError(
             "--workers shares out the frames of --truth; a plan takes none"
         )
     target = options.output
-    wanted = config.load(path, BenchProtocol)
+    bench_protocol = config.load(path, BenchProtocol)
     design = lenses.load(options.lens)
     with options.claim(target) as draft:
-        found = protocol.plan_captures(design, wanted, log_response_slopes(design))
-        store.write_text(draft.path, _listed(found))
-    rows = _rows(found)
-    values = {"file": str(target), "frames": rows, "gain": found.gain.tolist()}
-    values |= {"sigma": dict(zip(found.names, found.sigma.tolist(), strict=True))}
-    values |= {"warnings": list(found.warnings)}
+        plan = protocol.plan_captures(
+            design, bench_protocol, log_response_slopes(design)
+        )
+        store.write_text(draft.path, _stage_csv(plan))
+    rows = _rows(plan)
+    values = {"file": str(target), "frames": rows, "gain": plan.gain.tolist()}
+    values |= {"sigma": dict(zip(plan.names, plan.sigma.tolist(), strict=True))}
+    values |= {"warnings": list(plan.warnings)}
     values |= {
-        "even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))
+        "even_sigma": dict(zip(plan.names, plan.even_sigma.tolist(), strict=True))
     }
-    values |= {
-        "untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))
-    }
+    values |= {"untold_sigma": dict(zip(plan.names, plan.untold.tolist(), strict=True))}
     lines = [
         f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
         for z, angle, time in rows
     ]
-    whole = np.hypot(found.sigma, found.untold)
+    total_sigma = np.hypot(plan.sigma, plan.untold)
     lines.append(
         "  half of a 95 % interval, with what nobody states; within the model; so with frames evenly spread"
     )
-    columns = (protocol.REACH * part for part in (whole, found.sigma, found.even_sigma))
-    table = zip(found.names, *columns, strict=True)
+    columns = (
+        protocol.REACH * part for part in (total_sigma, plan.sigma, plan.even_sigma)
+    )
+    table = zip(plan.names, *columns, strict=True)
     lines += [
         f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}"
         for n, total, own, even in table
     ]
-    lines += [f"  note: {words}" for words in found.warnings]
+    lines += [f"  note: {words}" for words in plan.warnings]
     options.console.result(
         values,
         "\n".join([f"{target}: {len(rows)} frames, the most telling first", *lines]),
@@ -82,53 +85,54 @@ def _plan(options: Options, path: Path) -> int:
     return 0
 
 
-def _rows(found: CapturePlan) -> list[tuple[float, float, float]]:
+def _rows(plan: CapturePlan) -> list[tuple[float, float, float]]:
     """Depth, angle and exposure of the frames to take."""
     return list(
         zip(
-            found.depth_um.tolist(),
-            found.angle_deg.tolist(),
-            found.exposure.tolist(),
+            plan.depth_um.tolist(),
+            plan.angle_deg.tolist(),
+            plan.exposure.tolist(),
             strict=True,
         )
     )
 
 
-def _listed(found: CapturePlan) -> str:
-    """The frames to take, as rows of a stage.csv but for the times, which the bench
-    sets in proportion to ``relative_exposure``.
+def _stage_csv(plan: CapturePlan) -> str:
+    """CSV text of a stage table of the planned frames: file, depth, angle, relative
+    exposure.
     """
     lines = ["file,depth_um,angle_deg,relative_exposure"]
     lines += [
         f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}"
-        for i, (z, angle, time) in enumerate(_rows(found))
+        for i, (z, angle, time) in enumerate(_rows(plan))
     ]
     return "\n".join(lines) + "\n"
 
 
 def _shoot(options: Options, path: Path) -> int:
+    """Simulate the captures of a hidden lens, write the capture folder, print; exit 0."""
     target = options.output
     truth = config.load(path, HiddenLens)
     design = lenses.load(options.lens)
     frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
     room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
     with options.claim_folder(target, room=room) as draft, options.shared():
-        shots = bench.simulate_frames(
+        simulated = bench.simulate_frames(
             design,
             truth,
             log_response_slopes(
                 design, wanted=[k.name for k in truth.parameter if k.value]
             ),
         )
-        write_captures(draft.path, shots, truth, design)
+        write_captures(draft.path, simulated, truth, design)
     values = {
         "folder": str(target),
-        "frames": len(shots.frames),
-        "peak_e": float(shots.electrons.max()),
+        "frames": len(simulated.frames),
+        "peak_e": float(simulated.electrons.max()),
     }
     options.console.result(
         values,
-        f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons",
+        f"{target}: {len(simulated.frames)} frames, peak {simulated.electrons.max():.0f} electrons",
     )
     return 0
 
@@ -159,15 +163,15 @@ def write_captures(
         tifffile.imwrite(
             folder / f"{name}.tif", stack, photometric="minisblack", metadata=None
         )
-    about = {
+    description = {
         "pixel_um": truth.camera.pixel_um,
         "wavelength_um": lens.wavelength_um,
         "bits": truth.camera.bits,
     }
-    about |= {
+    description |= {
         "pixel_sigma_um": 0.0,
         **dict.fromkeys(_STATED, 0.0),
     }  # a bench knows what stands on it
-    about |= {k.name: k.value for k in truth.parameter if k.name in _STATED}
-    text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
+    description |= {k.name: k.value for k in truth.parameter if k.name in _STATED}
+    text = "".join(f"{name} = {value!r}\n" for name, value in description.items())
     (folder / "capture.toml").write_text(text, encoding="utf-8")

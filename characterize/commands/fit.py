@@ -63,7 +63,9 @@ def run(options: Options) -> int:
 
 
 def _run_lens(options: Options, design: Path, target: Path) -> int:
-    lens, shots = lenses.load(design), captures.load(options.capture)
+    """Fit an as-built lens, write it with its page, print; the exit status."""
+    lens = lenses.load(design)
+    capture = captures.load(options.capture)
     metrology = (
         config.load(options.metrology, MetrologySettings)
         if options.metrology
@@ -77,35 +79,43 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
         insist=options.insist,
     )
     truth = config.load(options.truth, HiddenLens) if options.truth else None
-    hidden = {k.name: k.value for k in truth.parameter} if truth else None
-    about = _provenance(options, design)
+    true_values = {k.name: k.value for k in truth.parameter} if truth else None
+    provenance = _provenance(options, design)
     with options.claim(
-        target, companions=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+        target, companions=report.BESIDE, room=transaction.ROOM + capture.frames.nbytes
     ) as draft:
-        result = dataclasses.replace(fit(shots, lens, choice), provenance=about)
+        result = dataclasses.replace(fit(capture, lens, choice), provenance=provenance)
         asbuilt.save(draft.path, result)
-        report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
+        report.asbuilt_report(
+            draft.path.with_suffix(".html"), result, truth=true_values
+        )
     return options.console.judged(
         _lens_values(result), _lens_text(result, target), result.problems
     )
 
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
+    """Fit a pupil, write it with its page, print; the exit status."""
     spec = config.load(pupil, PupilSpec)
     if spec.mask is not None:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
-    shots = captures.load(options.capture)
-    about = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
+    capture = captures.load(options.capture)
+    provenance = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
     with options.claim(
-        target, companions=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+        target, companions=report.BESIDE, room=transaction.ROOM + capture.frames.nbytes
     ) as draft:
-        found = fit_pupil(shots, spec, insist=options.insist)
-        save(draft.path, found, about)
-        report.pupil_report(draft.path.with_suffix(".html"), found)
-    return options.console.judged(_values(found), _text(found, target), found.problems)
+        pupil_fit = fit_pupil(capture, spec, insist=options.insist)
+        save(draft.path, pupil_fit, provenance)
+        report.pupil_report(draft.path.with_suffix(".html"), pupil_fit)
+    return options.console.judged(
+        _values(pupil_fit), _text(pupil_fit, target), pupil_fit.problems
+    )
 
 
 def _provenance(options: Options, *sources: Path) -> store.Provenance:
+    """Settings as text, and the SHA-256 of every capture file, source and settings
+    file by name.
+    """
     path = options.capture
     files = (
         sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
@@ -122,6 +132,7 @@ def _provenance(options: Options, *sources: Path) -> store.Provenance:
 
 
 def _lens_values(result: AsBuilt) -> dict[str, object]:
+    """Numbers of an as-built fit for JSON: parameters, intervals, chi², verdicts."""
     rows = zip(result.names, result.value, result.sigma, strict=True)
     words = {
         name: list(getattr(result, name))
@@ -141,6 +152,7 @@ def _lens_values(result: AsBuilt) -> dict[str, object]:
 
 
 def _lens_text(result: AsBuilt, target: Path) -> str:
+    """Text of an as-built fit for the console: verdicts, table of parameters, notes."""
     lines = [
         f"{target}: fitted to {len(result.measured)} frames, chi² / dof {result.chi2_per_dof:.3f}; {result.reason}"
     ]
@@ -164,11 +176,12 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
     return "\n".join(lines)
 
 
-def _values(found: PupilFit) -> dict[str, object]:
+def _values(pupil_fit: PupilFit) -> dict[str, object]:
+    """Numbers of a pupil fit for JSON: agreement, chi², optics, parameters, cautions."""
     scores = {
-        "agreement": found.agreement,
-        "held_out": found.held_out,
-        "spline": found.between,
+        "agreement": pupil_fit.agreement,
+        "held_out": pupil_fit.held_out,
+        "spline": pupil_fit.between,
     }
     return {
         **{
@@ -176,34 +189,39 @@ def _values(found: PupilFit) -> dict[str, object]:
             for key, score in scores.items()
             if score is not None
         },
-        "chi2_per_dof": found.chi2_per_dof,
-        "converged": found.converged,
-        "reason": found.reason,
-        "optics": {name: [value, sigma] for name, value, sigma in found.optics},
+        "chi2_per_dof": pupil_fit.chi2_per_dof,
+        "converged": pupil_fit.converged,
+        "reason": pupil_fit.reason,
+        "optics": {name: [value, sigma] for name, value, sigma in pupil_fit.optics},
         "parameters": {
             n: [float(v), float(s)]
-            for n, v, s in zip(found.names, found.value, found.sigma, strict=True)
+            for n, v, s in zip(
+                pupil_fit.names, pupil_fit.value, pupil_fit.sigma, strict=True
+            )
         },
-        "cautions": list(found.cautions),
-        "problems": list(found.problems),
+        "cautions": list(pupil_fit.cautions),
+        "problems": list(pupil_fit.problems),
     }
 
 
-def _text(found: PupilFit, target: Path) -> str:
-    lines = [f"{target}: pupil fitted to {len(found.measured)} planes; {found.reason}"]
+def _text(pupil: PupilFit, target: Path) -> str:
+    """Text of a pupil fit for the console: agreement, first 12 parameters, notes."""
+    lines = [f"{target}: pupil fitted to {len(pupil.measured)} planes; {pupil.reason}"]
     scores = (
-        ("all planes fitted", found.agreement),
-        ("odd planes predicted from even", found.held_out),
+        ("all planes fitted", pupil.agreement),
+        ("odd planes predicted from even", pupil.held_out),
     )
     for label, score in (
         *scores,
-        ("the same by a cubic spline, without physics", found.between),
+        ("the same by a cubic spline, without physics", pupil.between),
     ):
         if score is not None:
             numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
             lines.append(f"  {label}: {numbers}")
     lines += [
-        f"  {n} = {v:.4g} +- {s:.2g}"
-        for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
+        f"  {name} = {value:.4g} +- {sigma:.2g}"
+        for name, value, sigma in zip(
+            pupil.names[:12], pupil.value, pupil.sigma, strict=False
+        )
     ]
-    return "\n".join(lines + ["  note: " + words for words in found.cautions])
+    return "\n".join(lines + ["  note: " + words for words in pupil.cautions])

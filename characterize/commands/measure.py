@@ -69,7 +69,7 @@ class Options(CommonOptions):
 
 def run(options: Options) -> int:
     """Measure and write; exit 0, or 1 where no pillar could be measured or most sites
-    hold what is no round one.
+    hold no round pillar.
 
     Args:
         options: options of the command.
@@ -78,15 +78,15 @@ def run(options: Options) -> int:
         options = dataclasses.replace(
             options, pixel_nm=sem.instrument_pixel_nm(options.source)
         )
-    of_pillars = options.pixel_nm is not None or options.bar_nm is not None
-    if of_pillars and options.edge_um is not None:
+    is_micrograph = options.pixel_nm is not None or options.bar_nm is not None
+    if is_micrograph and options.edge_um is not None:
         raise ConfigError(
             "give --edge-um (a slanted edge), or --pixel-nm or --bar-nm (pillars), not both"
         )
     if options.edge_um is not None and not 0 < options.edge_um < math.inf:
         raise ConfigError(f"--edge-um {options.edge_um}: need the pixel in um, above 0")
     measure = (
-        _micrograph if of_pillars else _frames if options.edge_um is None else _edge
+        _micrograph if is_micrograph else _frames if options.edge_um is None else _edge
     )
     with options.claim_folder(options.output) as draft:
         values, text, failures = measure(options, draft.path)
@@ -94,39 +94,47 @@ def run(options: Options) -> int:
 
 
 def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
-    """Measure captures into the folder: numbers, text, and no failure."""
-    shots = captures.load(options.source)
+    """Measure captures and write frames.csv, measure.json and measure.html into the
+    folder.
+
+    Returns:
+        Numbers for JSON, text for the console, no failures.
+    """
+    capture = captures.load(options.source)
     design = lenses.load(options.design) if options.design else None
-    found = frames.measure_frames(shots, design=design, reference_e=options.reference_e)
-    rows = [_plain(row) for row in found.frames]
+    quality = frames.measure_frames(
+        capture, design=design, reference_e=options.reference_e
+    )
+    rows = [_frame_row(row) for row in quality.frames]
     values: dict[str, object] = {
         "frames": rows,
-        "best_depth": _by_field(found.best_depth_um, "depth_um"),
-        "distortion": _by_field(found.distortion, "distortion"),
-        "notes": list(found.notes),
+        "best_depth": _by_field(quality.best_depth_um, "depth_um"),
+        "distortion": _by_field(quality.distortion, "distortion"),
+        "notes": list(quality.notes),
     }
     store.write_text(folder / "frames.csv", _table(rows))
     store.write_text(folder / "measure.json", _json(values))
-    measure_page.frames_page(folder / "measure.html", found)
+    measure_page.frames_page(folder / "measure.html", quality)
     lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
         f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, MTF50 {r.mtf50_x_per_um:.3g} / "
         f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
-        for r in found.frames
+        for r in quality.frames
     ]
     lines += [
         f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um"
-        for (x, y), z in found.best_depth_um.items()
+        for (x, y), z in quality.best_depth_um.items()
     ]
     lines += [
         f"  distortion at {x:g}, {y:g} deg: {d:+.3%}"
-        for (x, y), d in found.distortion.items()
+        for (x, y), d in quality.distortion.items()
     ]
-    lines += [f"  note: {words}" for words in found.notes]
+    lines += [f"  note: {words}" for words in quality.notes]
     return values, "\n".join(lines), []
 
 
 def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, float]]:
+    """Records of both field angles in degrees and a value under ``name``."""
     return [
         {"angle_deg": x, "angle_y_deg": y, name: value}
         for (x, y), value in values.items()
@@ -134,16 +142,19 @@ def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, fl
 
 
 def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
-    """Measure the modulation across an edge into the folder: numbers, text, and no
-    failure.
+    """Measure the MTF across an edge and write edge.csv, measure.json and measure.html
+    into the folder.
+
+    Returns:
+        Numbers for JSON, text for the console, no failures.
     """
     image = _cropped(picture.read_picture(options.source), options.crop)
     pixel = float(options.edge_um or 0)
-    found = metrics.mtf_of_edge(image, pixel_um=pixel)
-    curve = np.stack([found.frequency_per_um, found.modulation], 1)
-    keep = found.frequency_per_um <= 1 / pixel
+    mtf = metrics.mtf_of_edge(image, pixel_um=pixel)
+    curve = np.stack([mtf.frequency_per_um, mtf.modulation], 1)
+    keep = mtf.frequency_per_um <= 1 / pixel
     values: dict[str, object] = {
-        "mtf50_per_um": found.mtf50_per_um,
+        "mtf50_per_um": mtf.mtf50_per_um,
         "nyquist_per_um": 0.5 / pixel,
         "pixel_um": pixel,
     }
@@ -153,49 +164,55 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[
     ]
     store.write_text(folder / "edge.csv", _table(rows))
     store.write_text(folder / "measure.json", _json(values))
-    measure_page.edge_page(folder / "measure.html", image, found, pixel_um=pixel)
-    text = f"{options.output}: modulation one half at {found.mtf50_per_um:.4g} per um (Nyquist {0.5 / pixel:.4g})"
+    measure_page.edge_page(folder / "measure.html", image, mtf, pixel_um=pixel)
+    text = f"{options.output}: modulation one half at {mtf.mtf50_per_um:.4g} per um (Nyquist {0.5 / pixel:.4g})"
     return values, text, []
 
 
 def _micrograph(
     options: Options, folder: Path
 ) -> tuple[dict[str, object], str, list[str]]:
-    """Measure a picture of pillars into the folder: numbers, text, and why its pillars
-    are not measured.
+    """Measure the pillars of a micrograph and write pillars.csv, measure.json,
+    measure.html and, where it is certain, bias.toml into the folder.
+
+    Returns:
+        Numbers for JSON, text for the console, failures.
     """
     whole = picture.read_picture(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = (
         _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
     )
-    found = sem.measure_diameters(
+    pillars = sem.measure_diameters(
         image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm)
     )
-    laid: overlay.MaskOverlay | None = None
+    on_mask: overlay.MaskOverlay | None = None
     table: overlay.Table = []
     scale = 1.0
     if options.design is not None:
-        design = _drawn_round(options.design)
-        laid = overlay.overlay_design(found, design)
-        scale = overlay.lattice_scale(found, pixel, design)
-        sure = (
-            laid.clearly and abs(scale - 1) < overlay.SCALE
-        )  # elsewhere, other diameters were drawn
-        table = overlay.bias_table(laid) if sure else []
-        found = overlay.register_to_mask(found, laid)
-    values = _summary(found, laid, table, pixel) | (
-        {"pitch_over_design": scale} if laid is not None else {}
+        design = _round_design(options.design)
+        on_mask = overlay.overlay_design(pillars, design)
+        scale = overlay.lattice_scale(pillars, pixel, design)
+        is_certain = (
+            on_mask.clearly and abs(scale - 1) < overlay.SCALE
+        )  # another place or scale has other drawn diameters
+        table = overlay.bias_table(on_mask) if is_certain else []
+        pillars = overlay.register_to_mask(pillars, on_mask)
+    values = _summary(pillars, on_mask, table, pixel) | (
+        {"pitch_over_design": scale} if on_mask is not None else {}
     )
-    store.write_text(folder / "pillars.csv", _table(_pillars(found, laid)))
+    store.write_text(folder / "pillars.csv", _table(_pillars(pillars, on_mask)))
     store.write_text(folder / "measure.json", _json(values))
     if table:
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(
-        folder / "measure.html", image, found, laid, table, pixel_nm=pixel
+        folder / "measure.html", image, pillars, on_mask, table, pixel_nm=pixel
     )
-    lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
+    lines = [
+        _pillars_text(pillars, on_mask, table, options.output),
+        *_scale_text(scale, pixel),
+    ]
     if not options.crop and len(image) < len(whole):
         lines.append(
             f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise"
@@ -204,24 +221,28 @@ def _micrograph(
         lines.append(
             "  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds"
         )
-    return values, "\n".join(lines), _unmeasured(found, pixel)
+    return values, "\n".join(lines), _unmeasured(pillars, pixel)
 
 
-def _unmeasured(found: sem.MeasuredDiameters, pixel_nm: float) -> list[str]:
-    """Why a picture's pillars are not measured; nothing where they are."""
-    if float((found.collapsed | found.oval).mean()) > sem.MOST:
+def _unmeasured(pillars: sem.MeasuredDiameters, pixel_nm: float) -> list[str]:
+    """Failures of a micrograph in words: most sites without a round pillar, or no
+    diameter; empty otherwise.
+    """
+    if float((pillars.collapsed | pillars.oval).mean()) > sem.MOST:
         return [
-            f"most sites hold no round pillar: is the lattice of {found.lattice.pitch_px * pixel_nm:.4g} nm right? "
+            f"most sites hold no round pillar: is the lattice of {pillars.lattice.pitch_px * pixel_nm:.4g} nm right? "
             "--pitch-nm states it (tops may be dark, but rims must stand out from the ground by more than noise and "
             "blur leave)"
         ]
     return (
-        [] if np.isfinite(found.diameter_nm).any() else ["no pillar could be measured"]
+        []
+        if np.isfinite(pillars.diameter_nm).any()
+        else ["no pillar could be measured"]
     )
 
 
-def _drawn_round(path: Path) -> DiameterMap:
-    """What the mask of a lens draws, where its pillars are round."""
+def _round_design(path: Path) -> DiameterMap:
+    """Diameters drawn on the mask of a lens file; refuses pillars that are not round."""
     design = lenses.load(path)
     if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
         raise CaptureError(
@@ -231,6 +252,7 @@ def _drawn_round(path: Path) -> DiameterMap:
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
+    """The picture cut to (top, bottom, left, right) pixels; whole without ``crop``."""
     if crop is None:
         return image
     top, bottom, left, right = crop
@@ -243,78 +265,92 @@ def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
 
 
 def _summary(
-    found: sem.MeasuredDiameters,
-    laid: overlay.MaskOverlay | None,
+    pillars: sem.MeasuredDiameters,
+    on_mask: overlay.MaskOverlay | None,
     table: overlay.Table,
     pixel: float,
 ) -> dict[str, object]:
+    """Numbers of a micrograph for measure.json: counts by state, lattice, mean and 3
+    sigma of the diameters in nm; place on the mask and bias table with a design.
+    """
     values: dict[str, object] = {
-        "pillars": len(found.diameter_nm),
-        "missing": int(found.missing.sum()),
-        "collapsed": int(found.collapsed.sum()),
-        "oval": int(found.oval.sum()),
-        "lattice": found.lattice.kind,
+        "pillars": len(pillars.diameter_nm),
+        "missing": int(pillars.missing.sum()),
+        "collapsed": int(pillars.collapsed.sum()),
+        "oval": int(pillars.oval.sum()),
+        "lattice": pillars.lattice.kind,
         "pixel_nm": pixel,
-        "pitch_nm": found.lattice.pitch_px * pixel,
-        "mean_nm": found.mean_nm,
-        "three_sigma_nm": found.three_sigma_nm,
+        "pitch_nm": pillars.lattice.pitch_px * pixel,
+        "mean_nm": pillars.mean_nm,
+        "three_sigma_nm": pillars.three_sigma_nm,
     }
-    if laid is not None:
+    if on_mask is not None:
         values |= {
-            "mask_row": laid.row,
-            "mask_column": laid.column,
-            "place_is_clear": laid.clearly,
-            "outliers": int(laid.outlier.sum()),
+            "mask_row": on_mask.row,
+            "mask_column": on_mask.column,
+            "place_is_clear": on_mask.clearly,
+            "outliers": int(on_mask.outlier.sum()),
             "bias_nm": [list(row) for row in table],
         }
     return values
 
 
 def _pillars(
-    found: sem.MeasuredDiameters, laid: overlay.MaskOverlay | None
+    pillars: sem.MeasuredDiameters, on_mask: overlay.MaskOverlay | None
 ) -> list[dict[str, object]]:
+    """One record a pillar for pillars.csv: site, place in pixels, diameter and standard
+    error in nm, state; drawn diameter and error with a design.
+    """
     rows: list[dict[str, object]] = []
-    of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
-    for k in range(len(found.diameter_nm)):
-        state = next((word for word, which in of.items() if which[k]), "good")
+    flags = {
+        "missing": pillars.missing,
+        "collapsed": pillars.collapsed,
+        "oval": pillars.oval,
+    }
+    for k in range(len(pillars.diameter_nm)):
+        state = next((word for word, flagged in flags.items() if flagged[k]), "good")
         row: dict[str, object] = {
-            "site_row": int(found.site[k, 0]),
-            "site_column": int(found.site[k, 1]),
-            "row_px": round(float(found.row[k]), 3),
-            "column_px": round(float(found.column[k]), 3),
-            "diameter_nm": round(float(found.diameter_nm[k]), 3),
-            "sigma_nm": round(float(found.sigma_nm[k]), 3),
+            "site_row": int(pillars.site[k, 0]),
+            "site_column": int(pillars.site[k, 1]),
+            "row_px": round(float(pillars.row[k]), 3),
+            "column_px": round(float(pillars.column[k]), 3),
+            "diameter_nm": round(float(pillars.diameter_nm[k]), 3),
+            "sigma_nm": round(float(pillars.sigma_nm[k]), 3),
             "state": state,
         }
-        if laid is not None:
+        if on_mask is not None:
             row |= {
-                "designed_nm": round(float(laid.designed_nm[k]), 3),
-                "error_nm": round(float(laid.error_nm[k]), 3),
-                "outlier": bool(laid.outlier[k]),
+                "designed_nm": round(float(on_mask.designed_nm[k]), 3),
+                "error_nm": round(float(on_mask.error_nm[k]), 3),
+                "outlier": bool(on_mask.outlier[k]),
             }
         rows.append(row)
     return rows
 
 
-def _words(
-    found: sem.MeasuredDiameters,
-    laid: overlay.MaskOverlay | None,
+def _pillars_text(
+    pillars: sem.MeasuredDiameters,
+    on_mask: overlay.MaskOverlay | None,
     table: overlay.Table,
     target: Path,
 ) -> str:
-    gone, fallen = int(found.missing.sum()), int(found.collapsed.sum())
+    """Text for the console: counts by state, mean diameter, place on the mask, bias
+    table.
+    """
+    missing = int(pillars.missing.sum())
+    collapsed = int(pillars.collapsed.sum())
     lines = [
-        f"{target}: {len(found.diameter_nm)} sites of a {found.lattice.kind} lattice, {gone} missing, {fallen} "
-        f"collapsed; mean {found.mean_nm:.2f} nm, 3 sigma {found.three_sigma_nm:.2f} nm"
+        f"{target}: {len(pillars.diameter_nm)} sites of a {pillars.lattice.kind} lattice, {missing} missing, "
+        f"{collapsed} collapsed; mean {pillars.mean_nm:.2f} nm, 3 sigma {pillars.three_sigma_nm:.2f} nm"
     ]
-    if found.oval.any():
+    if pillars.oval.any():
         lines.append(
-            f"  {int(found.oval.sum())} are oval, longer than wide by more than 15 %: not measured"
+            f"  {int(pillars.oval.sum())} are oval, longer than wide by more than 15 %: not measured"
         )
-    if laid is not None:
+    if on_mask is not None:
         unsure = " (not clear: other places fit nearly as well; no bias table; take a wider picture)"
         lines.append(
-            f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}"
+            f"  on the mask from row {on_mask.row}, column {on_mask.column}{'' if on_mask.clearly else unsure}"
         )
         lines += [
             f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)"
@@ -323,8 +359,10 @@ def _words(
     return "\n".join(lines)
 
 
-def _scale_words(scale: float, pixel_nm: float) -> list[str]:
-    """What to do where the picture's lattice is not as wide as the mask's."""
+def _scale_text(scale: float, pixel_nm: float) -> list[str]:
+    """Advice where the lattice constants of picture and mask differ by more than
+    :data:`overlay.SCALE`; empty otherwise.
+    """
     if abs(scale - 1) < overlay.SCALE:
         return []
     return [
@@ -333,7 +371,8 @@ def _scale_words(scale: float, pixel_nm: float) -> list[str]:
     ]
 
 
-def _plain(row: frames.FrameMetrics) -> dict[str, object]:
+def _frame_row(row: frames.FrameMetrics) -> dict[str, object]:
+    """Metrics of a frame as one flat record."""
     values: dict[str, object] = dataclasses.asdict(row)
     del values["spot"]
     spot: dict[str, object] = dataclasses.asdict(row.spot)
@@ -348,6 +387,7 @@ def _json(values: dict[str, object]) -> str:
 
 
 def _table(rows: Sequence[dict[str, object]]) -> str:
+    """CSV text of records with equal keys."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()

@@ -11,7 +11,7 @@ from characterize.measure import frames, metrics, overlay, sem
 from metalens.core import report
 from metalens.core.arrays import Array
 
-COLUMNS = {  # of a frame's record, and as the page has them
+COLUMNS = {  # attribute of a frame's record: heading on the page
     "name": "frame",
     "depth_um": "depth / µm",
     "angle_deg": "angle along x / deg",
@@ -28,7 +28,8 @@ _NAMED = 8  # lines that a legend holds
 
 
 def frames_page(path: Path, found: frames.CaptureQuality) -> None:
-    """Every frame with its numbers, and encircled energy over the radius.
+    """Write the page of captures: numbers of every frame, curves of MTF and encircled
+    energy, field curvature, distortion.
 
     Args:
         path: the page to write.
@@ -38,7 +39,7 @@ def frames_page(path: Path, found: frames.CaptureQuality) -> None:
         words: [attrgetter(name)(row) for row in found.frames]
         for name, words in COLUMNS.items()
     }
-    known = {
+    stated = {
         words: column
         for words, column in columns.items()
         if any(value == value for value in column)
@@ -47,7 +48,7 @@ def frames_page(path: Path, found: frames.CaptureQuality) -> None:
         report.Section(
             "Frames",
             "",
-            [report.Table(tuple(known), list(zip(*known.values(), strict=True)))],
+            [report.Table(tuple(stated), list(zip(*stated.values(), strict=True)))],
         ),
         report.Section(
             "Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]
@@ -75,24 +76,26 @@ def frames_page(path: Path, found: frames.CaptureQuality) -> None:
     report.write_report(path, "Image quality of the captures", sections)
 
 
-def _curves(found: frames.CaptureQuality) -> bytes:
-    """Modulation over frequency and encircled energy over the radius."""
+def _curves(quality: frames.CaptureQuality) -> bytes:
+    """PNG of two panels: MTF along x over spatial frequency, and encircled energy over
+    the radius, one line a frame.
+    """
     figure, (mtf, energy) = report.make_figure(1, 2)
-    radius = np.linspace(0, min(found.light.shape[1:]) / 2 * found.step_um, 60)
-    for row, image in zip(found.frames, found.light, strict=True):
-        curve = metrics.mtf_of_psf(image, step_um=found.step_um)
-        keep = curve.frequency_per_um <= 0.5 / found.step_um
+    radius = np.linspace(0, min(quality.light.shape[1:]) / 2 * quality.step_um, 60)
+    for row, image in zip(quality.frames, quality.light, strict=True):
+        curve = metrics.mtf_of_psf(image, step_um=quality.step_um)
+        keep = curve.frequency_per_um <= 0.5 / quality.step_um
         mtf.plot(curve.frequency_per_um[keep], curve.modulation[keep], linewidth=0.8)
         energy.plot(
             radius,
-            metrics.encircled_energy(image, step_um=found.step_um, radius_um=radius),
+            metrics.encircled_energy(image, step_um=quality.step_um, radius_um=radius),
             label=row.name,
         )
     mtf.set_xlabel("cycles / µm")
     mtf.set_ylabel("modulation along x")
     energy.set_xlabel("radius / µm")
     energy.set_ylabel("share of the light")
-    if len(found.frames) <= _NAMED:
+    if len(quality.frames) <= _NAMED:
         energy.legend(fontsize=7)
     return report.figure_png(figure)
 
@@ -100,7 +103,7 @@ def _curves(found: frames.CaptureQuality) -> bytes:
 def edge_page(
     path: Path, image: Array, found: metrics.EdgeMtf, *, pixel_um: float
 ) -> None:
-    """The edge and the modulation across it.
+    """Write the page of a slanted edge: the picture and the MTF across it.
 
     Args:
         path: the page to write.
@@ -136,7 +139,8 @@ def micrograph_page(
     *,
     pixel_nm: float,
 ) -> None:
-    """The picture with a circle on every pillar, coloured by its error; the bias table.
+    """Write the page of a micrograph: the picture with a circle on every pillar,
+    coloured by its error, and the bias table.
 
     Args:
         path: the page to write.
@@ -151,7 +155,11 @@ def micrograph_page(
         report.Section(
             "Pillars",
             "",
-            [report.Figure(_drawn(image, found, laid, pixel_nm), caption, wide=True)],
+            [
+                report.Figure(
+                    _pillars_figure(image, found, laid, pixel_nm), caption, wide=True
+                )
+            ],
         )
     ]
     if table:
@@ -164,12 +172,15 @@ def micrograph_page(
     report.write_report(path, "Diameters of the pillars", sections)
 
 
-def _drawn(
+def _pillars_figure(
     image: Array,
-    found: sem.MeasuredDiameters,
-    laid: overlay.MaskOverlay | None,
+    pillars: sem.MeasuredDiameters,
+    on_mask: overlay.MaskOverlay | None,
     pixel_nm: float,
 ) -> bytes:
+    """PNG of the micrograph with a circle on every good pillar, coloured by its error
+    in nm (by its diameter without a design); missing and collapsed pillars are marked.
+    """
     from matplotlib.collections import EllipseCollection
     from matplotlib.figure import Figure
 
@@ -177,34 +188,37 @@ def _drawn(
     axis = figure.add_subplot()
     axis.imshow(image, cmap="gray")
     axis.set_axis_off()
-    good = np.isfinite(found.diameter_nm)
-    values = (found.diameter_nm if laid is None else laid.error_nm)[good]
-    wide = found.diameter_nm[good] / pixel_nm
-    thick = (
-        np.where(laid.outlier[good], 3.0, 1.0)
-        if laid is not None
+    good = np.isfinite(pillars.diameter_nm)
+    values = (pillars.diameter_nm if on_mask is None else on_mask.error_nm)[good]
+    diameter_px = pillars.diameter_nm[good] / pixel_nm
+    widths = (
+        np.where(on_mask.outlier[good], 3.0, 1.0)
+        if on_mask is not None
         else np.ones(int(good.sum()))
     )
     rings = EllipseCollection(
-        wide,
-        wide,
-        np.zeros(len(wide)),
+        diameter_px,
+        diameter_px,
+        np.zeros(len(diameter_px)),
         units="xy",
-        offsets=np.stack([found.column[good], found.row[good]], 1),
+        offsets=np.stack([pillars.column[good], pillars.row[good]], 1),
         offset_transform=axis.transData,
         facecolors="none",
         cmap="coolwarm",
-        linewidths=thick.tolist(),
+        linewidths=widths.tolist(),
     )
     rings.set_array(values)
     axis.add_collection(rings)
     rings.set_facecolor("none")
     axis.plot(
-        found.column[found.missing], found.row[found.missing], "x", color="yellow"
+        pillars.column[pillars.missing],
+        pillars.row[pillars.missing],
+        "x",
+        color="yellow",
     )
     axis.plot(
-        found.column[found.collapsed],
-        found.row[found.collapsed],
+        pillars.column[pillars.collapsed],
+        pillars.row[pillars.collapsed],
         "s",
         color="yellow",
         fillstyle="none",
@@ -212,7 +226,7 @@ def _drawn(
     figure.colorbar(
         rings,
         ax=axis,
-        label="diameter / nm" if laid is None else "error / nm",
+        label="diameter / nm" if on_mask is None else "error / nm",
         shrink=0.8,
     )
     return report.figure_png(figure)

@@ -18,17 +18,18 @@ BESIDE = (
     "_frames.png",
     "_parameters.png",
     "_posterior.png",
-)  # endings of what lies beside a fit
+)  # endings of the files that are written with a fit
 
 
 def pupil_report(path: Path, fit: PupilFit) -> None:
-    """Write the page of a generic pupil fit.
+    """Write the HTML page of a pupil fit: images, pupil maps, parameters, cautions.
 
     Args:
         path: the page to write.
+        fit: the fitted pupil.
     """
     score = fit.held_out or fit.agreement
-    keys = [
+    key_figures = [
         report.KeyFigure(
             "NCC, " + ("held-out" if fit.held_out else "fitted"),
             f"{score.ncc:.4f}",
@@ -37,7 +38,7 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
         report.KeyFigure("NRMSE", f"{score.nrmse:.3f}", score.nrmse <= 0.2),
         report.KeyFigure("chi² / dof", f"{fit.chi2_per_dof:.2f}"),
     ]
-    images = report.Figure(
+    frames = report.Figure(
         frames_figure(
             (fit.measured, fit.predicted), fit.residual_sigma, ("measured", "fitted")
         ),
@@ -46,11 +47,11 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
     )
     maps = report.Figure(_maps(fit), "Phase (rad) and amplitude of the pupil.")
     rows = [
-        (n, float(v), float(s))
-        for n, v, s in zip(fit.names, fit.value, fit.sigma, strict=True)
+        (name, float(value), float(sigma))
+        for name, value, sigma in zip(fit.names, fit.value, fit.sigma, strict=True)
     ]
     sections = [
-        report.Section("Images", f"{fit.reason}.", [images]),
+        report.Section("Images", f"{fit.reason}.", [frames]),
         report.Section(
             "Pupil", "", [maps, report.Table(("parameter", "value", "1 sigma"), rows)]
         ),
@@ -59,34 +60,30 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
     if fit.problems:
         sections.insert(0, report.Section("Problems", "\n\n".join(fit.problems)))
     report.write_report(
-        path, "Pupil from a through-focus stack", sections, key_figures=keys
+        path, "Pupil from a through-focus stack", sections, key_figures=key_figures
     )
 
 
 def asbuilt_report(
     path: Path, result: AsBuilt, *, truth: Mapping[str, float] | None = None
 ) -> None:
-    """Write the page of an as-built lens, and its pictures beside it: frames,
-    parameters, posterior (``_NAME.png``).
+    """Write the HTML page of an as-built lens and its pictures (``STEM_frames.png``,
+    ``_parameters.png``, ``_posterior.png``).
 
-    As designed, measured, built and residual of every frame; intervals; the posterior
-    of each parameter as a curve;
-    correlations; what to measure next. ``truth``: hidden values by name, where they are
-    known, drawn beside the fit.
+    The page shows every frame as designed, measured, fitted and residual; intervals and
+    posterior curves of the parameters; correlations; what to measure next.
 
     Args:
         path: the page to write.
         result: the as-built lens.
+        truth: true values by name, drawn with the posteriors; None where unknown.
     """
-    sure = float(
-        np.mean(
-            [
-                s < 0.5 * typical_sigma(name)
-                for name, s in zip(result.names, result.sigma, strict=True)
-            ]
-        )
-    )
-    keys = [
+    well_known = [
+        sigma < 0.5 * typical_sigma(name)
+        for name, sigma in zip(result.names, result.sigma, strict=True)
+    ]
+    known_share = float(np.mean(well_known))
+    key_figures = [
         report.KeyFigure(
             "verdict",
             "trusted" if result.trusted else "refused by its checks",
@@ -96,21 +93,23 @@ def asbuilt_report(
             "chi² / dof", f"{result.chi2_per_dof:.3f}", 0.9 < result.chi2_per_dof < 1.15
         ),
         report.KeyFigure("frames", str(len(result.measured))),
-        report.KeyFigure("parameters", f"{len(result.names)}, {sure:.0%} well known"),
+        report.KeyFigure(
+            "parameters", f"{len(result.names)}, {known_share:.0%} well known"
+        ),
     ]
     pictures = {"frames": _every_frame(result), "parameters": _intervals(result)}
     pictures |= {"posterior": _posterior(result, truth or {})} if result.curves else {}
     for name, picture in pictures.items():
         store.write_bytes(path.with_name(f"{path.stem}_{name}.png"), picture)
-    seen = (
+    frames_caption = (
         "One column a frame. Square root of the light above background, one scale down each column; the residual runs "
         "from -5 (blue) to 5 sigma (red): noise alone looks like even speckle, structure is what the model leaves over."
     )
-    bars = (
+    intervals_caption = (
         "95 % intervals in the typical uncertainty of each parameter, with what these captures cannot tell (thin); "
         "pale: what would be left if all causes that nobody stated were absent; grey: what was known beforehand."
     )
-    correlated = report.Figure(
+    correlation = report.Figure(
         _correlation(result),
         "Correlation of the parameters: deep colours cannot be told apart.",
     )
@@ -119,18 +118,18 @@ def asbuilt_report(
         report.Section(
             "Frames",
             result.reason + ".",
-            [report.Figure(pictures["frames"], seen, wide=True)],
+            [report.Figure(pictures["frames"], frames_caption, wide=True)],
         ),
         report.Section(
             "Parameters",
             "",
             [
-                report.Figure(pictures["parameters"], bars, wide=True),
+                report.Figure(pictures["parameters"], intervals_caption, wide=True),
                 _parameters(result),
             ],
         ),
         *_curves(pictures, truth),
-        report.Section("What goes together", "", [correlated]),
+        report.Section("What goes together", "", [correlation]),
         report.Section("What the frames fix", "\n\n".join(result.identifiable)),
         report.Section(
             "What they cannot tell, and what to measure next",
@@ -142,13 +141,16 @@ def asbuilt_report(
         sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
     lead = "The lens that was really made, from what the bench saw: how it differs from the design, and how surely."
     report.write_report(
-        path, "The lens as built", sections, lead=lead, key_figures=keys
+        path, "The lens as built", sections, lead=lead, key_figures=key_figures
     )
 
 
 def _curves(
     pictures: dict[str, bytes], truth: Mapping[str, float] | None
 ) -> list[report.Section]:
+    """Section with the picture of the posteriors and its caption; none without the
+    picture.
+    """
     if "posterior" not in pictures:
         return []
     caption = (
@@ -167,8 +169,10 @@ def _curves(
 
 
 def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
-    """Small curves, four in a row: density by profile, draws where there are any,
-    interval, design and truth.
+    """PNG of the posterior density of every parameter, four panels a row.
+
+    Solid: profile density with unstated causes; dashed: without them; shaded: 95 %
+    interval; grey bars: draws; grey line: design (0); red line: truth.
     """
     from matplotlib.figure import Figure
 
@@ -182,39 +186,40 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         axis.set_axis_off()
     for axis, name in zip(axes, names, strict=False):
         low, high = result.interval(name)
-        hidden = [truth[name]] if name in truth else []
-        reach = 0.4 * (high - low)
-        ends = min([low - reach, *hidden]), max([high + reach, *hidden])
-        at = np.linspace(ends[0] - 0.02 * reach, ends[1] + 0.02 * reach, 300)
-        within = result.curves[name]
+        truths = [truth[name]] if name in truth else []
+        margin = 0.4 * (high - low)
+        start = min([low - margin, *truths])
+        stop = max([high + margin, *truths])
+        grid = np.linspace(start - 0.02 * margin, stop + 0.02 * margin, 300)
+        curve = result.curves[name]
         axis.set_axis_on()
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
         axis.plot(
-            at,
-            knowable.profile_density(_stretched(result, name, within), at),
+            grid,
+            knowable.profile_density(_widened_profile(result, name, curve), grid),
             color="#1f6feb",
             linewidth=1.2,
         )
         axis.plot(
-            at,
-            knowable.profile_density(within, at),
+            grid,
+            knowable.profile_density(curve, grid),
             color="#1f6feb",
             linewidth=0.6,
             linestyle=(0, (3, 2)),
         )
         if len(result.draws):
-            drawn = result.draws[:, result.names.index(name)]
+            draws = result.draws[:, result.names.index(name)]
             axis.hist(
-                drawn,
+                draws,
                 bins=24,
-                range=(at[0], at[-1]),
+                range=(grid[0], grid[-1]),
                 density=True,
                 color="#999",
                 alpha=0.5,
             )
-        if at[0] < 0 < at[-1]:
+        if grid[0] < 0 < grid[-1]:
             axis.axvline(0, color="#888", linewidth=0.7)
-        for value in hidden:
+        for value in truths:
             axis.axvline(value, color="#d1242f", linewidth=1.2)
         axis.set_title(name, fontsize=7, pad=2)
         axis.set_yticks([])
@@ -224,58 +229,77 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
     return report.figure_png(figure)
 
 
-def _stretched(result: AsBuilt, name: str, curve: Array) -> Array:
-    """A profile as wide as the interval with what cannot be told, each side by itself."""
+def _widened_profile(result: AsBuilt, name: str, curve: Array) -> Array:
+    """(2, points) profile of a parameter, widened to its interval with unstated causes.
+
+    Each side of the value is stretched by (total interval) / (interval within the
+    model), about the value.
+
+    Args:
+        curve: (2, points) parameter values and profile within the model.
+    """
     value = float(result.value[result.names.index(name)])
     sides = zip(result.interval(name), result.within_model(name), strict=True)
-    low, high = (
+    below, above = (
         (outer - value) / (inner - value) if inner != value else 1.0
         for outer, inner in sides
     )
     return np.stack(
-        [value + np.where(curve[0] < value, low, high) * (curve[0] - value), curve[1]]
+        [
+            value + np.where(curve[0] < value, below, above) * (curve[0] - value),
+            curve[1],
+        ]
     )
 
 
 def _parameters(result: AsBuilt) -> report.Table:
+    """Table of all parameters: value, standard error, both 95 % intervals, the causes
+    that widen them most, meaning.
+    """
     rows = []
-    for name, v, s in zip(result.names, result.value, result.sigma, strict=True):
-        ends = (
-            "{:.4g} to {:.4g}".format(*of(name))
-            for of in (result.interval, result.within_model)
+    for name, value, sigma in zip(
+        result.names, result.value, result.sigma, strict=True
+    ):
+        intervals = (
+            "{:.4g} to {:.4g}".format(*interval(name))
+            for interval in (result.interval, result.within_model)
         )
         rows.append(
             (
                 name,
-                float(v),
-                float(s),
-                *ends,
+                float(value),
+                float(sigma),
+                *intervals,
                 ", ".join(result.most(name)),
                 PARAMETERS[PLACE[name]].meaning,
             )
         )
-    heads = "total 95 %", "statistical 95 %", "widened mostly by"
-    return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
+    interval_heads = "total 95 %", "statistical 95 %", "widened mostly by"
+    heads = ("parameter", "value", "1 sigma", *interval_heads, "meaning")
+    return report.Table(heads, rows)
 
 
 def typical_sigma(name: str) -> float:
-    """Typical uncertainty of a parameter.
+    """Typical standard error of a parameter, in its unit.
 
     Args:
-        name: of the parameter.
+        name: name of the parameter.
     """
     return PARAMETERS[PLACE[name]].scale
 
 
 def _every_frame(result: AsBuilt) -> bytes:
+    """PNG of all frames as designed, measured, as built and residual, with depth and
+    angle as titles.
+    """
     stacks = result.nominal, result.measured, result.predicted
     titles = [
         f"{z / 1e3:.3g} mm" if z >= 1e3 else f"{z:.3g} um" for z in result.depth_um
     ]
     if np.ptp(result.angle_rad) > 0:
         titles = [
-            f"{t}\n{np.degrees(a[0]):.3g}°"
-            for t, a in zip(titles, result.angle_rad, strict=True)
+            f"{title}\n{np.degrees(angle[0]):.3g}°"
+            for title, angle in zip(titles, result.angle_rad, strict=True)
         ]
     return frames_figure(
         stacks,
@@ -286,19 +310,25 @@ def _every_frame(result: AsBuilt) -> bytes:
 
 
 def _intervals(result: AsBuilt) -> bytes:
+    """PNG of the 95 % intervals of all parameters, in units of their typical standard
+    errors, on the prior's interval.
+
+    Prior information of a parameter is the diagonal of the inverse covariance within
+    the model less the information of the frames.
+    """
     from matplotlib.figure import Figure
 
-    shown = [
+    fitted = [
         i
         for i, name in enumerate(result.names)
         if name != "log_gain" and not name.startswith("background")
     ]
-    names = [result.names[i] for i in shown]
+    names = [result.names[i] for i in fitted]
     unit = np.array([typical_sigma(name) for name in names])
-    value = result.value[shown] / unit
+    value = result.value[fitted] / unit
     information = np.diag(
         invert_information(result.within_covariance) - result.information
-    )[shown]
+    )[fitted]
     prior = np.maximum(information, 1e-12) ** -0.5 / unit
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()
@@ -309,17 +339,20 @@ def _intervals(result: AsBuilt) -> bytes:
         left=-1.96 * np.minimum(prior, 1e3),
         color="#e4e4e4",
     )
-    whole, within = (
+    total_error, model_error = (
         np.abs(
-            np.array([of(name) for name in names]) / unit[:, None] - value[:, None]
+            np.array([interval(name) for name in names]) / unit[:, None]
+            - value[:, None]
         ).T
-        for of in (result.interval, result.within_model)
+        for interval in (result.interval, result.within_model)
     )
-    axis.errorbar(value, rows, xerr=within, fmt="none", ecolor="#9ec1f7", linewidth=3.5)
+    axis.errorbar(
+        value, rows, xerr=model_error, fmt="none", ecolor="#9ec1f7", linewidth=3.5
+    )
     axis.errorbar(
         value,
         rows,
-        xerr=whole,
+        xerr=total_error,
         fmt="o",
         markersize=3,
         color="#1f6feb",
@@ -329,7 +362,7 @@ def _intervals(result: AsBuilt) -> bytes:
     axis.axvline(0, color="#444", linewidth=0.8)
     axis.set_yticks(
         rows,
-        [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)],
+        [f"{name}  (1 = {scale:g})" for name, scale in zip(names, unit, strict=True)],
         fontsize=7,
     )
     axis.set_xscale("symlog", linthresh=1)
@@ -343,6 +376,7 @@ def _intervals(result: AsBuilt) -> bytes:
 
 
 def _correlation(result: AsBuilt) -> bytes:
+    """PNG of the (p, p) correlation matrix of the parameters."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 5.4))
@@ -362,41 +396,45 @@ def frames_figure(
     *,
     titles: Sequence[str] = (),
 ) -> bytes:
-    """PNG of all frames, twelve to a band: one row for each stack, the last for the
-    residual in sigma (-5 to 5).
+    """PNG of all frames, twelve columns to a band: a row for each stack, and a last row
+    for the residual in sigma (-5 to 5).
+
+    Frames show the square root of the light above their median, on one scale for all
+    stacks of a column.
 
     Args:
-        stacks: (n, y, x) frames, one stack a row.
-        residual_sigma: (n, y, x) residual over its noise.
-        labels: one for each stack.
-        titles: one for each frame.
+        stacks: (n, y, x) frames of every row.
+        residual_sigma: (n, y, x) residual over its standard deviation.
+        labels: label of each stack.
+        titles: title of each frame; numbers without them.
     """
     from matplotlib.figure import Figure
 
-    total, each = len(residual_sigma), len(stacks) + 1
-    columns = min(12, total)
-    bands = -(-total // columns)
-    tall = residual_sigma.shape[1] / residual_sigma.shape[2]
+    frame_count = len(residual_sigma)
+    band_rows = len(stacks) + 1
+    columns = min(12, frame_count)
+    bands = -(-frame_count // columns)
+    aspect = residual_sigma.shape[1] / residual_sigma.shape[2]
     figure = Figure(
-        figsize=(1.15 * columns + 0.4, 1.2 * tall * each * bands + 0.25 * bands)
+        figsize=(1.15 * columns + 0.4, 1.2 * aspect * band_rows * bands + 0.25 * bands)
     )
     axes = figure.subplots(
-        each * bands,
+        band_rows * bands,
         columns,
         squeeze=False,
         gridspec_kw={"wspace": 0.04, "hspace": 0.06},
     )
     for axis in axes.flat:
         axis.set_axis_off()
-    for frame in range(total):
+    for frame in range(frame_count):
         band, column = divmod(frame, columns)
-        cells = axes[band * each : (band + 1) * each, column]
-        floor = [float(np.median(stack[frame])) for stack in stacks]
+        cells = axes[band * band_rows : (band + 1) * band_rows, column]
+        medians = [float(np.median(stack[frame])) for stack in stacks]
         top = max(
             float(stack[frame].max()) - low
-            for stack, low in zip(stacks, floor, strict=True)
+            for stack, low in zip(stacks, medians, strict=True)
         )
-        for cell, stack, low in zip(cells, stacks, floor, strict=False):
+        for cell, stack, low in zip(cells, stacks, medians, strict=False):
             cell.imshow(
                 np.sqrt(np.maximum(stack[frame] - low, 0)),
                 cmap="magma",
@@ -421,17 +459,18 @@ def frames_figure(
 
 
 def _maps(fit: PupilFit) -> bytes:
+    """PNG of the phase and amplitude maps of a pupil."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 2.7))
-    for place, (values, title, colours) in enumerate(
+    for panel, (values, title, colours) in enumerate(
         (
             (fit.phase_rad, "phase / rad", "twilight"),
             (fit.amplitude, "amplitude", "viridis"),
         ),
         1,
     ):
-        axis = figure.add_subplot(1, 2, place)
+        axis = figure.add_subplot(1, 2, panel)
         figure.colorbar(axis.imshow(values, cmap=colours), ax=axis)
         axis.set_title(title, fontsize=9)
         axis.set_axis_off()

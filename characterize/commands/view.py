@@ -17,14 +17,14 @@ from metalens.view import ImagePanel, Panel, SliderAxis, TablePanel, at_brightes
 
 
 def capture_panels(path: Path) -> list[Panel]:
-    """Every frame of a capture, in counts, and what was written down with it.
+    """Panels of a capture: its frames in counts, its stage table, its description.
 
     Args:
         path: the file.
     """
-    read = captures.load(path)
-    frames = np.asarray(read.frames, float)
-    step = read.pixel_um if np.isfinite(read.pixel_um) else 1.0
+    capture = captures.load(path)
+    frames = np.asarray(capture.frames, float)
+    step = capture.pixel_um if np.isfinite(capture.pixel_um) else 1.0
     rows = [
         (
             name,
@@ -34,19 +34,25 @@ def capture_panels(path: Path) -> list[Panel]:
             ),
         )
         for name, position, angle, exposure in zip(
-            read.names, read.position_um, read.angle_rad, read.exposure_s, strict=True
+            capture.names,
+            capture.position_um,
+            capture.angle_rad,
+            capture.exposure_s,
+            strict=True,
         )
     ]
-    about: list[tuple[str, object]] = [
-        ("converter / bits", read.bits),
-        ("pixel / µm", read.pixel_um),
-        ("wavelength / µm", read.wavelength_um),
+    description: list[tuple[str, object]] = [
+        ("converter / bits", capture.bits),
+        ("pixel / µm", capture.pixel_um),
+        ("wavelength / µm", capture.wavelength_um),
     ]
-    about += [(in_words(key), str(value)) for key, value in sorted(read.about.items())]
-    about += [("put right", text) for text in read.corrections]
+    description += [
+        (in_words(key), str(value)) for key, value in sorted(capture.about.items())
+    ]
+    description += [("put right", text) for text in capture.corrections]
     return [
         ImagePanel(
-            "Frames", frames, [SliderAxis("frame", list(read.names))], step, "counts"
+            "Frames", frames, [SliderAxis("frame", list(capture.names))], step, "counts"
         ),
         TablePanel(
             "Stage",
@@ -59,76 +65,85 @@ def capture_panels(path: Path) -> list[Panel]:
             ),
             rows,
         ),
-        TablePanel("As captured", ("name", "value"), about),
+        TablePanel("As captured", ("name", "value"), description),
     ]
 
 
 def asbuilt_panels(path: Path) -> list[Panel]:
-    """The lens as built: its parameters with intervals, frames beside fit and residual,
-    and its PSFs.
+    """Panels of an as-built lens: parameters with intervals, measured and fitted
+    frames, residuals, PSFs.
 
     Args:
         path: the file.
     """
-    made = AsBuilt.load(path)
+    lens = AsBuilt.load(path)
     axis = [
         SliderAxis(
             "frame",
-            [_said(d, a) for d, a in zip(made.depth_um, made.angle_rad, strict=True)],
+            [
+                _frame_label(d, a)
+                for d, a in zip(lens.depth_um, lens.angle_rad, strict=True)
+            ],
         )
     ]
-    peak = float(made.measured.max())
+    peak = float(lens.measured.max())
     panels: list[Panel] = [
         TablePanel(
             "Parameters",
             ("parameter", "value", "95 % from", "to", "meaning"),
             [
-                (name, float(v), *made.interval(name), PARAMETERS[PLACE[name]].meaning)
-                for name, v in zip(made.names, made.value, strict=True)
+                (name, float(v), *lens.interval(name), PARAMETERS[PLACE[name]].meaning)
+                for name, v in zip(lens.names, lens.value, strict=True)
             ],
         ),
         ImagePanel(
             "Frames as captured and as fitted",
-            np.stack([made.measured, made.predicted]) / peak,
+            np.stack([lens.measured, lens.predicted]) / peak,
             [SliderAxis("shown", ["captured", "fitted"], blink=True), *axis],
-            made.pixel_um,
+            lens.pixel_um,
             "of the brightest pixel",
         ),
         ImagePanel(
             "Captured less fitted",
-            made.residual_sigma,
+            lens.residual_sigma,
             axis,
-            made.pixel_um,
+            lens.pixel_um,
             "sigma",
             signed=True,
         ),
-        TablePanel("What is known", ("", "in words"), _words(made)),
+        TablePanel("What is known", ("", "in words"), _words(lens)),
     ]
-    return [*panels, _psf(made.psf())]
+    return [*panels, _psf(lens.psf())]
 
 
 def pupil_panels(path: Path) -> list[Panel]:
-    """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the
-    numbers.
+    """Panels of a pupil file: phase and amplitude, measured and fitted stack,
+    residuals, parameters, agreement.
 
     Args:
         path: the file.
     """
     stored = store.load(path, "pupil")
-    held, about = stored.arrays, stored.attributes
+    arrays, attributes = stored.arrays, stored.attributes
     names = [
         name.decode() if isinstance(name, bytes) else str(name)
-        for name in held["names"].tolist()
+        for name in arrays["names"].tolist()
     ]
-    rows = list(zip(names, held["value"].tolist(), held["sigma"].tolist(), strict=True))
-    planes = [SliderAxis("plane", held["position_um"].tolist(), "µm")]
-    both = np.stack([held["measured"], held["predicted"]])
-    step = 2 / held["phase_rad"].shape[-1]
-    said = [(in_words(key), str(about[key])) for key in sorted(about) if key != "spec"]
+    rows = list(
+        zip(names, arrays["value"].tolist(), arrays["sigma"].tolist(), strict=True)
+    )
+    planes = [SliderAxis("plane", arrays["position_um"].tolist(), "µm")]
+    both = np.stack([arrays["measured"], arrays["predicted"]])
+    step = 2 / arrays["phase_rad"].shape[-1]
+    attribute_rows = [
+        (in_words(key), str(attributes[key]))
+        for key in sorted(attributes)
+        if key != "spec"
+    ]
     return [
         ImagePanel(
             "Phase in the pupil",
-            np.nan_to_num(held["phase_rad"]),
+            np.nan_to_num(arrays["phase_rad"]),
             [],
             step,
             "rad",
@@ -137,7 +152,7 @@ def pupil_panels(path: Path) -> list[Panel]:
         ),
         ImagePanel(
             "Amplitude in the pupil",
-            np.nan_to_num(held["amplitude"]),
+            np.nan_to_num(arrays["amplitude"]),
             [],
             step,
             "of its mean",
@@ -153,7 +168,7 @@ def pupil_panels(path: Path) -> list[Panel]:
         ),
         ImagePanel(
             "Measured less fitted",
-            held["residual_sigma"],
+            arrays["residual_sigma"],
             planes,
             1.0,
             "sigma",
@@ -161,14 +176,17 @@ def pupil_panels(path: Path) -> list[Panel]:
             across="pixels",
         ),
         TablePanel("Parameters", ("parameter", "value", "standard error"), rows),
-        TablePanel("How good it is", ("", "value"), said),
+        TablePanel("How good it is", ("", "value"), attribute_rows),
     ]
 
 
 def _psf(stack: PsfStack) -> Panel:
+    """Panel of PSFs over field angle and depth, as shares of the highest peak."""
     values = np.asarray(stack.intensity)
     axes = [
-        SliderAxis("field angle", [_said(None, pair) for pair in stack.angles_rad]),
+        SliderAxis(
+            "field angle", [_frame_label(None, pair) for pair in stack.angles_rad]
+        ),
         SliderAxis("depth", (1e-3 * stack.depths_um).tolist(), "mm"),
     ]
     values = values.reshape(
@@ -185,20 +203,21 @@ def _psf(stack: PsfStack) -> Panel:
     )
 
 
-def _said(depth_um: float | None, angle_rad: Array) -> str:
+def _frame_label(depth_um: float | None, angle_rad: Array) -> str:
     x, y = np.degrees(angle_rad)
     turn = f"{x:.3g}, {y:.3g} deg"
     return turn if depth_um is None else f"{1e-3 * depth_um:.4g} mm, {turn}"
 
 
-def _words(made: AsBuilt) -> list[tuple[str, str]]:
-    found = [("verdict", text) for text in made.verdicts]
-    found += [("problem", text) for text in made.problems] + [
-        ("caution", text) for text in made.cautions
+def _words(lens: AsBuilt) -> list[tuple[str, str]]:
+    """(kind, sentence) of every verdict, problem, caution and degeneracy."""
+    rows = [("verdict", text) for text in lens.verdicts]
+    rows += [("problem", text) for text in lens.problems] + [
+        ("caution", text) for text in lens.cautions
     ]
-    found += [("cannot be told apart", text) for text in made.degeneracies]
+    rows += [("cannot be told apart", text) for text in lens.degeneracies]
     return [
-        *found,
-        ("chi² per degree of freedom", f"{made.chi2_per_dof:.3f}"),
-        ("search", made.reason),
+        *rows,
+        ("chi² per degree of freedom", f"{lens.chi2_per_dof:.3f}"),
+        ("search", lens.reason),
     ]

@@ -16,25 +16,25 @@ from metalens.core.errors import CaptureError
 from metalens.lens import Lens
 
 _FINE = 15  # samples a pixel side under the ideal spot
-_CUBIC = (
-    np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6
-)  # to a pixel from its second and first neighbours
-# pixels on each side of the brightest one, over which the ideal spot is laid on a
-# frame's
+# weights of the second and first neighbours that interpolate a pixel
+_CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6
+# pixels on each side of the brightest pixel, over which the ideal spot is aligned
 _CORE = 5
-_SAME = 1e-9  # of a depth, which went through its inverse
+_SAME = 1e-9  # relative tolerance of equal depths, after two inversions
 Field = tuple[float, float]  # angle along x and y, degrees
 
 
 @dataclass(frozen=True, slots=True)
 class FrameMetrics:
-    """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a
-    design. peak_e: background off.
+    """Image quality of one frame.
 
-    angle_deg, angle_y_deg: of the field along x and y.
-    mtf50_x_per_um, mtf50_y_per_um: of the spot, pixel included. efficiency: share of
-    the reference's light within
-    ``circle_um`` (three times the FWHM) about the centroid, nan without a reference.
+    name, depth_um: of the frame. angle_deg, angle_y_deg: field angles along x and y.
+    spot: widths of the spot.
+    mtf50_x_per_um, mtf50_y_per_um: frequencies of half modulation, pixel included.
+    strehl: against the Airy pattern of the lens's aperture, nan without a design.
+    circle_um: diameter of the efficiency's circle, three times the FWHM.
+    efficiency: light within the circle over that of the reference, nan without it.
+    peak_e: highest pixel above background, electrons.
     """
 
     name: str
@@ -51,22 +51,22 @@ class FrameMetrics:
 
     @property
     def field(self) -> Field:
-        """Angles along x and y that one position of the source has in all frames."""
+        """Field angles along x and y in degrees, rounded so that equal ones compare
+        equal.
+        """
         return round(self.angle_deg, 6), round(self.angle_y_deg, 6)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CaptureQuality:
-    """All frames, and what they say together.
+    """Image quality of all frames, field curvature and distortion.
 
-    best_depth_um: {field angles (x, y) in degrees: source depth of the sharpest spot}:
-    field curvature.
-    distortion: {field angles: (place on the sensor along the field over d tan(angle)) -
-    1}, relative to the smallest
-    angle; empty where frames were taken at one angle, or windows move with the chief
-    ray (``window`` in the capture's
-    description).
-    light: (n, y, x) electrons above background. step_um: of a pixel.
+    frames: metrics of every frame.
+    best_depth_um: {(x, y) field angles in degrees: source depth of the sharpest spot}.
+    distortion: {field angles: image height / (d tan(angle)) - 1}, relative to the
+    smallest angle. Empty with one angle, or where the window moves with the chief ray.
+    light: (n, y, x) electrons above background. step_um: side of a pixel.
+    notes: cautions in words.
     """
 
     frames: tuple[FrameMetrics, ...]
@@ -80,7 +80,8 @@ class CaptureQuality:
 def measure_frames(
     capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan
 ) -> CaptureQuality:
-    """Quality of the frames as they are.
+    """Image quality of captured frames: spot widths, MTF, Strehl ratio, efficiency,
+    best depth, distortion.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -97,30 +98,37 @@ def measure_frames(
         )
     frames = to_electrons(capture)
     step = capture.pixel_um
-    shots = zip(frames.electrons, frames.usable, _places(capture), strict=True)
-    light = np.stack([_above(*shot) for shot in shots])
+    labelled = zip(frames.electrons, frames.usable, _frame_labels(capture), strict=True)
+    light = np.stack([_above_border(*shot) for shot in labelled])
     notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
         notes.append(
             "saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad"
         )
     rows = [
-        _row(capture, i, image, design, reference_e) for i, image in enumerate(light)
+        _metrics_row(capture, i, image, design, reference_e)
+        for i, image in enumerate(light)
     ]
-    best = _best(rows)
+    sharpest = _sharpest_depths(rows)
     notes += [
-        _open_end(field, depth)
-        for field, depth in best.items()
-        if _at_an_end(rows, field, depth)
+        _end_note(field, depth)
+        for field, depth in sharpest.items()
+        if _is_at_end(rows, field, depth)
     ]
     return CaptureQuality(
-        tuple(rows), best, _distortion(rows, capture, design), light, step, tuple(notes)
+        tuple(rows),
+        sharpest,
+        _distortion(rows, capture, design),
+        light,
+        step,
+        tuple(notes),
     )
 
 
-def _row(
+def _metrics_row(
     capture: Capture, i: int, image: Array, design: Lens | None, reference_e: float
 ) -> FrameMetrics:
+    """Metrics of frame ``i``, whose light above background is ``image``."""
     step = capture.pixel_um
     spot = metrics.measure_spot(image, step_um=step)
     circle = 3 * spot.fwhm_um
@@ -151,16 +159,18 @@ def airy_pattern(
     *,
     place_px: Field = (0.0, 0.0),
 ) -> Array:
-    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's
-    pixels.
+    """(y, x) Airy pattern (2 J1(u) / u)² of the lens's aperture, averaged over the
+    pixels of a capture.
 
-    place_px: (x, y) of its middle from the window's.
+    u = 2 pi sin(theta) r / wavelength, with the half aperture angle theta.
 
     Args:
         design: the lens whose aperture it is.
+        capture: gives the pixel, its fill factor and the wavelength.
         shape: (rows, columns).
+        place_px: (x, y) of the pattern's middle from that of the window.
     """
-    wave = (
+    wavelength_um = (
         capture.wavelength_um
         if math.isfinite(capture.wavelength_um)
         else design.wavelength_um
@@ -168,31 +178,40 @@ def airy_pattern(
     sine = design.diameters.radius_um / math.hypot(
         design.diameters.radius_um, design.reduced_um
     )
-    within = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
+    offsets = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
     y, x = (
-        (np.arange(n)[:, None] - (n - 1) / 2 - p + within).ravel()
-        for n, p in zip(shape, place_px[::-1], strict=True)
+        (np.arange(size)[:, None] - (size - 1) / 2 - place + offsets).ravel()
+        for size, place in zip(shape, place_px[::-1], strict=True)
     )
-    u = 2 * math.pi * sine / wave * capture.pixel_um * np.hypot(x[None], y[:, None])
-    safe = np.maximum(u, 1e-9)
-    fine = np.where(u > 1e-9, (2 * special.j1(safe) / safe) ** 2, 1.0)
-    return np.asarray(fine.reshape(shape[0], _FINE, shape[1], _FINE).mean((1, 3)))
+    argument = (
+        2
+        * math.pi
+        * sine
+        / wavelength_um
+        * capture.pixel_um
+        * np.hypot(x[None], y[:, None])
+    )
+    safe = np.maximum(argument, 1e-9)
+    samples = np.where(argument > 1e-9, (2 * special.j1(safe) / safe) ** 2, 1.0)
+    return np.asarray(samples.reshape(shape[0], _FINE, shape[1], _FINE).mean((1, 3)))
 
 
 def _strehl(image: Array, design: Lens, capture: Capture) -> float:
-    """Strehl ratio against the Airy pattern where it is most like the spot (largest
-    normalised correlation).
+    """Strehl ratio of a spot against the Airy pattern at its place.
+
+    The place has the largest normalised correlation of pattern and spot core.
     """
-    peak = [int(i) for i in np.unravel_index(int(image.argmax()), image.shape)]
+    peak = [int(index) for index in np.unravel_index(int(image.argmax()), image.shape)]
     half = min(_CORE, (min(image.shape) - 1) // 2)
     middle = [
-        min(max(i, half), n - 1 - half) for i, n in zip(peak, image.shape, strict=True)
+        min(max(index, half), size - 1 - half)
+        for index, size in zip(peak, image.shape, strict=True)
     ]
-    core = image[tuple(slice(i - half, i + half + 1) for i in middle)]
+    core = image[tuple(slice(index - half, index + half + 1) for index in middle)]
 
-    def unlike(at: Array) -> float:
+    def negative_correlation(place: Array) -> float:
         ideal = airy_pattern(
-            design, capture, core.shape, place_px=(float(at[0]), float(at[1]))
+            design, capture, core.shape, place_px=(float(place[0]), float(place[1]))
         )
         return -float((ideal * core).sum() / np.linalg.norm(ideal))
 
@@ -203,16 +222,20 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
         "xatol": 2e-3,
         "fatol": 1e-9 * float(np.abs(core).sum()),
     }
-    found = optimize.minimize(unlike, start, method="Nelder-Mead", options=options).x
+    place_px = optimize.minimize(
+        negative_correlation, start, method="Nelder-Mead", options=options
+    ).x
     x, y = (
-        float(f) + m - (n - 1) / 2
-        for f, m, n in zip(found, middle[::-1], image.shape[::-1], strict=True)
+        float(coordinate) + centre - (size - 1) / 2
+        for coordinate, centre, size in zip(
+            place_px, middle[::-1], image.shape[::-1], strict=True
+        )
     )
     ideal = airy_pattern(design, capture, image.shape, place_px=(x, y))
     return metrics.strehl_ratio(image, ideal - np.median(_rim(ideal)))
 
 
-def _places(capture: Capture) -> list[str]:
+def _frame_labels(capture: Capture) -> list[str]:
     """Name and depth of every frame."""
     depths = (
         f" at {depth:g} um" if math.isfinite(depth) else ""
@@ -221,15 +244,15 @@ def _places(capture: Capture) -> list[str]:
     return [f"{name}{depth}" for name, depth in zip(capture.names, depths, strict=True)]
 
 
-def _above(electrons: Array, usable: Array, place: str) -> Array:
+def _above_border(electrons: Array, usable: Array, place: str) -> Array:
     """The frame above the median of its border; masked pixels by :func:`_filled`.
 
     Raises:
         CaptureError: none of its light stands out; the frame's place is named.
     """
-    rim = _rim(electrons)
-    light = _filled(electrons - np.median(rim), usable)
-    noise = 1.4826 * float(np.median(np.abs(rim - np.median(rim))))
+    border = _rim(electrons)
+    light = _filled(electrons - np.median(border), usable)
+    noise = 1.4826 * float(np.median(np.abs(border - np.median(border))))
     if light.max() < 5 * max(noise, 1e-9):
         raise CaptureError(
             f"{place}: no spot above five times the noise of the frame's border; where defocus spreads "
@@ -239,33 +262,38 @@ def _above(electrons: Array, usable: Array, place: str) -> Array:
 
 
 def _filled(light: Array, usable: Array) -> Array:
-    """Masked pixels by the cubic through two pixels on either side, (4 (f₁ + f₋₁) - f₂
-    - f₋₂) / 6.
+    """The frame with masked pixels interpolated by the cubic
+    (4 (f₁ + f₋₁) - f₂ - f₋₂) / 6.
 
-    Mean of that along rows and along columns where all four are usable, else mean of
-    the usable ones of the eight
-    neighbours (0 without any). A hole in the core of a spot would narrow it.
+    It is the mean along rows and columns where all four neighbours are usable, else the
+    mean of the usable pixels among the eight neighbours, or 0 without any.
     """
-    known, some = np.where(usable, light, 0.0), usable.astype(float)
-    cubic, lines = np.zeros_like(known), np.zeros_like(known)
+    light_known = np.where(usable, light, 0.0)
+    is_usable = usable.astype(float)
+    cubic = np.zeros_like(light_known)
+    line_count = np.zeros_like(light_known)
     for axis in (0, 1):
-        whole = ndimage.correlate1d(some, [1, 1, 0, 1, 1], axis, mode="constant") > 3.5
-        cubic += whole * ndimage.correlate1d(known, _CUBIC, axis, mode="constant")
-        lines += whole
-    near, count = (
+        complete = (
+            ndimage.correlate1d(is_usable, [1, 1, 0, 1, 1], axis, mode="constant") > 3.5
+        )
+        cubic += complete * ndimage.correlate1d(
+            light_known, _CUBIC, axis, mode="constant"
+        )
+        line_count += complete
+    neighbour_sum, count = (
         ndimage.correlate(part, np.ones((3, 3)), mode="constant")
-        for part in (known, some)
+        for part in (light_known, is_usable)
     )
     filled = np.where(
-        lines > 0, cubic / np.maximum(lines, 1), near / np.maximum(count, 1)
+        line_count > 0,
+        cubic / np.maximum(line_count, 1),
+        neighbour_sum / np.maximum(count, 1),
     )
     return np.where(usable, light, filled)
 
 
 def _masked_words(light: Array, usable: Array) -> list[str]:
-    """What masked pixels in the core of a spot, above a tenth of its peak, mean for its
-    numbers.
-    """
+    """Caution on masked pixels above a tenth of a spot's peak; empty without any."""
     inside = (~usable & (light > 0.1 * light.max((1, 2), keepdims=True))).sum((1, 2))
     if not inside.any():
         return []
@@ -280,31 +308,40 @@ def _rim(image: Array) -> Array:
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
-def _best(rows: list[FrameMetrics]) -> dict[Field, float]:
-    """Depth of the highest peak share at each angle, by a parabola in 1/z through the
-    best three.
+def _sharpest_depths(rows: list[FrameMetrics]) -> dict[Field, float]:
+    """{field angles: depth in um of the sharpest spot}.
+
+    Sharpness is 1 / EE80²; its maximum is that of a parabola in 1/z through the three
+    depths about the sharpest frame. Angles with fewer than three depths are left out.
     """
-    out = {}
-    for field in sorted({r.field for r in rows}):
-        own = sorted((r for r in rows if r.field == field), key=lambda r: r.depth_um)
-        if len(own) < 3 or not all(math.isfinite(r.depth_um) for r in own):
+    depths = {}
+    for field in sorted({row.field for row in rows}):
+        rows_of_field = sorted(
+            (row for row in rows if row.field == field), key=lambda row: row.depth_um
+        )
+        if len(rows_of_field) < 3 or not all(
+            math.isfinite(row.depth_um) for row in rows_of_field
+        ):
             continue
-        sharp = np.array([1 / r.spot.ee80_um**2 for r in own])
-        place = 1 / np.array([r.depth_um for r in own])
-        k = int(np.clip(np.argmax(sharp), 1, len(own) - 2))
-        a, b, _ = np.polyfit(place[k - 1 : k + 2], sharp[k - 1 : k + 2], 2)
-        top = -b / (2 * a) if a < 0 else place[int(np.argmax(sharp))]
-        out[field] = float(1 / np.clip(top, place.min(), place.max()))
-    return out
+        sharpness = np.array([1 / row.spot.ee80_um**2 for row in rows_of_field])
+        inverse_depth = 1 / np.array([row.depth_um for row in rows_of_field])
+        k = int(np.clip(np.argmax(sharpness), 1, len(rows_of_field) - 2))
+        a, b, _ = np.polyfit(inverse_depth[k - 1 : k + 2], sharpness[k - 1 : k + 2], 2)
+        vertex = -b / (2 * a) if a < 0 else inverse_depth[int(np.argmax(sharpness))]
+        depths[field] = float(
+            1 / np.clip(vertex, inverse_depth.min(), inverse_depth.max())
+        )
+    return depths
 
 
-def _at_an_end(rows: list[FrameMetrics], field: Field, depth_um: float) -> bool:
+def _is_at_end(rows: list[FrameMetrics], field: Field, depth_um: float) -> bool:
     """Whether the sharpest depth of an angle is the first or last of its frames."""
     depths = [r.depth_um for r in rows if r.field == field]
     return min(abs(depth_um / end - 1) for end in (min(depths), max(depths))) < _SAME
 
 
-def _open_end(field: Field, depth_um: float) -> str:
+def _end_note(field: Field, depth_um: float) -> str:
+    """Note that the sharpest depth of an angle lies at the end of the captured range."""
     x, y = field
     return f"sharpest at {x:g}, {y:g} deg at an end of the captured depths, {depth_um:.5g} um: focus may lie beyond it"
 
@@ -312,23 +349,28 @@ def _open_end(field: Field, depth_um: float) -> str:
 def _distortion(
     rows: list[FrameMetrics], capture: Capture, design: Lens | None
 ) -> dict[Field, float]:
-    """Only where the window stands still (``window = "fixed"`` in capture.toml) and the
-    design gives the distance.
+    """{field angles: distortion} relative to the smallest angle.
+
+    Distortion: image height along the field over d tan(angle), less 1. Empty without a
+    design, or where the window is not fixed (``window = "fixed"`` in capture.toml).
     """
     if design is None or capture.about.get("window") != "fixed":
         return {}
     places: dict[Field, list[Field]] = {}
     for row in rows:
         places.setdefault(row.field, []).append(row.spot.centroid_um)
-    zero = np.mean(places.get((0.0, 0.0), [(0.0, 0.0)]), axis=0)
-    ratio, least = {}, math.inf
-    for field in sorted(places, key=lambda f: math.hypot(*f)):
+    axis_place = np.mean(places.get((0.0, 0.0), [(0.0, 0.0)]), axis=0)
+    ratio = {}
+    reference = math.inf
+    for field in sorted(places, key=lambda angles: math.hypot(*angles)):
         tangent = np.tan(np.radians(field))
         if not tangent.any():
             continue
-        straight = design.reduced_um * tangent
+        ideal_um = design.reduced_um * tangent
         ratio[field] = float(
-            (np.mean(places[field], axis=0) - zero) @ straight / (straight @ straight)
+            (np.mean(places[field], axis=0) - axis_place)
+            @ ideal_um
+            / (ideal_um @ ideal_um)
         )
-        least = ratio[field] if math.isinf(least) else least
-    return {field: value / least - 1 for field, value in sorted(ratio.items())}
+        reference = ratio[field] if math.isinf(reference) else reference
+    return {field: value / reference - 1 for field, value in sorted(ratio.items())}

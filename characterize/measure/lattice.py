@@ -1,5 +1,5 @@
-"""The lattice of the pillars in a micrograph: any two basis vectors, from the waves
-that the picture holds.
+"""Lattice of the pillars in a micrograph: two basis vectors from the strongest spatial
+frequencies of the picture.
 """
 
 import itertools
@@ -12,15 +12,15 @@ from scipy import fft, ndimage, optimize
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
-_WEAK = 0.25  # amplitude of a lattice's wave over the strongest of all
+_WEAK = 0.25  # least amplitude of a lattice's wave, over that of the strongest
 _LONGER = 2.5  # the longer side of a rectangular cell over the pitch, at most
 _APART_DEG = 25.0  # least angle between the two waves of a lattice
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImageLattice:
-    """Places origin + i a + j b, in pixels as (row, column); a is the vector nearer to
-    +x.
+    """Lattice of places origin + i a + j b, (row, column) in pixels; a is the vector
+    closer to +x.
     """
 
     origin: Array
@@ -35,23 +35,26 @@ class ImageLattice:
     @property
     def kind(self) -> str:
         """Square, hexagonal, rectangular or oblique, to 2 % and 1.5 degrees."""
-        one = float(np.linalg.norm(self.a))
-        other = float(np.linalg.norm(self.b))
+        length_a = float(np.linalg.norm(self.a))
+        length_b = float(np.linalg.norm(self.b))
         angle = math.degrees(
-            math.acos(np.clip(float(self.a @ self.b) / one / other, -1, 1))
+            math.acos(np.clip(float(self.a @ self.b) / length_a / length_b, -1, 1))
         )
-        alike = abs(one / other - 1) < 0.02
+        equal = abs(length_a / length_b - 1) < 0.02
         if abs(angle - 90) < 1.5:
-            return "square" if alike else "rectangular"
+            return "square" if equal else "rectangular"
         return (
             "hexagonal"
-            if alike and min(abs(angle - 60), abs(angle - 120)) < 1.5
+            if equal and min(abs(angle - 60), abs(angle - 120)) < 1.5
             else "oblique"
         )
 
     def sites(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
-        """((n, 2) row and column, (n, 2) index j and i) of sites whose cell lies in the
-        frame, by j, then by i.
+        """((n, 2) row and column, (n, 2) index j and i) of the sites whose cell lies in
+        a frame, by j, then by i.
+
+        Args:
+            shape: (rows, columns) of the frame.
         """
         corners = (
             np.array(list(itertools.product((0, shape[0]), (0, shape[1]))))
@@ -61,25 +64,31 @@ class ImageLattice:
         low = np.floor(index.min(0)).astype(int)
         high = np.ceil(index.max(0)).astype(int)
         j, i = (
-            g.ravel()
-            for g in np.meshgrid(
-                *(np.arange(p, q + 1) for p, q in zip(low, high, strict=True)),
+            indices.ravel()
+            for indices in np.meshgrid(
+                *(
+                    np.arange(first, last + 1)
+                    for first, last in zip(low, high, strict=True)
+                ),
                 indexing="ij",
             )
         )
         place = self.origin + j[:, None] * self.b + i[:, None] * self.a
         half = 0.45 * self.pitch_px
-        keep = ((place >= half) & (place <= np.array(shape[:2]) - half)).all(1)
-        return place[keep], np.stack([j, i], 1)[keep]
+        inside = ((place >= half) & (place <= np.array(shape[:2]) - half)).all(1)
+        return place[inside], np.stack([j, i], 1)[inside]
 
 
 def find_lattice(flat: Array, pitch_px: float | None = None) -> ImageLattice:
-    """The lattice of bright pillars in a levelled picture.
+    """Lattice of bright pillars in a levelled picture.
+
+    The two strongest wave vectors k give the basis as the inverse matrix of k. Their
+    phases give the origin.
 
     Args:
         flat: (y, x) levelled picture.
-        pitch_px: distance of neighbours where it is known: waves of neither it nor a
-            longer side are not considered.
+        pitch_px: known distance of neighbours: only waves of it or of a longer side
+            are considered.
 
     Accuracy: 1e-3 of a pitch for ten pillars a side; drift of the scan goes into the
     vectors.
@@ -87,31 +96,37 @@ def find_lattice(flat: Array, pitch_px: float | None = None) -> ImageLattice:
     Raises:
         CaptureError: no two waves that could span a lattice (of the stated pitch).
     """
-    seen = (flat - flat.mean()) * np.outer(
+    windowed = (flat - flat.mean()) * np.outer(
         np.hanning(flat.shape[0]), np.hanning(flat.shape[1])
     )
-    waves = [_refined(seen, wave) for wave in _waves(seen, pitch_px)]
+    waves = [_refined(windowed, wave) for wave in _strongest_waves(windowed, pitch_px)]
     inverse = np.linalg.inv(np.array(waves))  # columns span the lattice
-    phase = np.angle([_amount(seen, wave) for wave in waves])
+    phase = np.angle([_fourier_amplitude(windowed, wave) for wave in waves])
     origin = -inverse @ phase / (2 * math.pi)
-    one, other = _reduced(inverse[:, 0], inverse[:, 1])
+    first, second = _shortest_basis(inverse[:, 0], inverse[:, 1])
     a, b = (
-        (one, other)
-        if abs(one[1]) * np.linalg.norm(other) >= abs(other[1]) * np.linalg.norm(one)
-        else (other, one)
+        (first, second)
+        if abs(first[1]) * np.linalg.norm(second)
+        >= abs(second[1]) * np.linalg.norm(first)
+        else (second, first)
     )
     return ImageLattice(origin, a * np.sign(a[1] or 1.0), b * np.sign(b[0] or 1.0))
 
 
-def _waves(seen: Array, pitch_px: float | None) -> tuple[Array, Array]:
-    """Two strongest waves (cycles a pixel: row, column) not along one line, the first
-    of the known pitch.
+def _strongest_waves(windowed: Array, pitch_px: float | None) -> tuple[Array, Array]:
+    """Two strongest waves at an angle of ``_APART_DEG`` or more, (row, column) cycles a
+    pixel; the first has the known pitch.
+
+    Args:
+        windowed: (y, x) picture times a window.
+        pitch_px: known distance of neighbours, or None.
     """
-    size = [2 * fft.next_fast_len(n) for n in seen.shape]
-    power = np.abs(fft.rfft2(seen, size))
-    ky, kx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None]
+    size = [2 * fft.next_fast_len(n) for n in windowed.shape]
+    power = np.abs(fft.rfft2(windowed, size))
+    ky = fft.fftfreq(size[0])[:, None]
+    kx = fft.rfftfreq(size[1])[None]
     length = np.hypot(ky, kx)
-    power = np.where((length > 2.5 / min(seen.shape)) & (length < 0.35), power, 0.0)
+    power = np.where((length > 2.5 / min(windowed.shape)) & (length < 0.35), power, 0.0)
     peaks = (ndimage.maximum_filter(power, 5, mode="wrap") == power) & (
         power > _WEAK * power.max()
     )
@@ -137,38 +152,39 @@ def _waves(seen: Array, pitch_px: float | None) -> tuple[Array, Array]:
     )
 
 
-def _amount(seen: Array, wave: Array) -> complex:
+def _fourier_amplitude(windowed: Array, wave: Array) -> complex:
+    """Fourier transform of a (y, x) picture at one (row, column) frequency."""
     rows, columns = (
-        np.exp(-2j * math.pi * k * np.arange(n))
-        for k, n in zip(wave, seen.shape, strict=True)
+        np.exp(-2j * math.pi * frequency * np.arange(size))
+        for frequency, size in zip(wave, windowed.shape, strict=True)
     )
-    return complex(rows @ seen @ columns)
+    return complex(rows @ windowed @ columns)
 
 
-def _refined(seen: Array, wave: Array) -> Array:
-    """The wave at the top of its peak."""
-    step = 0.3 / max(seen.shape)
+def _refined(windowed: Array, wave: Array) -> Array:
+    """(2,) frequency of the largest Fourier amplitude close to ``wave``."""
+    step = 0.3 / max(windowed.shape)
     simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
-    ends = {
+    options = {
         "initial_simplex": simplex,
         "xatol": 1e-3,
         "fatol": np.inf,
     }  # whatever the unit of the picture
-    found = optimize.minimize(
-        lambda k: -abs(_amount(seen, wave + k * step)),
+    solution = optimize.minimize(
+        lambda offset: -abs(_fourier_amplitude(windowed, wave + offset * step)),
         simplex[0],
         method="Nelder-Mead",
-        options=ends,
+        options=options,
     )
-    return np.asarray(wave + found.x * step)
+    return np.asarray(wave + solution.x * step)
 
 
-def _reduced(one: Array, other: Array) -> tuple[Array, Array]:
-    """The shortest two vectors of a lattice (Gauss)."""
+def _shortest_basis(first: Array, second: Array) -> tuple[Array, Array]:
+    """The two shortest vectors of a lattice, by Gauss reduction of a basis."""
     while True:
-        if one @ one > other @ other:
-            one, other = other, one
-        turns = round(float(one @ other) / float(one @ one))
-        if turns == 0:
-            return one, other
-        other = other - turns * one
+        if first @ first > second @ second:
+            first, second = second, first
+        multiple = round(float(first @ second) / float(first @ first))
+        if multiple == 0:
+            return first, second
+        second = second - multiple * first

@@ -15,9 +15,9 @@ from metalens.psf import encircled_power, find_peak, fwhm
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EdgeMtf:
-    """Modulation against spatial frequency along one direction; 1 at zero.
+    """Modulation transfer function along one direction.
 
-    frequency_per_um: (f,) from 0. modulation: (f,).
+    frequency_per_um: (f,) from 0. modulation: (f,), 1 at frequency 0.
     """
 
     frequency_per_um: Array
@@ -32,7 +32,8 @@ class EdgeMtf:
         if len(below) == 0 or below[0] == 0:
             return math.nan
         i = int(below[0])
-        high, low = self.modulation[i - 1], self.modulation[i]
+        high = self.modulation[i - 1]
+        low = self.modulation[i]
         share = (high - 0.5) / (high - low)
         return float(
             self.frequency_per_um[i - 1]
@@ -83,13 +84,16 @@ def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> EdgeMtf:
 
 
 def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> EdgeMtf:
-    """Slanted-edge MTF (ISO 12233): edge found by line centroids, profile oversampled,
-    derivative windowed.
+    """MTF across a slanted edge (ISO 12233).
+
+    The edge is a line through the centroids of each row's derivative. Pixels are binned
+    by their distance from it; the profile's derivative, times a Hann window, is
+    Fourier transformed.
 
     Args:
+        image: (y, x) one straight edge, tilted 2 to 20 degrees from rows or columns.
         pixel_um: pitch of the pixels, um.
         oversample: bins of the edge profile a pixel.
-        image: one straight edge, tilted 2 to 20 degrees from the rows or columns.
 
     Accuracy: the finite difference and the bins are divided out; 1-2 % on noise-free
     edges to 0.7 Nyquist.
@@ -111,46 +115,52 @@ def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> EdgeMt
         np.arange(pixels.shape[1])[None] - (slope * rows + offset)[:, None]
     ) * math.cos(math.atan(slope))
     reach = int(min(distance.max(), -distance.min()))
-    place = np.round(distance * oversample).astype(int) + reach * oversample
-    keep = (place >= 0) & (place <= 2 * reach * oversample)
-    count = np.bincount(place[keep], minlength=2 * reach * oversample + 1)
-    total = np.bincount(place[keep], pixels[keep], minlength=2 * reach * oversample + 1)
-    profile = np.interp(
-        np.arange(len(count)),
-        np.flatnonzero(count),
-        total[count > 0] / count[count > 0],
+    bin_number = np.round(distance * oversample).astype(int) + reach * oversample
+    inside = (bin_number >= 0) & (bin_number <= 2 * reach * oversample)
+    samples = np.bincount(bin_number[inside], minlength=2 * reach * oversample + 1)
+    sums = np.bincount(
+        bin_number[inside], pixels[inside], minlength=2 * reach * oversample + 1
     )
-    spread = np.diff(profile)
-    peak = int(np.argmax(np.abs(ndimage.gaussian_filter1d(spread, oversample))))
-    half = min(peak, len(spread) - 1 - peak)
-    spread = spread[peak - half : peak + half + 1] * np.hanning(2 * half + 3)[1:-1]
-    spectrum = np.abs(fft.rfft(spread, 8 * len(spread)))
-    frequency = fft.rfftfreq(8 * len(spread), pixel_um / oversample)
-    fold = (
+    profile = np.interp(
+        np.arange(len(samples)),
+        np.flatnonzero(samples),
+        sums[samples > 0] / samples[samples > 0],
+    )
+    line_spread = np.diff(profile)
+    peak = int(np.argmax(np.abs(ndimage.gaussian_filter1d(line_spread, oversample))))
+    half_width = min(peak, len(line_spread) - 1 - peak)
+    line_spread = (
+        line_spread[peak - half_width : peak + half_width + 1]
+        * np.hanning(2 * half_width + 3)[1:-1]
+    )
+    spectrum = np.abs(fft.rfft(line_spread, 8 * len(line_spread)))
+    frequency = fft.rfftfreq(8 * len(line_spread), pixel_um / oversample)
+    attenuation = (
         np.sinc(frequency * pixel_um / oversample) ** 2
     )  # difference of neighbours, and bins
-    keep_f = frequency <= 1 / pixel_um
+    passed = frequency <= 1 / pixel_um
     return EdgeMtf(
-        frequency[keep_f], (spectrum / spectrum[0] / np.maximum(fold, 0.1))[keep_f]
+        frequency[passed],
+        (spectrum / spectrum[0] / np.maximum(attenuation, 0.1))[passed],
     )
 
 
 def strehl_ratio(psf: Array, ideal: Array) -> float:
-    """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled
-    alike.
+    """Strehl ratio: peak of a PSF over that of the ideal PSF, both of sum 1.
 
     Peaks come from a quintic spline through the samples, so that their place under the
     grid does not matter.
 
     Args:
         psf: (y, x) light, background taken off.
+        ideal: (y, x) ideal PSF on the same samples.
     """
     peaks = (find_peak(light)[2] / np.sum(light) for light in (psf, ideal))
     return float(next(peaks) / next(peaks))
 
 
 def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
-    """Widths of a PSF whose background is taken off.
+    """FWHM, EE80 radius, ISO 11146 widths and centroid of a PSF, um.
 
     Args:
         psf: (y, x) light, background taken off.
@@ -162,7 +172,7 @@ def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
     light = np.asarray(psf, float)
     if not light.sum() > 0:
         raise CaptureError("a PSF without light; take off less background")
-    y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    y, x = (np.arange(size) - (size - 1) / 2 for size in light.shape)
     widths, (cx, cy) = _second_moments(light, x, y)
     return SpotMetrics(
         fwhm(light, step_um),
@@ -173,11 +183,10 @@ def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
 
 
 def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
-    """Share of the window's light within radii about the centroid; pixels cut by the
-    circle count by their part.
+    """(r,) share of the window's light within radii about the centroid; pixels on the
+    circle count by their part inside.
 
-    Noise below the background counts as it is, below 0: cut off, that above would be
-    light of its own.
+    Negative pixels count as they are: cut off, the noise would add light.
 
     Args:
         psf: (y, x) light, background taken off.
@@ -185,11 +194,12 @@ def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
         radius_um: (r,) radii, um.
     """
     light = np.asarray(psf, float)
-    y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    y, x = (np.arange(size) - (size - 1) / 2 for size in light.shape)
     _, (cx, cy) = _second_moments(light, x, y)
     radii = np.asarray(radius_um, float) / step_um
     return np.asarray(
-        [_within(light, x - cx, y - cy, float(r)) for r in radii] / light.sum()
+        [_within(light, x - cx, y - cy, float(radius)) for radius in radii]
+        / light.sum()
     )
 
 
@@ -222,8 +232,13 @@ def focusing_efficiency(
 def _second_moments(
     light: Array, x: Array, y: Array
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """ISO 11146-1: widths 4 sigma along the principal axes, over a window three widths
-    wide, iterated.
+    """((major, minor) widths 4 sigma along the principal axes, (x, y) centroid) of
+    ISO 11146-1, in pixels; the window is iterated to three widths.
+
+    4 sigma = 4 sqrt((xx + yy ± sqrt((xx - yy)² + 4 xy²)) / 2) of the second moments.
+
+    Args:
+        light: (y, x) light. x: (x,) and y: (y,) pixel coordinates.
     """
     cx = cy = 0.0
     width = 2.0 * max(light.shape)
@@ -232,15 +247,19 @@ def _second_moments(
         mask = (np.abs(x[None] - cx) <= 1.5 * width) & (
             np.abs(y[:, None] - cy) <= 1.5 * width
         )
-        w = light * mask
-        total = w.sum()
-        cx = float((w * x[None]).sum() / total)
-        cy = float((w * y[:, None]).sum() / total)
-        dx, dy = x[None] - cx, y[:, None] - cy
-        xx, yy, xy = ((w * m).sum() / total for m in (dx * dx, dy * dy, dx * dy))
+        weighted = light * mask
+        total = weighted.sum()
+        cx = float((weighted * x[None]).sum() / total)
+        cy = float((weighted * y[:, None]).sum() / total)
+        dx = x[None] - cx
+        dy = y[:, None] - cy
+        xx, yy, xy = (
+            (weighted * product).sum() / total
+            for product in (dx * dx, dy * dy, dx * dy)
+        )
         root = math.hypot(xx - yy, 2 * xy)
         major, minor = (
-            4 * math.sqrt(max((xx + yy + s * root) / 2, 0)) for s in (1, -1)
+            4 * math.sqrt(max((xx + yy + sign * root) / 2, 0)) for sign in (1, -1)
         )
         if abs(major - width) < 1e-6 * width:
             break
@@ -249,18 +268,20 @@ def _second_moments(
 
 
 def _encircled(light: Array, x: Array, y: Array, share: float) -> float:
-    """Least radius about (0, 0), in pixels, that holds a share of all light."""
-    wanted = share * light.sum()
+    """Radius about (0, 0), in pixels, that holds a share of all light: first crossing,
+    to a fraction of a pixel.
+    """
+    target = share * light.sum()
     distance = np.hypot(x[None], y[:, None]).ravel()
     order = np.argsort(distance, kind="stable")
-    first = int(np.argmax(np.cumsum(light.ravel()[order]) >= wanted))
-    about = float(distance[order[first]])
-    radii = np.linspace(max(about - 2, 0), about + 2, 41)
-    held = np.array([_within(light, x, y, float(r)) for r in radii]) - wanted
-    k = max(int(np.argmax(held >= 0)), 1)
+    first = int(np.argmax(np.cumsum(light.ravel()[order]) >= target))
+    rough_radius = float(distance[order[first]])
+    radii = np.linspace(max(rough_radius - 2, 0), rough_radius + 2, 41)
+    excess = np.array([_within(light, x, y, float(r)) for r in radii]) - target
+    k = max(int(np.argmax(excess >= 0)), 1)
     return float(
         optimize.brentq(
-            lambda r: _within(light, x, y, r) - wanted, radii[k - 1], radii[k]
+            lambda r: _within(light, x, y, r) - target, radii[k - 1], radii[k]
         )
     )
 
@@ -273,33 +294,38 @@ def _within(light: Array, x: Array, y: Array, radius: float) -> float:
     a pixel.
     """
     distance = np.hypot(x[None], y[:, None])
-    whole = float(light[distance <= radius - math.sqrt(0.5)].sum())
+    inside_light = float(light[distance <= radius - math.sqrt(0.5)].sum())
     row, column = np.nonzero(np.abs(distance - radius) < math.sqrt(0.5))
     lines = y[row, None] + (np.arange(16) - 7.5) / 16
     chord = np.sqrt(np.maximum(radius**2 - lines**2, 0))
     low = np.maximum(x[column, None] - 0.5, -chord)
     high = np.minimum(x[column, None] + 0.5, chord)
-    return whole + float((light[row, column] * np.maximum(high - low, 0).mean(1)).sum())
+    return inside_light + float(
+        (light[row, column] * np.maximum(high - low, 0).mean(1)).sum()
+    )
 
 
 def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:
-    """Slope and offset of the edge from the centroids of each row's derivative, fitted
-    twice about the line.
+    """Slope and offset of an edge, column = slope * row + offset, in pixels.
+
+    A line through the centroid of each row's squared derivative, fitted four times;
+    later fits weight pixels by a Gaussian about the line before.
     """
-    slope, offset = 0.0, pixels.shape[1] / 2
+    slope = 0.0
+    offset = pixels.shape[1] / 2
     derivative = np.abs(ndimage.gaussian_filter1d(pixels, 1.0, axis=1, order=1))
     columns = np.arange(pixels.shape[1])
-    near = np.ones_like(derivative)
-    for reach in (None, 12.0, 8.0, 6.0):
-        if reach is not None:
-            near = np.exp(
-                -0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / reach) ** 2
+    proximity = np.ones_like(derivative)
+    for width in (None, 12.0, 8.0, 6.0):
+        if width is not None:
+            proximity = np.exp(
+                -0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / width) ** 2
             )
-        weight = near * np.maximum(derivative - np.median(derivative), 0) ** 2
+        weight = proximity * np.maximum(derivative - np.median(derivative), 0) ** 2
         total = weight.sum(1)
         if not total.max() > 0:
             raise CaptureError("no edge in the image")
-        good = total > 0.1 * np.median(total)
-        center = (weight * columns).sum(1)[good] / total[good]
-        slope, offset = (float(v) for v in np.polyfit(rows[good], center, 1))
+        strong = total > 0.1 * np.median(total)
+        center = (weight * columns).sum(1)[strong] / total[strong]
+        slope, offset = (float(value) for value in np.polyfit(rows[strong], center, 1))
     return slope, offset

@@ -1,5 +1,5 @@
-"""Micrograph on design: which pillar of the mask each measured one is, its error, and
-the bias table of the process.
+"""Registration of a micrograph to the mask: the drawn pillar of each measured pillar,
+its error, and the bias table of the process.
 """
 
 import dataclasses
@@ -17,21 +17,22 @@ from metalens.lens import DiameterMap
 Table = list[
     tuple[float, float, float, int]
 ]  # drawn nm, made less drawn nm, its standard error, pillars
-# scatter of the best place over that of the next best: below, the place is sure
+# scatter at the best place over that at the next best, below which it is clear
 _CLEAR = 0.7
-_LEAST = 12  # pillars
-OUTLIER = 4.0  # robust sigma
-SCALE = 0.005  # of the lattice against the mask's: 1 nm on a pillar of 200
+_LEAST = 12  # least number of good pillars
+OUTLIER = 4.0  # error of an outlier, robust sigma
+SCALE = 0.005  # largest scale error of the lattice: 1 nm on a pillar of 200
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MaskOverlay:
-    """Measured pillars beside the design.
+    """Measured pillars registered to the mask.
 
-    designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0,
-    0) of the lattice on the mask.
-    site: (p, 2) row and column of every pillar on the mask. clearly: whether the place
-    on the mask is beyond doubt.
+    designed_nm, error_nm: (p,) drawn diameter, and measured less drawn; nan where
+    unknown.
+    row, column: place on the mask of the lattice's pillar (0, 0).
+    site: (p, 2) row and column of every pillar on the mask.
+    clearly: whether the place is unambiguous.
     outlier: (p,) error beyond ``OUTLIER`` robust sigma.
     """
 
@@ -45,15 +46,15 @@ class MaskOverlay:
 
 
 def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay:
-    """Lay measured pillars on the design: the shift of whole sites where design and
-    measurement differ most evenly.
+    """Place of a micrograph on the mask: the shift by whole sites at which measured
+    diameters scatter least about a line in the drawn ones.
 
-    A bias that is the same everywhere, or goes with the diameter, plays no part.
-    The picture's +x is taken as the mask's, to half the angle between two rows of the
-    lattice.
+    A constant bias, or one proportional to the diameter, does not matter. The picture's
+    +x is taken as the mask's, to half the angle between two rows of the lattice.
 
     Args:
         found: pillars of the micrograph.
+        design: drawn diameters.
 
     Raises:
         CaptureError: fewer than twelve good pillars, a lattice that is not the design's
@@ -69,8 +70,9 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
     first = on_mask.min(0)
     site = on_mask - first
     patch = np.zeros(site.max(0) + 1)
-    mask = np.zeros_like(patch)
-    patch[tuple(site[good].T)], mask[tuple(site[good].T)] = found.diameter_nm[good], 1.0
+    weight = np.zeros_like(patch)
+    patch[tuple(site[good].T)] = found.diameter_nm[good]
+    weight[tuple(site[good].T)] = 1.0
     drawn = np.asarray(design.diameter_um, float) * 1e3
     if (np.array(patch.shape) > drawn.shape).any():
         raise CaptureError(
@@ -78,22 +80,22 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
         )
     for _ in range(
         2
-    ):  # again without what went wrong: one fallen pillar is as much as all noise
-        scatter = _scatter(patch, mask, drawn)
+    ):  # the second time without outliers: one fallen pillar outweighs all noise
+        scatter = _scatter(patch, weight, drawn)
         row, column = (
             int(i) for i in np.unravel_index(int(np.argmin(scatter)), scatter.shape)
         )
         designed = drawn[site[:, 0] + row, site[:, 1] + column]
         designed = np.where(designed > 0, designed, np.nan)
         error = found.diameter_nm - designed
-        middle = np.nanmedian(error)
-        spread = 1.4826 * float(np.nanmedian(np.abs(error - middle)))
-        outlier = np.nan_to_num(np.abs(error - middle), nan=0.0) > OUTLIER * max(
+        median = np.nanmedian(error)
+        spread = 1.4826 * float(np.nanmedian(np.abs(error - median)))
+        outlier = np.nan_to_num(np.abs(error - median), nan=0.0) > OUTLIER * max(
             spread, 0.5
         )
-        mask[tuple(site[outlier].T)] = 0.0
+        weight[tuple(site[outlier].T)] = 0.0
     ordered = np.sort(scatter[np.isfinite(scatter)])
-    sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
+    is_clear = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
     row, column = row - int(first[0]), column - int(first[1])
     return MaskOverlay(
         designed,
@@ -101,14 +103,15 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
         row,
         column,
         on_mask + np.array([row, column]),
-        bool(sure),
+        bool(is_clear),
         outlier,
     )
 
 
 def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
-    """(2, 2) rows and columns of the mask's map that a step along j, and one along i,
-    of a picture's lattice goes.
+    """(2, 2) steps in rows and columns of the mask: of lattice index j, then of i.
+
+    The picture's vectors are scaled to the mask's cell area and rounded to whole sites.
     """
     kind = design.lattice.kind
     if lattice.kind != kind:
@@ -119,9 +122,11 @@ def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
     steps_um = np.array(design.steps_um[::-1])
     vectors = vectors * np.sqrt(design.site_um2 / abs(np.linalg.det(vectors)))
     steps = np.rint(vectors / steps_um)
-    long, expected = (np.linalg.norm(v, axis=1) for v in (vectors, steps * steps_um))
+    lengths, expected_lengths = (
+        np.linalg.norm(vector, axis=1) for vector in (vectors, steps * steps_um)
+    )
     one_cell = np.isclose(abs(np.linalg.det(steps)), 2 if design.lattice.centred else 1)
-    if not one_cell or (np.abs(long - expected) > 0.05 * long).any():
+    if not one_cell or (np.abs(lengths - expected_lengths) > 0.05 * lengths).any():
         raise CaptureError(
             f"rows of this {kind} lattice do not lie in the picture as on the mask (+x right, +y down); turn it"
         )
@@ -131,14 +136,12 @@ def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
 def lattice_scale(
     found: MeasuredDiameters, pixel_nm: float, design: DiameterMap
 ) -> float:
-    """Lattice constant in the picture over that of the mask: by how much the stated
-    pixel is too large.
+    """Lattice constant in the picture over that of the mask: the factor by which the
+    stated pixel is too large.
 
-    Of the plane places (row, column) = origin + J (j, i) through the good pillars, sqrt
-    |det J|, so that a scan
-    stretched along one axis counts half. Masks are written true to scale to a few parts
-    in a million, pixels of
-    microscopes are known to some per cent. Accuracy: 4e-4 for five pillars a side.
+    It is sqrt |det J| of a least-squares fit (row, column) = origin + J (j, i) to the
+    good pillars, over the mask's. Masks are true to parts in a million, pixels of
+    microscopes to per cent. Accuracy: 4e-4 for five pillars a side.
 
     Args:
         found: pillars of the micrograph.
@@ -147,15 +150,17 @@ def lattice_scale(
     """
     good = np.isfinite(found.diameter_nm)
     sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
-    turn = np.linalg.lstsq(
+    jacobian = np.linalg.lstsq(
         sites, np.column_stack([found.row[good], found.column[good]]), rcond=None
     )[0][:2]
-    return float(np.sqrt(abs(np.linalg.det(turn)) / design.site_um2) * pixel_nm / 1e3)
+    return float(
+        np.sqrt(abs(np.linalg.det(jacobian)) / design.site_um2) * pixel_nm / 1e3
+    )
 
 
 def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
-    """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of
-    the pillars, outliers left out.
+    """Rows (drawn nm, made less drawn nm, its standard error, pillars) over groups of
+    equally many pillars by drawn diameter, without outliers.
 
     Args:
         laid: the micrograph's pillars on the mask.
@@ -199,24 +204,28 @@ def register_to_mask(found: MeasuredDiameters, laid: MaskOverlay) -> MeasuredDia
 
 
 def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
-    """Variance of the patch about a line in the drawn diameters at every shift; inf
-    where no line of a process fits.
+    """Variance of measured diameters about a line in the drawn ones, at every shift of
+    the patch on the design; inf where a pillar lies off the design.
 
-    Least squares of made = a + b drawn under the mask, b within a third of 1; inf too
-    where a pillar has no design.
+    Least squares of made = a + b drawn, b limited to 2/3 to 4/3, by convolutions.
+
+    Args:
+        patch: (j, i) measured diameters in nm, 0 without one.
+        mask: (j, i) 1 where measured, else 0.
+        drawn: (y, x) drawn diameters in nm, 0 without a pillar.
     """
-    turned = (patch * mask)[::-1, ::-1]
+    flipped = (patch * mask)[::-1, ::-1]
     weight = mask[::-1, ::-1]
     count = mask.sum()
 
-    def mean_of(one: Array, other: Array) -> Array:
-        return np.asarray(signal.fftconvolve(one, other, mode="valid") / count)
+    def mean_of(map_values: Array, kernel: Array) -> Array:
+        return np.asarray(signal.fftconvolve(map_values, kernel, mode="valid") / count)
 
-    made = patch[mask > 0]
+    measured = patch[mask > 0]
     level = mean_of(drawn, weight)
     spread = np.maximum(mean_of(drawn**2, weight) - level**2, 1e-9)
-    together = mean_of(drawn, turned) - level * made.mean()
-    slope = np.clip(together / spread, 2 / 3, 4 / 3)
-    rest = made.var() - 2 * slope * together + slope**2 * spread
-    there = mean_of((drawn > 0).astype(float), weight) > 1 - 0.5 / count
-    return np.where(there, np.maximum(rest, 0), np.inf)
+    covariance = mean_of(drawn, flipped) - level * measured.mean()
+    slope = np.clip(covariance / spread, 2 / 3, 4 / 3)
+    variance = measured.var() - 2 * slope * covariance + slope**2 * spread
+    all_drawn = mean_of((drawn > 0).astype(float), weight) > 1 - 0.5 / count
+    return np.where(all_drawn, np.maximum(variance, 0), np.inf)

@@ -17,33 +17,31 @@ from characterize.model import KnownValue
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, CaptureError
 
-_ROUND = (
-    2 / 3
-)  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
-# sites of a lattice that is only tried, discs that tell the blur of a picture
+# least share of rays whose edges lie on one circle; half on a bar of aspect ratio 2
+_ROUND = 2 / 3
+# sites that test a candidate lattice, and discs that give the blur of a picture
 _TRIED = 25
-# radius over blur from which on a disc tells its blur as well as all together do
+# radius over blur above which a disc's own blur replaces the median of the picture
 _TELLS = 3.0
-# share of sites above which what is there decides of a lattice, or of a picture
+# share of sites that decides about a lattice or a picture
 MOST = 0.5
-# length over width from which on a pillar is none of round ones: a circle's radius is
-# off by 0.4 % there
+# length over width above which a pillar counts as oval: a circle's radius is off by
+# 0.4 % there
 _OVAL = 1.15
-# errors of narrow discs (7 to 12 pixels, noise of a tenth) over those of edges: their
-# tops are one place
+# standard errors of narrow discs (7 to 12 pixels, noise 0.1) over those of edges alone
 _LEVELS = 1.2
-# share of what blur does to a radius by which clean discs (7 to 30 pixels, blur 0.5 to
-# 2.5) are off
+# error of the blur's effect on a radius, as a share of it: clean discs (7 to 30 pixels,
+# blur 0.5 to 2.5)
 _UNSURE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Micrograph:
-    """What is known of a picture.
+    """Scale of a micrograph.
 
-    pixel_nm: size of a pixel. pitch_nm: lattice constant of the pillars.
-    edge_bias_nm: constant by which edges appear outside (above 0) the true ones, from a
-    calibration sample.
+    pixel_nm: size of a pixel. pitch_nm: lattice constant of the pillars, 0 if unknown.
+    edge_bias_nm: distance of the imaged edges outside the true ones, from a calibration
+    sample.
     """
 
     pixel_nm: float
@@ -60,18 +58,15 @@ class Micrograph:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeasuredDiameters:
-    """Pillars found in a micrograph.
+    """Pillars measured in a micrograph.
 
-    row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is
-    missing or collapsed.
-    sigma_nm: (p,) standard error of each diameter: noise of its edges, rim and gap, and
-    a tenth of what blur did. It
-        holds 95 % of drawn discs without a bright rim; a rim adds a constant
-        (edge_bias_nm).
-    missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far
-    from round.
+    row, column: (p,) centres in pixels.
+    diameter_nm: (p,) nan where the pillar is missing, collapsed or oval.
+    sigma_nm: (p,) standard error of each diameter: noise of edges, rim and gap, and a
+    tenth of the correction for blur. A bright rim adds a constant (edge_bias_nm).
+    missing: (p,) no pillar at the site. collapsed: (p,) off its site, or not round.
     oval: (p,) longer than wide by more than 15 %, beyond noise; not measured.
-    site: (p, 2) lattice index j and i of each; lattice: where the sites are, in pixels.
+    site: (p, 2) lattice index j and i. lattice: places of the sites in pixels.
     """
 
     row: Array
@@ -90,9 +85,7 @@ class MeasuredDiameters:
 
     @property
     def doubtful(self) -> bool:
-        """Whether most sites hold what is no round pillar: then the lattice may be
-        another.
-        """
+        """Whether most sites hold no round pillar, so that the lattice may be wrong."""
         return bool(self.collapsed.mean() > MOST)
 
     @property
@@ -113,8 +106,11 @@ class MeasuredDiameters:
         return float(3 * self._good_nm.std()) if self._good_nm.size else math.nan
 
     def bias(self, designed_nm: Array | float) -> KnownValue:
-        """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with
-        its standard error.
+        """Mean diameter error against the design as the known value ``bias_nm`` of a
+        fit, with its standard error.
+
+        Args:
+            designed_nm: (p,) drawn diameters, or one for all.
         """
         difference = self.diameter_nm - np.asarray(designed_nm)
         good = difference[np.isfinite(difference)]
@@ -130,8 +126,10 @@ class MeasuredDiameters:
 
 
 def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
-    """Diameters of all whole pillars on the lattice of a top-down micrograph, rims
-    brighter than the gaps.
+    """Diameters of all pillars on the lattice of a top-down micrograph.
+
+    Rims must be brighter than the gaps. Where most sites hold no round pillar, lattices
+    shifted by half a cell are tried too: pillars with dark tops.
 
     Args:
         image: (y, x) picture.
@@ -146,25 +144,30 @@ def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
             f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values"
         )
     pitch = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
-    rough = _flattened(picture, pitch or min(picture.shape) / 4)
-    lattice = find_lattice(rough, pitch)
-    flat = _flattened(picture, lattice.pitch_px) if pitch is None else rough
-    found = _on(flat, lattice, about)
-    if (
-        not found.doubtful
-    ):  # the brightest places of a cell are its pillars, but for dark tops
-        return found
-    others = [one for one in _others(lattice) if len(one.sites(flat.shape)[0])]
-    tried = [_on(flat, one, about, most=_TRIED).whole for one in others]
+    first_pass = _levelled(picture, pitch or min(picture.shape) / 4)
+    lattice = find_lattice(first_pass, pitch)
+    flat = _levelled(picture, lattice.pitch_px) if pitch is None else first_pass
+    measured = _measure_on_lattice(flat, lattice, about)
+    if not measured.doubtful:
+        return measured
+    candidates = [
+        candidate
+        for candidate in _shifted_lattices(lattice)
+        if len(candidate.sites(flat.shape)[0])
+    ]
+    whole_shares = [
+        _measure_on_lattice(flat, candidate, about, sample=_TRIED).whole
+        for candidate in candidates
+    ]
     return (
-        _on(flat, others[int(np.argmax(tried))], about)
-        if max(tried, default=0.0) > MOST
-        else found
+        _measure_on_lattice(flat, candidates[int(np.argmax(whole_shares))], about)
+        if max(whole_shares, default=0.0) > MOST
+        else measured
     )
 
 
-def _others(lattice: ImageLattice) -> list[ImageLattice]:
-    """The same lattice with pillars where its gaps are."""
+def _shifted_lattices(lattice: ImageLattice) -> list[ImageLattice]:
+    """The lattice shifted by half of a + b, of a and of b."""
     a, b = lattice.a / 2, lattice.b / 2
     return [
         dataclasses.replace(lattice, origin=lattice.origin + step)
@@ -172,39 +175,48 @@ def _others(lattice: ImageLattice) -> list[ImageLattice]:
     ]
 
 
-def _on(
-    flat: Array, lattice: ImageLattice, about: Micrograph, *, most: int = 0
+def _measure_on_lattice(
+    flat: Array, lattice: ImageLattice, about: Micrograph, *, sample: int = 0
 ) -> MeasuredDiameters:
-    """Pillars on a lattice that is known, in a levelled picture; of some ``most``
-    sites, evenly from all, if stated.
+    """Pillars at the sites of a lattice in a levelled picture.
+
+    Args:
+        flat: (y, x) levelled picture.
+        lattice: the sites.
+        about: pixel size and edge bias.
+        sample: number of sites to measure, evenly from all; 0 for all.
     """
-    place, site = (
-        v[:: max(len(v) // most, 1) if most else 1] for v in lattice.sites(flat.shape)
+    places, site = (
+        values[:: max(len(values) // sample, 1) if sample else 1]
+        for values in lattice.sites(flat.shape)
     )
-    steps = [_step(flat, row, column, lattice.pitch_px) for row, column in place]
-    usual = float(np.median(steps)) if steps else 0.0
+    steps = [_edge_step(flat, row, column, lattice.pitch_px) for row, column in places]
+    median_step = float(np.median(steps)) if steps else 0.0
     results = [
-        _pillar(flat, row, column, lattice.pitch_px, there=step > 0.4 * usual)
-        for (row, column), step in zip(place, steps, strict=True)
+        _pillar(
+            flat, row, column, lattice.pitch_px, is_present=step > 0.4 * median_step
+        )
+        for (row, column), step in zip(places, steps, strict=True)
     ]
     if not results:
         raise CaptureError("no whole pillar in the picture; need a wider picture")
     row, column, radius, sigma, missing, collapsed = (
-        np.array(v) for v in zip(*results, strict=True)
+        np.array(values) for values in zip(*results, strict=True)
     )
-    whole = np.where(collapsed.astype(bool), np.nan, radius)
-    radius, sigma = _sharper(
-        flat, np.stack([row, column], 1), whole, sigma, lattice.pitch_px
+    raw_radius = np.where(collapsed.astype(bool), np.nan, radius)
+    radius, sigma = _deblurred_radii(
+        flat, np.stack([row, column], 1), raw_radius, sigma, lattice.pitch_px
     )
     diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
-    missing, collapsed = missing.astype(bool), collapsed.astype(bool)
-    near = ~missing & (
-        np.hypot(*(np.stack([row, column], 1) - place).T) < 0.2 * lattice.pitch_px
+    missing = missing.astype(bool)
+    collapsed = collapsed.astype(bool)
+    on_site = ~missing & (
+        np.hypot(*(np.stack([row, column], 1) - places).T) < 0.2 * lattice.pitch_px
     )
     oval = np.array(
         [
-            n and _is_oval(flat, y, x, lattice.pitch_px)
-            for n, y, x in zip(near, row, column, strict=True)
+            is_on_site and _is_oval(flat, y, x, lattice.pitch_px)
+            for is_on_site, y, x in zip(on_site, row, column, strict=True)
         ]
     )
     collapsed = collapsed & ~oval
@@ -222,12 +234,15 @@ def _on(
     )
 
 
-def _flattened(image: Array, pitch: float) -> Array:
-    rows = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
-    steady = image - rows[:, None]
-    steady = steady - ndimage.gaussian_filter(steady, 1.5 * pitch)
-    low, high = np.percentile(steady, [10, 90])
-    return np.asarray((steady - low) / max(high - low, 1e-12))
+def _levelled(image: Array, pitch: float) -> Array:
+    """(y, x) picture less its slow background along rows and in 2D; its 10th and 90th
+    percentile become 0 and 1.
+    """
+    row_level = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
+    flat = image - row_level[:, None]
+    flat = flat - ndimage.gaussian_filter(flat, 1.5 * pitch)
+    low, high = np.percentile(flat, [10, 90])
+    return np.asarray((flat - low) / max(high - low, 1e-12))
 
 
 def instrument_pixel_nm(path: Path) -> float | None:
@@ -298,189 +313,233 @@ def scale_from_bar(image: Array, bar_nm: float) -> float:
 def _rays(
     flat: Array, row: float, column: float, pitch: float
 ) -> tuple[Array, Array, Array]:
-    """(distance, angle, (distance, angle) levels smoothed along and across) about a
-    place.
+    """Levels along rays from a point.
+
+    Returns:
+        (r,) distances in pixels, (rays,) angles in rad, (r, rays) levels, smoothed
+        along and across the rays.
     """
     angle = (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
-    fine = min(0.25, pitch / 120)
-    reach = np.arange(0, 0.5 * pitch + 1, fine)
-    points = (
-        row + reach[:, None] * np.sin(angle),
-        column + reach[:, None] * np.cos(angle),
+    step_px = min(0.25, pitch / 120)
+    distance = np.arange(0, 0.5 * pitch + 1, step_px)
+    indices = (
+        row + distance[:, None] * np.sin(angle),
+        column + distance[:, None] * np.cos(angle),
     )
-    rays = ndimage.map_coordinates(flat, points, order=1, mode="nearest")
-    smooth = radial.ray_smoothing(pitch) / fine
+    rays = ndimage.map_coordinates(flat, indices, order=1, mode="nearest")
+    sigma_px = radial.ray_smoothing(pitch) / step_px
     return (
-        reach,
+        distance,
         angle,
-        ndimage.gaussian_filter(rays, (smooth, 1.0), mode=("nearest", "wrap")),
+        ndimage.gaussian_filter(rays, (sigma_px, 1.0), mode=("nearest", "wrap")),
     )
 
 
-def _sharper(
+def _deblurred_radii(
     flat: Array, place: Array, radius: Array, sigma: Array, pitch: float
 ) -> tuple[Array, Array]:
-    """Radii and their errors, those of solid discs that are not wide beside the blur
-    found anew.
+    """Radii and standard errors in pixels, with narrow discs corrected for blur.
 
-    Blur is one of the picture: the median over ``_TRIED`` discs or a few more. A disc
-    wider than a few blurs tells its
-    own, whose noise offsets that of the levels of its rim and gap.
+    The blur is the median variance of ``_TRIED`` or more discs. A disc wider than
+    ``_TELLS`` blurs takes its own, which cancels noise of its rim and gap levels.
+
+    Args:
+        flat: (y, x) levelled picture.
+        place: (p, 2) row and column of the pillars.
+        radius: (p,) radii; nan where not measured.
+        sigma: (p,) standard errors.
+        pitch: lattice constant, pixels.
     """
     radius = radius.copy()
     sigma = sigma.copy()
     smooth = radial.ray_smoothing(pitch)
 
-    def own_blur(k: int) -> float:
+    def blur_at(k: int) -> float:
         reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
         return radial.blur_variance(reach, rays, smooth)
 
-    there = np.flatnonzero(np.isfinite(radius)).tolist()
-    own = {k: own_blur(k) for k in there[:: max(len(there) // _TRIED, 1)]}
-    blurs = np.array(list(own.values()))
-    if np.isfinite(blurs).sum() <= MOST * len(blurs):
+    measured = np.flatnonzero(np.isfinite(radius)).tolist()
+    own_variance = {k: blur_at(k) for k in measured[:: max(len(measured) // _TRIED, 1)]}
+    variances = np.array(list(own_variance.values()))
+    if np.isfinite(variances).sum() <= MOST * len(variances):
         return radius, sigma
-    usual = float(np.nanmedian(blurs))
-    for k in there:
-        blur = usual
-        if radial.is_wide_disc(radius[k], usual, smooth, times=_TELLS):
-            mine = own[k] if k in own else own_blur(k)
-            blur = mine if math.isfinite(mine) else usual
-        found = _edges(flat, place[k, 0], place[k, 1], pitch, blur)
-        if found is not None and math.isfinite(found[2]):
-            radius[k], sigma[k] = found[2:4]
+    median_variance = float(np.nanmedian(variances))
+    for k in measured:
+        variance_used = median_variance
+        if radial.is_wide_disc(radius[k], median_variance, smooth, times=_TELLS):
+            variance = own_variance[k] if k in own_variance else blur_at(k)
+            variance_used = variance if math.isfinite(variance) else median_variance
+        circle = _fit_circle(flat, place[k, 0], place[k, 1], pitch, variance_used)
+        if circle is not None and math.isfinite(circle[2]):
+            radius[k], sigma[k] = circle[2:4]
     return radius, sigma
 
 
-def _step(flat: Array, row: float, column: float, pitch: float) -> float:
-    """Height of the fall from a pillar's rim to the gap, in the mean over all rays."""
-    reach, _, rays = _rays(flat, row, column, pitch)
-    inner, outer, _ = radial.rim_and_gap_levels(reach, rays)
+def _edge_step(flat: Array, row: float, column: float, pitch: float) -> float:
+    """Level of a pillar's rim less that of the gap, from the mean over all rays."""
+    distance, _, rays = _rays(flat, row, column, pitch)
+    inner, outer, _ = radial.rim_and_gap_levels(distance, rays)
     return inner - outer
 
 
 def _pillar(
-    flat: Array, row: float, column: float, pitch: float, *, there: bool
+    flat: Array, row: float, column: float, pitch: float, *, is_present: bool
 ) -> tuple[float, float, float, float, bool, bool]:
-    """(row, column, radius, its error, missing, collapsed) at a lattice site, in
-    pixels.
+    """(row, column, radius, standard error, missing, collapsed) of the pillar at a
+    lattice site, in pixels.
+
+    The circle is fitted up to four times about its new middle.
+
+    Args:
+        row: site. column: site.
+        pitch: lattice constant.
+        is_present: whether the site shows an edge; without, a bright patch in its cell
+            means a fallen pillar.
     """
     half = int(pitch / 2)
-    r0, c0 = int(round(row)), int(round(column))
-    patch = flat[max(r0 - half, 0) : r0 + half + 1, max(c0 - half, 0) : c0 + half + 1]
-    if not there:
-        fallen = bool(
+    row_px = int(round(row))
+    column_px = int(round(column))
+    patch = flat[
+        max(row_px - half, 0) : row_px + half + 1,
+        max(column_px - half, 0) : column_px + half + 1,
+    ]
+    if not is_present:
+        is_fallen = bool(
             (ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08
         )  # it lies elsewhere in its cell
-        return row, column, math.nan, math.nan, not fallen, fallen
+        return row, column, math.nan, math.nan, not is_fallen, is_fallen
     y = row
     x = column
     radius = math.nan
     sigma = math.nan
     scatter = math.inf
     for _ in range(4):
-        edges = _edges(flat, y, x, pitch)
-        if edges is None:
+        circle = _fit_circle(flat, y, x, pitch)
+        if circle is None:
             return y, x, math.nan, math.nan, False, True
-        dy, dx, radius, sigma, scatter = edges
+        dy, dx, radius, sigma, scatter = circle
         y, x = y + dy, x + dx
         if math.hypot(dy, dx) < 1e-3:
             break
-    off = math.hypot(y - row, x - column) > 0.2 * pitch
-    return y, x, radius, sigma, False, bool(off or scatter > max(0.15 * radius, 1.5))
+    is_displaced = math.hypot(y - row, x - column) > 0.2 * pitch
+    return (
+        y,
+        x,
+        radius,
+        sigma,
+        False,
+        bool(is_displaced or scatter > max(0.15 * radius, 1.5)),
+    )
 
 
-def _edges(
+def _fit_circle(
     flat: Array, row: float, column: float, pitch: float, blur: float | None = None
 ) -> tuple[float, float, float, float, float] | None:
-    """Disc through the half-rise places of all rays: (dy, dx, radius, error of it,
-    scatter); None without edges.
+    """Circle fitted to the half-level crossings of all rays: (dy, dx, radius, standard
+    error, scatter) in pixels; None without edges.
 
-    Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t; the radius is that
-    of the same area, less what blur
-    takes; with the variance of a ``blur`` that is known, less what that does to a solid
-    disc which is not wide beside
-    it. The scatter is about the circle alone, and infinite where too many rays have
-    their edges elsewhere.
+    Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t. The radius is that
+    of equal area, corrected for blur. The scatter is about the circle alone, infinite
+    where too many rays have their edges off it.
+
+    Args:
+        flat: (y, x) levelled picture.
+        row: middle to start from. column: likewise.
+        pitch: lattice constant, pixels.
+        blur: variance of the blur, square pixels, for a disc that is not wide; None
+            takes the steepness of the edges.
     """
-    reach, angle, rays = _rays(flat, row, column, pitch)
-    inner, outer, rim = radial.rim_and_gap_levels(reach, rays)
-    found = radial.edge_crossings(reach, rays, (inner + outer) / 2, rim)
-    good = np.isfinite(found)
-    if inner - outer < 0.2 or good.sum() < RAYS // 2:
+    distance, angle, rays = _rays(flat, row, column, pitch)
+    inner, outer, rim = radial.rim_and_gap_levels(distance, rays)
+    edge_px = radial.edge_crossings(distance, rays, (inner + outer) / 2, rim)
+    valid = np.isfinite(edge_px)
+    if inner - outer < 0.2 or valid.sum() < RAYS // 2:
         return None
-    middle = np.median(found[good])
-    good &= np.abs(found - middle) < max(0.2 * middle, 2.0)
+    middle = np.median(edge_px[valid])
+    valid &= np.abs(edge_px - middle) < max(0.2 * middle, 2.0)
     terms = np.stack(
-        [np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos))], 1
+        [
+            np.ones(RAYS),
+            *(function(k * angle) for k in (1, 2) for function in (np.sin, np.cos)),
+        ],
+        1,
     )
-    design = terms[good]
-    (mean, dy, dx, *oval), *_ = np.linalg.lstsq(design, found[good], rcond=None)
-    rest = found[good] - design @ np.array([mean, dy, dx, *oval])
-    wide = 0.5 * float(np.square(oval).sum())  # mean square of what is oval
-    independent = _independent(mean)
-    noise = rest.var() / max(
-        1 - len(terms[0]) / (independent * good.mean()), 0.1
+    design = terms[valid]
+    (mean, dy, dx, *oval), *_ = np.linalg.lstsq(design, edge_px[valid], rcond=None)
+    residual = edge_px[valid] - design @ np.array([mean, dy, dx, *oval])
+    oval_variance = 0.5 * float(
+        np.square(oval).sum()
+    )  # mean square of the second harmonic
+    independent = _independent_rays(mean)
+    edge_variance = residual.var() / max(
+        1 - len(terms[0]) / (independent * valid.mean()), 0.1
     )  # of an edge; the terms took some
-    own = float(np.linalg.pinv(design.T @ design)[0, 0]) * RAYS / independent
+    variance_factor = (
+        float(np.linalg.pinv(design.T @ design)[0, 0]) * RAYS / independent
+    )
     # half of the rim's level and half of the gap's, as noisy as edges, are in every
     # edge
-    shared = 0.25 / _independent(float(reach[rim])) + 0.25 / _independent(
-        0.5 * (mean + 0.5 * pitch)
-    )
-    edge = terms @ np.array([mean, dy, dx, *oval])
-    radius = math.sqrt(mean**2 + wide)
+    level_factor = 0.25 / _independent_rays(
+        float(distance[rim])
+    ) + 0.25 / _independent_rays(0.5 * (mean + 0.5 * pitch))
+    fitted_px = terms @ np.array([mean, dy, dx, *oval])
+    radius = math.sqrt(mean**2 + oval_variance)
     smooth = radial.ray_smoothing(pitch)
-    noise = math.sqrt(noise * (own + shared))
-    taken = radial.drawn_in(reach, rays, edge, radius, smooth)
-    true, unsure = radius + taken, _UNSURE * taken
+    noise = math.sqrt(edge_variance * (variance_factor + level_factor))
+    blur_loss = radial.drawn_in(distance, rays, fitted_px, radius, smooth)
+    corrected = radius + blur_loss
+    systematic = _UNSURE * blur_loss
     if blur is not None and not radial.is_wide_disc(radius, blur, smooth):
-        (true, gain), plain = (
-            radial.deblur_radius(reach, radius, blur, smooth),
+        (corrected, gain), plain = (
+            radial.deblur_radius(distance, radius, blur, smooth),
             blur / (2 * radius),
         )
         noise = noise * gain * _LEVELS
-        unsure = _UNSURE * (plain + abs(true - radius - plain))
-    error = math.hypot(noise, unsure)
-    scatter = math.sqrt(rest.var() + wide) if good.mean() > _ROUND else math.inf
-    return float(dy), float(dx), true, error, scatter
+        systematic = _UNSURE * (plain + abs(corrected - radius - plain))
+    error = math.hypot(noise, systematic)
+    scatter = (
+        math.sqrt(residual.var() + oval_variance) if valid.mean() > _ROUND else math.inf
+    )
+    return float(dy), float(dx), corrected, error, scatter
 
 
 def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
-    """Whether a pillar is longer than wide by more than ``_OVAL``, and by four sigma of
-    its edges' scatter.
+    """Whether a pillar is longer than wide by more than ``_OVAL``, beyond four standard
+    errors.
 
-    About its middle an ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t,
-    of a² / b² = (A + D) / (A - D),
-    D² = B² + C². Edges are where each ray falls the most: levels of the mean over all
-    rays are of no ray's own.
+    An ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t, with a² / b² =
+    (A + D) / (A - D), D² = B² + C². The edge of a ray is its steepest fall.
     """
-    reach, angle, rays = _rays(flat, row, column, pitch)
-    first = int(np.searchsorted(reach, 0.1 * pitch))
-    edge = reach[first + np.argmin(np.diff(rays[first:], axis=0), axis=0)]
+    distance, angle, rays = _rays(flat, row, column, pitch)
+    start = int(np.searchsorted(distance, 0.1 * pitch))
+    edge_px = distance[start + np.argmin(np.diff(rays[start:], axis=0), axis=0)]
     design = np.stack(
         [np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], 1
     )
-    good = np.ones(RAYS, bool)
+    valid = np.ones(RAYS, bool)
     for _ in range(4):
-        powers = np.linalg.lstsq(design[good], edge[good] ** -2, rcond=None)[0]
+        powers = np.linalg.lstsq(design[valid], edge_px[valid] ** -2, rcond=None)[0]
         fitted = np.maximum(design @ powers, 1e-12) ** -0.5
-        rest = edge - fitted
-        good = np.abs(rest) < max(0.2 * float(np.median(edge)), 2.0)
-        if good.sum() < _ROUND * RAYS or powers[0] <= 0:
+        residual = edge_px - fitted
+        valid = np.abs(residual) < max(0.2 * float(np.median(edge_px)), 2.0)
+        if valid.sum() < _ROUND * RAYS or powers[0] <= 0:
             return False
-    level, along = float(powers[0]), math.hypot(*powers[3:])
-    own = max(_independent(level**-0.5) * good.mean() - 5, 1.0)
-    noise = float((rest[good] * 2 * fitted[good] ** -3).std()) * math.sqrt(2 / own)
-    return along > 4 * noise and level + along > _OVAL**2 * (level - along)
+    level = float(powers[0])
+    second_harmonic = math.hypot(*powers[3:])
+    degrees = max(_independent_rays(level**-0.5) * valid.mean() - 5, 1.0)
+    noise = float((residual[valid] * 2 * fitted[valid] ** -3).std()) * math.sqrt(
+        2 / degrees
+    )
+    return second_harmonic > 4 * noise and level + second_harmonic > _OVAL**2 * (
+        level - second_harmonic
+    )
 
 
-def _independent(radius: float) -> float:
-    """How many of the rays at a radius in pixels tell something of their own, the
-    circle's three numbers among them.
+def _independent_rays(radius: float) -> float:
+    """Number of statistically independent rays at a radius in pixels.
 
-    Noise of single pixels, smoothed over rays (a Gaussian of one ray) and between
-    pixels (a variance of 1/6 across).
+    Noise of single pixels is smoothed over rays (a Gaussian of one ray) and by
+    interpolation between pixels (a variance of 1/6).
     """
     step = 2 * math.pi * max(radius, 0.5) / RAYS
     return RAYS / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / (6 * step**2)))

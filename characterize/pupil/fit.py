@@ -1,5 +1,5 @@
-"""Maximum-likelihood phase retrieval from a through-focus stack, scored on planes that
-the fit never saw.
+"""Maximum-likelihood phase retrieval from a through-focus stack, scored on planes left
+out of the fit.
 """
 
 import dataclasses
@@ -56,8 +56,8 @@ class PupilFit:
     from a fit of the others; None where too few.
     between: of the same planes by a cubic spline along the stack, without physics.
     optics: (name, value, standard error) of what was freed.
-    cautions: degeneracies and corrections in words. problems: checks that failed, with
-    their cause.
+    cautions: degeneracies and corrections in words. problems: failed checks with their
+    cause.
     """
 
     spec: PupilSpec
@@ -89,8 +89,10 @@ def fit_pupil(
     sparse: int = 2,
     insist: bool = False,
 ) -> PupilFit:
-    """Fit phase, amplitude, drift, stage errors, blur, gains and backgrounds to all
-    planes; with ``judge`` also to some of them, tested on the others.
+    """Pupil of a through-focus stack by maximum likelihood.
+
+    Fitted are phase, amplitude, drift, stage errors, blur, gains and backgrounds of all
+    planes. With ``judge`` some planes are fitted first and predict the others.
 
     Args:
         capture: through-focus stack of one bead, in counts.
@@ -105,17 +107,18 @@ def fit_pupil(
         FitError: too few planes, no bead, or refused by a check of
             :func:`characterize.pupil.score.pupil_problems`.
     """
-    stated, frames = complete_spec(spec, capture), to_electrons(capture)
-    position_um = stage_positions_um(capture, stated)
-    data, bead = crop_to_bead(frames, stated)
-    whole = PupilModel(stated, position_um)
-    mean = initial_parameters(whole, data, bead)
-    enough = judge and len(position_um) > 2 * sparse
-    model, optics = fit_optics(whole, data, mean, sparse if enough else 1)
-    mean = transfer_parameters(mean, whole, model)
+    full_spec = complete_spec(spec, capture)
+    frames = to_electrons(capture)
+    position_um = stage_positions_um(capture, full_spec)
+    data, bead = crop_to_bead(frames, full_spec)
+    first_model = PupilModel(full_spec, position_um)
+    mean = initial_parameters(first_model, data, bead)
+    enough_planes = judge and len(position_um) > 2 * sparse
+    model, optics = fit_optics(first_model, data, mean, sparse if enough_planes else 1)
+    mean = transfer_parameters(mean, first_model, model)
 
     held_out = between = None
-    if enough:
+    if enough_planes:
         start, held_out, between = score_held_out(model, data, mean, sparse)
     else:
         start = fit_low_orders(model, data, mean)
@@ -123,8 +126,8 @@ def fit_pupil(
     agreement = measure_agreement(
         solution.image, data, model.background(solution.value)
     )
-    stopped = "" if solution.converged else solution.reason
-    problems = pupil_problems(held_out or agreement, stopped)
+    stop_reason = "" if solution.converged else solution.reason
+    problems = pupil_problems(held_out or agreement, stop_reason)
     if problems and not insist:
         raise FitRefused("fit refused: " + "; ".join(problems))
     phase, amplitude = model.pupil_maps(solution.value)
@@ -146,7 +149,7 @@ def fit_pupil(
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        cautions=(*frames.corrections, *describe_limits(stated, solution, optics)),
+        cautions=(*frames.corrections, *describe_limits(full_spec, solution, optics)),
         problems=tuple(problems),
     )
 
@@ -164,48 +167,53 @@ def save(
     arrays = {name: getattr(fit, name) for name in _STORED}
     for name in ("names", "cautions", "problems"):
         arrays[name] = np.array(getattr(fit, name) or ("",))
-    known = [n for n in config.dumps(fit.spec).splitlines() if not n.endswith("nan")]
-    about: dict[str, store.Attribute] = {
-        "spec": "\n".join(known) + "\n",
+    stated_lines = [
+        line for line in config.dumps(fit.spec).splitlines() if not line.endswith("nan")
+    ]
+    attributes: dict[str, store.Attribute] = {
+        "spec": "\n".join(stated_lines) + "\n",
         "chi2_per_dof": fit.chi2_per_dof,
         "converged": fit.converged,
         "reason": fit.reason,
     }
-    about |= {f"fitted_{name}": value for name, value, _ in fit.optics}
+    attributes |= {f"fitted_{name}": value for name, value, _ in fit.optics}
     for label in ("agreement", "held_out", "between"):
         score = getattr(fit, label)
         if score is not None:
             entries = dataclasses.asdict(score).items()
-            about |= {f"{label}_{key}": value for key, value in entries}
-    store.save(path, "pupil", arrays, attributes=about, provenance=provenance)
+            attributes |= {f"{label}_{key}": value for key, value in entries}
+    store.save(path, "pupil", arrays, attributes=attributes, provenance=provenance)
 
 
 def complete_spec(spec: PupilSpec, capture: Capture) -> PupilSpec:
-    """Wavelength and pixel from the capture where not stated; a window no larger than
-    the frame.
+    """Specification with the wavelength and pixel of the capture where it states none,
+    and a window no larger than the frame.
 
     Args:
-        spec: as given.
+        spec: as stated by the user.
         capture: the stack with its metadata.
 
     Raises:
         CaptureError: neither of them states the wavelength or the pixel.
     """
-    found = {}
+    values = {}
     for name in ("wavelength_um", "pixel_um"):
         value = getattr(spec, name)
-        found[name] = getattr(capture, name) if math.isnan(value) else value
-        if math.isnan(found[name]):
+        values[name] = getattr(capture, name) if math.isnan(value) else value
+        if math.isnan(values[name]):
             raise CaptureError(
                 f"{name} is missing: give it in the pupil file or in capture.toml; it "
                 "cannot be fitted"
             )
     window = min(spec.window, *capture.frames.shape[1:])
-    return replace(spec, window=window, **found)
+    return replace(spec, window=window, **values)
 
 
 def stage_positions_um(capture: Capture, spec: PupilSpec) -> Array:
-    """(n,) stage positions from the sharpest plane: of the capture, or by ``step_um``.
+    """(n,) stage positions of the planes in um, relative to the sharpest plane.
+
+    The origin is the mean position, weighted by how far a plane's peak exceeds half of
+    the highest peak.
 
     Args:
         capture: frames and their positions.
@@ -234,32 +242,32 @@ def stage_positions_um(capture: Capture, spec: PupilSpec) -> Array:
 def crop_to_bead(
     frames: ElectronFrames, spec: PupilSpec
 ) -> tuple[FitImages, tuple[int, int]]:
-    """Square region of interest about the bead, moved inwards at the edges of the
-    frame; the bead's (row, column) from the middle of it.
+    """Square window about the bead, and the bead's (row, column) from its middle.
 
-    The brightest spot of a difference of Gaussians is the bead, which no background
-    gradient moves.
+    The bead is the brightest spot of a difference of Gaussians, which a background
+    gradient does not move. At the edge of the frame the window is moved inwards.
 
     Args:
         frames: the whole stack in electrons.
         spec: gives the side of the window and, where stated, the bead's place.
     """
-    shape, window = frames.electrons.shape, spec.window
+    shape = frames.electrons.shape
+    window = spec.window
     center = spec.center
     if center is None:
-        middle = np.median(frames.electrons, axis=(1, 2), keepdims=True)
-        filled = np.where(frames.usable, frames.electrons, middle)
-        spot = ndimage.gaussian_filter(filled, (0, 1, 1))
-        spot -= ndimage.gaussian_filter(filled, (0, window / 4, window / 4))
-        bright = np.sort(spot, axis=0)[-3:].mean(0)
-        row, column = np.unravel_index(int(bright.argmax()), bright.shape)
+        median_e = np.median(frames.electrons, axis=(1, 2), keepdims=True)
+        filled = np.where(frames.usable, frames.electrons, median_e)
+        contrast = ndimage.gaussian_filter(filled, (0, 1, 1))
+        contrast -= ndimage.gaussian_filter(filled, (0, window / 4, window / 4))
+        brightness = np.sort(contrast, axis=0)[-3:].mean(0)
+        row, column = np.unravel_index(int(brightness.argmax()), brightness.shape)
         center = int(row), int(column)
     half = window // 2
-    first = np.clip(np.subtract(center, half), 0, np.subtract(shape[1:], window))
-    top, left = first.tolist()
-    cut = (slice(None), slice(top, top + window), slice(left, left + window))
+    corner = np.clip(np.subtract(center, half), 0, np.subtract(shape[1:], window))
+    top, left = corner.tolist()
+    inner = (slice(None), slice(top, top + window), slice(left, left + window))
     electrons, usable, saturated, variance_e2, scale = (
-        np.broadcast_to(getattr(frames, name), shape)[cut]
+        np.broadcast_to(getattr(frames, name), shape)[inner]
         for name in ("electrons", "usable", "saturated", "variance_e2", "scale")
     )
     data = FitImages(electrons, usable, saturated, variance_e2, scale, spec.model_error)
@@ -269,8 +277,11 @@ def crop_to_bead(
 def initial_parameters(
     model: PupilModel, data: FitImages, bead: tuple[int, int]
 ) -> Array:
-    """(p,) parameters: unaberrated pupil, blur of half a pixel, light and background of
-    the data.
+    """(p,) start parameters: unaberrated pupil, blur of half a pixel, gain and
+    background from the data.
+
+    Background of a plane: its 20th percentile, electrons. Gain: logarithm of the light
+    of the brightest plane above it.
 
     Args:
         model: gives the parameter vector.
@@ -281,56 +292,67 @@ def initial_parameters(
         FitError: no light above the background.
     """
     x = np.zeros(sum(model.sizes.values()))
-    level = np.percentile(data.electrons, 20, axis=(1, 2))
-    light = (data.electrons - level[:, None, None]).sum((1, 2)).max()
-    if light <= 0:
+    background_e = np.percentile(data.electrons, 20, axis=(1, 2))
+    light_e = (data.electrons - background_e[:, None, None]).sum((1, 2)).max()
+    if light_e <= 0:
         raise FitError(
             "no light above the background in the window; check center and window"
         )
-    parts, pixel_um = model.unpack(x), model.spec.pixel_um
-    parts["background"][:], parts["gain"][:] = level, math.log(light)
-    parts["blur"][:] = 0.5 * pixel_um
-    parts["drift_y"][0], parts["drift_x"][0] = np.array(bead) * pixel_um
+    groups = model.unpack(x)
+    pixel_um = model.spec.pixel_um
+    groups["background"][:] = background_e
+    groups["gain"][:] = math.log(light_e)
+    groups["blur"][:] = 0.5 * pixel_um
+    groups["drift_y"][0], groups["drift_x"][0] = np.array(bead) * pixel_um
     return x
 
 
 def fit_optics(
     model: PupilModel, data: FitImages, mean: Array, every: int
 ) -> tuple[PupilModel, Optics]:
-    """Model with the optics that ``spec.free`` names, fitted with low orders of the
-    pupil; (name, value, standard error) of each.
+    """Model with the fitted values of the optics named by ``spec.free``, and (name,
+    value, standard error) of each.
 
-    Where the images fix products only (aperture times pixel, say), the priors about the
-    stated values decide.
+    The fit uses every n-th plane and low orders of the pupil. Where the images fix
+    products only (aperture times pixel, say), the priors about the stated values
+    decide. Standard errors are widened by sqrt(chi² / dof) where that is above 1.
 
     Args:
-        model: with the stated values.
-        data: its planes.
+        model: model with the stated values.
+        data: all planes of ``model``.
         mean: (p,) mean of the prior.
-        every: distance of the planes that are used: the others judge it too.
+        every: the fit takes planes 0, every, 2 every, ...
     """
     spec = model.spec
     if not spec.free:
         return model, ()
-    low = _lower(spec, 6, 2)
+    low_spec = _lower(spec, 6, 2)
     planes = np.arange(0, len(model.position_um), every)
-    part = PupilModel(low, model.position_um[planes])
-    part_mean = transfer_parameters(mean, model, part)
-    some = data.planes(planes)
-    start = fit_low_orders(part, some, part_mean)
-    found = maximize_likelihood(part, some, start, part_mean, iterations=40, step=0.1)
-    optics, position_um = part.optics_at(found.value)
-    longer = float(np.ptp(position_um) / np.ptp(part.position_um))
-    step_um = longer * float(np.abs(np.diff(model.position_um)).mean())
-    widened = found.covariance * max(1.0, found.chi2_per_dof)
-    sigma = part.unpack(np.sqrt(np.diag(widened)))["optics"].tolist()
-    values = [step_um if n == "step_um" else getattr(optics, n) for n in spec.free]
+    low_model = PupilModel(low_spec, model.position_um[planes])
+    low_mean = transfer_parameters(mean, model, low_model)
+    low_data = data.planes(planes)
+    start = fit_low_orders(low_model, low_data, low_mean)
+    solution = maximize_likelihood(
+        low_model, low_data, start, low_mean, iterations=40, step=0.1
+    )
+    optics, position_um = low_model.optics_at(solution.value)
+    stage_factor = float(np.ptp(position_um) / np.ptp(low_model.position_um))
+    step_um = stage_factor * float(np.abs(np.diff(model.position_um)).mean())
+    covariance = solution.covariance * max(1.0, solution.chi2_per_dof)
+    sigma = low_model.unpack(np.sqrt(np.diag(covariance)))["optics"].tolist()
+    values = [
+        step_um if quantity == "step_um" else getattr(optics, quantity)
+        for quantity in spec.free
+    ]
     fitted = zip(spec.free, values, sigma, strict=True)
-    orders = {n: getattr(spec, n) for n in ("phase_order", "amplitude_order")}
-    known = replace(
+    orders = {
+        quantity: getattr(spec, quantity)
+        for quantity in ("phase_order", "amplitude_order")
+    }
+    fitted_spec = replace(
         optics, free=(), stage_sigma_um=model.stage_sigma_um, model=spec.model, **orders
     )
-    return PupilModel(known, longer * model.position_um), tuple(
+    return PupilModel(fitted_spec, stage_factor * model.position_um), tuple(
         (name, value, value * relative) for name, value, relative in fitted
     )
 
@@ -338,10 +360,10 @@ def fit_optics(
 def score_held_out(
     model: PupilModel, data: FitImages, mean: Array, every: int
 ) -> tuple[Array, StackAgreement, StackAgreement]:
-    """Fit every n-th plane, predict the planes between, compare with a cubic spline
-    through the same planes.
+    """Agreement of held-out planes with a fit of the others, and with a cubic spline
+    through the others.
 
-    The stage is taken as exact here, as stage errors of planes left out are unknown.
+    The stage is taken as exact here: stage errors of held-out planes are unknown.
 
     Args:
         model: of all planes.
@@ -356,34 +378,35 @@ def score_held_out(
     fitted = np.union1d(planes[::every], planes[-1])
     hidden = np.setdiff1d(planes, fitted)
     exact = replace(model.spec, stage_sigma_um=0.0)
-    part = PupilModel(exact, model.position_um[fitted])
-    some = data.planes(fitted)
-    part_mean = transfer_parameters(mean, model, part)
-    start = fit_low_orders(part, some, part_mean)
-    solution = maximize_likelihood(part, some, start, part_mean)
-    value = transfer_parameters(solution.value, part, model)
+    part_model = PupilModel(exact, model.position_um[fitted])
+    fitted_data = data.planes(fitted)
+    part_mean = transfer_parameters(mean, model, part_model)
+    start = fit_low_orders(part_model, fitted_data, part_mean)
+    solution = maximize_likelihood(part_model, fitted_data, start, part_mean)
+    value = transfer_parameters(solution.value, part_model, model)
     background = model.background(value)[hidden]
-    rest = data.planes(hidden)
-    spline = predict_by_splines(model.position_um, data, fitted, hidden)
-    pupil = model.images(value, False)[0][hidden]
+    hidden_data = data.planes(hidden)
+    interpolated = predict_by_splines(model.position_um, data, fitted, hidden)
+    predicted = model.images(value, False)[0][hidden]
     return (
         value,
-        measure_agreement(pupil, rest, background),
-        measure_agreement(spline, rest, background),
+        measure_agreement(predicted, hidden_data, background),
+        measure_agreement(interpolated, hidden_data, background),
     )
 
 
 def fit_low_orders(model: PupilModel, data: FitImages, mean: Array) -> Array:
-    """(p,) start of a fit: the best of three fits of radial order 4, begun at spherical
-    aberrations of 0, 0.8 and -0.8 rad.
+    """(p,) start of a fit: the most likely of three fits of radial order 4, started at
+    spherical aberrations of 0, 0.8 and -0.8 rad.
 
     Args:
-        model: of all orders.
+        model: model of all orders.
         data: its planes.
-        mean: (p,) parameters to begin with, mean of the prior.
+        mean: (p,) parameters to start from, and mean of the prior.
     """
     low = PupilModel(replace(_lower(model.spec, 4, 0), free=()), model.position_um)
-    low_mean, solutions = transfer_parameters(mean, model, low), []
+    low_mean = transfer_parameters(mean, model, low)
+    solutions = []
     for spherical_rad in (0.0, 0.8, -0.8):
         start = low_mean.copy()
         start[low.phase_indices.index((4, 0))] = spherical_rad
@@ -392,18 +415,23 @@ def fit_low_orders(model: PupilModel, data: FitImages, mean: Array) -> Array:
     return transfer_parameters(best.value, low, model)
 
 
-def _lower(spec: PupilSpec, phase: int, amplitude: int) -> PupilSpec:
-    """The specification with orders of at most so much."""
+def _lower(spec: PupilSpec, phase_order: int, amplitude_order: int) -> PupilSpec:
+    """The specification with Zernike orders of at most ``phase_order`` and
+    ``amplitude_order``.
+    """
     return replace(
         spec,
-        phase_order=min(spec.phase_order, phase),
-        amplitude_order=min(spec.amplitude_order, amplitude),
+        phase_order=min(spec.phase_order, phase_order),
+        amplitude_order=min(spec.amplitude_order, amplitude_order),
     )
 
 
 def transfer_parameters(x: Array, source: PupilModel, target: PupilModel) -> Array:
-    """(p,) parameters for a model of other orders, planes or optics: gains and
-    backgrounds interpolated along the axis, new orders and stage errors 0.
+    """(p,) parameters of ``target`` that describe the same pupil as ``x`` of
+    ``source``.
+
+    Gains and backgrounds are interpolated along the axis. Orders and stage errors that
+    ``source`` lacks are 0.
 
     Args:
         x: parameters of ``source``.
@@ -411,16 +439,16 @@ def transfer_parameters(x: Array, source: PupilModel, target: PupilModel) -> Arr
         target: model of nested orders, over the same range of planes.
     """
     order = np.argsort(source.position_um)
-    out = np.zeros(sum(target.sizes.values()))
-    into = target.unpack(out)
+    result = np.zeros(sum(target.sizes.values()))
+    groups = target.unpack(result)
     for name, values in source.unpack(x).items():
         if name in ("gain", "background"):
-            place, along = target.position_um, source.position_um[order]
-            into[name][:] = np.interp(place, along, values[order])
+            source_um = source.position_um[order]
+            groups[name][:] = np.interp(target.position_um, source_um, values[order])
         else:
             count = min(len(values), target.sizes[name])
-            into[name][:count] = values[:count]
-    return out
+            groups[name][:count] = values[:count]
+    return result
 
 
 def maximize_likelihood(
@@ -432,30 +460,38 @@ def maximize_likelihood(
     iterations: int = 60,
     step: float = 1.0,
 ) -> FitSolution:
-    """Levenberg-Marquardt with Gaussian priors: smooth pupils, gains within 30 %.
+    """Levenberg-Marquardt fit of a pupil with Gaussian priors and bounds.
+
+    Prior standard deviations: phase of order n, 3 min(1, 4 / n)³ rad; log-amplitude of
+    order n, 0.5 / n; log-gain, 0.3; drift, 10 pixels; optics, :data:`RELATIVE_PRIOR`.
 
     Args:
-        model: images and derivatives.
+        model: expected images and their derivatives.
         data: measured planes.
-        start: (p,) parameters.
+        start: (p,) parameters to start from.
         mean: (p,) mean of the prior.
-        iterations: at most.
-        step: standard errors of a step at which it stops.
+        iterations: largest number of iterations.
+        step: the fit stops at steps of fewer standard errors.
     """
-    width, spec = np.full(len(start), np.inf), model.spec
-    low = np.full(len(start), -np.inf)
-    high = np.full(len(start), np.inf)
-    sigma, least, most = (model.unpack(one) for one in (width, low, high))
-    sigma["phase"][:] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
-    sigma["amplitude"][:] = [0.5 / n for n, _ in model.amplitude_indices]
-    sigma["drift_x"][:] = sigma["drift_y"][:] = 10 * spec.pixel_um
+    spec = model.spec
+    sigma = np.full(len(start), np.inf)
+    lower = np.full(len(start), -np.inf)
+    upper = np.full(len(start), np.inf)
+    sigma_of, lower_of, upper_of = (
+        model.unpack(vector) for vector in (sigma, lower, upper)
+    )
+    sigma_of["phase"][:] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
+    sigma_of["amplitude"][:] = [0.5 / n for n, _ in model.amplitude_indices]
+    sigma_of["drift_x"][:] = sigma_of["drift_y"][:] = 10 * spec.pixel_um
     if model.sizes["stage"]:
-        sigma["stage"][:] = model.stage_sigma_um
-    sigma["gain"][:] = 0.3
-    sigma["optics"][:] = [RELATIVE_PRIOR[name] for name in spec.free]
+        sigma_of["stage"][:] = model.stage_sigma_um
+    sigma_of["gain"][:] = 0.3
+    sigma_of["optics"][:] = [RELATIVE_PRIOR[name] for name in spec.free]
     # the derivative by the blur vanishes at 0
-    least["blur"][:], most["blur"][:] = 0.05 * spec.pixel_um, 4 * spec.pixel_um
-    least["optics"][:], most["optics"][:] = -0.3, 0.3
+    lower_of["blur"][:] = 0.05 * spec.pixel_um
+    upper_of["blur"][:] = 4 * spec.pixel_um
+    lower_of["optics"][:] = -0.3
+    upper_of["optics"][:] = 0.3
     settings = SolverSettings(
         iterations=iterations, step_tolerance=step, near=2.0, secant=True
     )
@@ -463,7 +499,7 @@ def maximize_likelihood(
         model.images,
         data,
         start,
-        prior=GaussianPrior(mean, width, low, high),
+        prior=GaussianPrior(mean, sigma, lower, upper),
         settings=settings,
     )
 
@@ -471,18 +507,18 @@ def maximize_likelihood(
 def describe_limits(
     spec: PupilSpec, solution: FitSolution, optics: Optics
 ) -> list[str]:
-    """Degeneracies and misfits of a fit in words.
+    """Sentences on the fitted optics, the degeneracies and the misfit of a fit.
 
     Args:
-        spec: as stated.
+        spec: specification before the optics were fitted.
         solution: the fit.
-        optics: fitted optics.
+        optics: (name, value, standard error) of the fitted optics.
     """
     words = []
     for name, value, sigma in optics:
-        before = getattr(spec, name)
-        given = f", stated {before:.4g}" if math.isfinite(before) else ""
-        words.append(f"{name} = {value:.4g} +- {sigma:.2g} was fitted{given}")
+        stated = getattr(spec, name)
+        stated_text = f", stated {stated:.4g}" if math.isfinite(stated) else ""
+        words.append(f"{name} = {value:.4g} +- {sigma:.2g} was fitted{stated_text}")
     words += [
         "the images cannot tell the direction of the stage: a reversed stack gives the "
         "phase turned by 180 degrees with the other sign",

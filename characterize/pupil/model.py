@@ -119,8 +119,8 @@ class PupilModel:
     """Debye integral of an isotropic emitter (Richards and Wolf 1959), evaluated by
     matrix Fourier transforms.
 
-    The pupil is exp(log-amplitude + i phase), both Zernike series. The intensity, summed
-    over the dipole components, is convolved with bead, Gaussian blur and pixel.
+    The pupil is exp(log-amplitude + i phase), both Zernike series. The intensity,
+    summed over the dipole components, is convolved with bead, Gaussian blur and pixel.
 
     Accuracy: the pupil is sampled finely enough that images of ``window`` pixels do not
     wrap around at the farthest defocus; its rim is weighted by the covered share of a
@@ -149,7 +149,9 @@ class PupilModel:
 
         defocus_um = 2 * span_um * spec.sine / math.sqrt(1 - spec.sine**2)
         period_um = (spec.window + 6) * spec.pixel_um + defocus_um
-        room = 1.4 if spec.free else 1.1  # against images that wrap around
+        room = (
+            1.4 if spec.free else 1.1
+        )  # factor that keeps images from wrapping around
         waves = period_um * spec.numerical_aperture / spec.wavelength_um
         self.nodes = 2 * math.ceil(room * waves / 2 + 6)
         self.axis = (2 * np.arange(self.nodes) + 1) / self.nodes - 1
@@ -157,7 +159,8 @@ class PupilModel:
         radius = np.hypot(u, v)
         covered = np.clip((1 - radius) * self.nodes / 2 + 0.5, 0, 1)
         self.inside = covered > 0
-        self.covered, radius = covered[self.inside], np.maximum(radius[self.inside], 1)
+        self.covered = covered[self.inside]
+        radius = np.maximum(radius[self.inside], 1)
         self.u, self.v = u[self.inside] / radius, v[self.inside] / radius
         self.phase_basis = zernike.zernike_basis(self.phase_indices, self.u, self.v)
         self.amplitude_basis = zernike.zernike_basis(
@@ -213,8 +216,13 @@ class PupilModel:
         return {name: x[place] for name, place in self._places.items()}
 
     def optics_at(self, x: Array) -> tuple[PupilSpec, Array]:
-        """Specification and stage positions (n,) with the optics of parameters ``x``,
-        (p,); what is freed is a factor of the stated value.
+        """Specification and (n,) stage positions in um with the fitted optics.
+
+        A free quantity is its stated value times exp(parameter). The numerical aperture
+        is kept below 0.98 of the index.
+
+        Args:
+            x: (p,) parameters in the order of :meth:`names`.
         """
         spec = self.spec
         if not spec.free:
@@ -230,95 +238,121 @@ class PupilModel:
         return replace(spec, model=kind, **values), position_um
 
     def background(self, x: Array) -> Array:
-        """(n, window, window) electrons at parameters ``x``, (p,): a level for each
-        plane and one linear gradient.
+        """(n, window, window) background in electrons: a level for each plane plus one
+        linear gradient.
+
+        Args:
+            x: (p,) parameters in the order of :meth:`names`.
         """
-        parts, along = self.unpack(x), self._along()
+        parts = self.unpack(x)
+        offset = self._along()
         slope_x, slope_y = parts["gradient"]
         level = parts["background"][:, None, None]
-        return np.asarray(level + slope_x * along + slope_y * along[:, None])
+        return np.asarray(level + slope_x * offset + slope_y * offset[:, None])
 
     def images(self, x: Array, jacobian: bool) -> tuple[Array, Array | None]:
-        """Expected images (n, window, window) in electrons at parameters ``x``, (p,),
-        and where asked their derivatives (p, n, window, window): 2 Re(E* dE), in single
-        precision; of the optics by differences.
+        """Expected images (n, window, window) in electrons, and with ``jacobian`` their
+        derivatives (p, n, window, window) by the parameters.
+
+        An image is gain * sum over dipoles of |F(A exp(i phase))|², convolved with
+        bead, blur and pixel, plus background. Its derivative by a pupil coefficient is
+        2 Re(E* dE), in single precision. Derivatives by the optics are central
+        differences.
+
+        Args:
+            x: (p,) parameters in the order of :meth:`names`.
+            jacobian: whether derivatives are computed; None without it.
         """
         parts = self.unpack(x)
         spec, position_um = self.optics_at(x)
-        k = 2 * math.pi * spec.index / spec.wavelength_um
-        along_x, along_y = spec.sine * self.u, spec.sine * self.v
-        along_z = np.sqrt(1 - along_x**2 - along_y**2)
+        wavenumber = 2 * math.pi * spec.index / spec.wavelength_um
+        cosine_x, cosine_y = spec.sine * self.u, spec.sine * self.v
+        cosine_z = np.sqrt(1 - cosine_x**2 - cosine_y**2)
+        # dipole amplitudes (components, rays) at the direction cosines of the pupil
         dipoles = self.covered * dipole_components(
-            along_x, along_y, vectorial=spec.vectorial
+            cosine_x, cosine_y, vectorial=spec.vectorial
         )
         grid = replace(self.grid, pixel_um=spec.pixel_um)
         blur_um = parts["blur"][0]
-        plain = grid.oversample == 1 and not spec.bead_um
-        sharp = bool(plain and blur_um <= _SHARP * spec.pixel_um)
-        cut = slice(grid.margin, -grid.margin) if sharp else slice(None)
-        y_um, x_um = (axis[cut] for axis in grid.axes_um())
-        to_y = np.exp(1j * k * spec.sine * np.outer(y_um, self.axis))
-        to_x = np.exp(1j * k * spec.sine * np.outer(self.axis, x_um))
-        if not sharp:
+        point_pixels = grid.oversample == 1 and not spec.bead_um
+        unblurred = bool(point_pixels and blur_um <= _SHARP * spec.pixel_um)
+        inner = slice(grid.margin, -grid.margin) if unblurred else slice(None)
+        y_um, x_um = (axis[inner] for axis in grid.axes_um())
+        kernel_y = np.exp(1j * wavenumber * spec.sine * np.outer(y_um, self.axis))
+        kernel_x = np.exp(1j * wavenumber * spec.sine * np.outer(self.axis, x_um))
+        if not unblurred:
             transfer, by_blur = self._transfer(grid, float(blur_um))
 
         z_um = position_um + (parts["stage"] if self.sizes["stage"] else 0.0)
-        turn = parts["phase"] @ self.phase_basis + k * np.outer(z_um, along_z)
-        turn -= k * np.outer(parts["drift_x"] @ self.drift_basis, along_x)
-        turn -= k * np.outer(parts["drift_y"] @ self.drift_basis, along_y)
+        drift_x_um = parts["drift_x"] @ self.drift_basis
+        drift_y_um = parts["drift_y"] @ self.drift_basis
+        aberration_rad = parts["phase"] @ self.phase_basis
+        phase_rad = aberration_rad + wavenumber * np.outer(z_um, cosine_z)
+        phase_rad -= wavenumber * np.outer(drift_x_um, cosine_x)
+        phase_rad -= wavenumber * np.outer(drift_y_um, cosine_y)
         amplitude = dipoles * np.exp(parts["amplitude"] @ self.amplitude_basis)
-        pupil = self._on_square((self.mask * np.exp(1j * turn))[:, None] * amplitude)
-        field = self._transform(pupil, to_y, to_x)
+        pupil = self._on_square(
+            (self.mask * np.exp(1j * phase_rad))[:, None] * amplitude
+        )
+        field = self._transform(pupil, kernel_y, kernel_x)
         intensity = (field.real**2 + field.imag**2).sum(1)
 
-        sample = 2 * spec.numerical_aperture * spec.pixel_um / spec.wavelength_um
-        scale = np.exp(parts["gain"]) * (sample / self.nodes) ** 2
+        pixel_step = 2 * spec.numerical_aperture * spec.pixel_um / spec.wavelength_um
+        scale = np.exp(parts["gain"]) * (pixel_step / self.nodes) ** 2
         scale = (scale / (dipoles**2).sum())[:, None, None]
 
-        light = scale * (intensity if sharp else grid.sample(intensity, transfer))
+        light = scale * (intensity if unblurred else grid.sample(intensity, transfer))
         images = light + self.background(x)
         if not jacobian:
             return images, None
 
-        out = np.zeros((len(x), *images.shape))
-        into, planes = self.unpack(out), np.arange(len(images))
-        staged = bool(self.sizes["stage"])
-        ways = 1j * k * np.stack([-along_x, -along_y, along_z])[: 2 + staged]
+        derivatives = np.zeros((len(x), *images.shape))
+        groups = self.unpack(derivatives)
+        planes = np.arange(len(images))
+        has_stage = bool(self.sizes["stage"])
+        cosines = np.stack([-cosine_x, -cosine_y, cosine_z])[: 2 + has_stage]
+        shift_columns = 1j * wavenumber * cosines
         columns = np.concatenate(
-            [self._columns, self._on_square(ways.astype(np.complex64))]
+            [self._columns, self._on_square(shift_columns.astype(np.complex64))]
         )
         slopes = np.empty((len(columns), *images.shape), np.float32)
-        pupil, field, to_y, to_x = (
-            a.astype(np.complex64) for a in (pupil, field, to_y, to_x)
+        pupil, field, kernel_y, kernel_x = (
+            a.astype(np.complex64) for a in (pupil, field, kernel_y, kernel_x)
         )
+        # 2 Re(E* dE) by every pupil coefficient and shift, a block of them at a time
         block = max(1, _BLOCK // field.size)
         for first in range(0, len(columns), block):
             changed = pupil * columns[first : first + block, None, None]
-            change = self._transform(changed, to_y, to_x)
-            both = field.view(np.float32) * change.view(np.float32)
-            slope = 2 * (both[..., ::2] + both[..., 1::2]).sum(2)
+            change = self._transform(changed, kernel_y, kernel_x)
+            products = field.view(np.float32) * change.view(np.float32)
+            slope = 2 * (products[..., ::2] + products[..., 1::2]).sum(2)
             slopes[first : first + block] = (
-                slope if sharp else grid.sample(slope, transfer)
+                slope if unblurred else grid.sample(slope, transfer)
             )
         count = len(self._columns)
         drift = self.drift_basis[:, :, None, None] * scale
-        np.multiply(slopes[:count], scale, out=out[:count])
-        np.multiply(drift, slopes[count], out=into["drift_x"])
-        np.multiply(drift, slopes[count + 1], out=into["drift_y"])
-        if staged:
-            into["stage"][planes, planes] = scale * slopes[-1]
-        if not sharp:
-            into["blur"][:] = scale * grid.sample(intensity, by_blur)
-        into["gain"][planes, planes] = light
-        into["background"][planes, planes] = 1.0
-        into["gradient"][0], into["gradient"][1] = self._along(), self._along()[:, None]
-        step, count = 1e-4, len(self.spec.free)
-        for row, at in zip(
-            into["optics"], np.eye(len(x))[len(x) - count :], strict=True
+        np.multiply(slopes[:count], scale, out=derivatives[:count])
+        np.multiply(drift, slopes[count], out=groups["drift_x"])
+        np.multiply(drift, slopes[count + 1], out=groups["drift_y"])
+        if has_stage:
+            groups["stage"][planes, planes] = scale * slopes[-1]
+        if not unblurred:
+            groups["blur"][:] = scale * grid.sample(intensity, by_blur)
+        groups["gain"][planes, planes] = light
+        groups["background"][planes, planes] = 1.0
+        groups["gradient"][0] = self._along()
+        groups["gradient"][1] = self._along()[:, None]
+        step = 1e-4
+        count = len(self.spec.free)
+        for row, direction in zip(
+            groups["optics"], np.eye(len(x))[len(x) - count :], strict=True
         ):
-            up, down = (self.images(x + s * at, False)[0] for s in (step, -step))
-            row[:] = (up - down) / (2 * step)
-        return images, out
+            above, below = (
+                self.images(x + signed_step * direction, False)[0]
+                for signed_step in (step, -step)
+            )
+            row[:] = (above - below) / (2 * step)
+        return images, derivatives
 
     def pupil_maps(self, x: Array) -> tuple[Array, Array]:
         """Phase in rad (nan outside the pupil) and amplitude (0 outside) of parameters
@@ -330,6 +364,7 @@ class PupilModel:
         return phase, self._on_square(np.exp(parts["amplitude"] @ self.amplitude_basis))
 
     def _along(self) -> Array:
+        """(window,) pixel offsets from the middle pixel of the window."""
         return np.arange(self.spec.window) - self.spec.window // 2
 
     def _transfer(
@@ -339,19 +374,21 @@ class PupilModel:
         blur.
         """
         fy, fx = grid.frequencies()
-        fixed = detector.ball_transfer(fy, fx, self.spec.bead_um)
+        constant = detector.ball_transfer(fy, fx, self.spec.bead_um)
         if grid.oversample > 1:
-            fixed = fixed * detector.pixel_transfer(fy, fx, grid.pixel_um)
+            constant = constant * detector.pixel_transfer(fy, fx, grid.pixel_um)
         blur, slope = detector.gaussian_transfer(fy, fx, blur_um)
-        return fixed * blur, fixed * slope
+        return constant * blur, constant * slope
 
-    def _transform(self, pupil: Array, to_y: Array, to_x: Array) -> Array:
-        """(..., nodes, nodes) to (..., y, x): field by one product along each axis."""
-        rows = pupil.reshape(-1, self.nodes) @ to_x
-        return np.asarray(to_y @ rows.reshape(*pupil.shape[:-1], -1))
+    def _transform(self, pupil: Array, kernel_y: Array, kernel_x: Array) -> Array:
+        """(..., y, x) field of a (..., nodes, nodes) pupil by matrix Fourier
+        transforms: kernel_y pupil kernel_x.
+        """
+        rows = pupil.reshape(-1, self.nodes) @ kernel_x
+        return np.asarray(kernel_y @ rows.reshape(*pupil.shape[:-1], -1))
 
     def _on_square(self, values: Array) -> Array:
-        """(..., inside) to (..., nodes, nodes), 0 outside the pupil."""
+        """(..., nodes, nodes) array of (..., inside) values, 0 outside the pupil."""
         square = np.zeros((*values.shape[:-1], self.nodes, self.nodes), values.dtype)
         square[..., self.inside] = values
         return square
@@ -374,21 +411,25 @@ def dipole_components(x: Array, y: Array, *, vectorial: bool) -> Array:
     cosine = np.sqrt(1 - sine2)
     if not vectorial:
         return np.asarray(cosine**-0.5)[None]
-    sine, azimuth = np.sqrt(sine2), np.arctan2(y, x)
-    c, s = np.cos(azimuth), np.sin(azimuth)
+    sine = np.sqrt(sine2)
+    azimuth = np.arctan2(y, x)
+    cosine_a = np.cos(azimuth)
+    sine_a = np.sin(azimuth)
     rows = [
-        1 + (cosine - 1) * c**2,
-        math.sqrt(2) * (cosine - 1) * s * c,
-        -sine * c,
-        1 + (cosine - 1) * s**2,
-        -sine * s,
+        1 + (cosine - 1) * cosine_a**2,
+        math.sqrt(2) * (cosine - 1) * sine_a * cosine_a,
+        -sine * cosine_a,
+        1 + (cosine - 1) * sine_a**2,
+        -sine * sine_a,
     ]
     return np.asarray(np.stack(rows) / np.sqrt(cosine))
 
 
 def load_phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) -> Array:
-    """(*shape) exp(i phase) of a pupil mask by bilinear interpolation of the complex
-    number, so that 2 pi jumps do no harm.
+    """(*shape) exp(i phase) of a phase mask at points of the pupil.
+
+    The complex number is interpolated bilinearly and divided by its modulus, so that
+    jumps of 2 pi in the phase do no harm.
 
     Args:
         path: NPY or TIFF, a square phase map in rad about the pupil.
@@ -418,8 +459,12 @@ def load_phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) ->
             f"{path}: a mask of {phase.shape} {phase.dtype}; need a square of 8 finite "
             "numbers or more"
         )
-    c, s = math.cos(turn_rad), math.sin(turn_rad)
-    place = [(one + 1) * side / 2 - 0.5 for one in (c * v - s * u, c * u + s * v)]
+    cosine = math.cos(turn_rad)
+    sine = math.sin(turn_rad)
+    indices = [
+        (coordinate + 1) * side / 2 - 0.5
+        for coordinate in (cosine * v - sine * u, cosine * u + sine * v)
+    ]
     mask = np.exp(1j * phase.astype(float))
-    value = ndimage.map_coordinates(mask, place, order=1, mode="nearest")
-    return np.asarray(value / np.maximum(np.abs(value), 1e-9))
+    samples = ndimage.map_coordinates(mask, indices, order=1, mode="nearest")
+    return np.asarray(samples / np.maximum(np.abs(samples), 1e-9))

@@ -29,19 +29,19 @@ from metalens.psf import SpectralNodes, among
 
 NONE = math.nan
 TOTAL, MEASURED = "all links", "measured, all at once"
-SOLVED = 12  # diameters at which the pillar model is solved again
-FINER = 30.0  # how much more precisely
-LABELS = 64  # pixels of renderings whose labels alone are wanted
-THINNED = 320  # frames that small changes of the optics are judged on
+SOLVED = 12  # diameters at which pillars are solved again
+FINER = 30.0  # factor by which the tolerance of those solutions is smaller
+LABELS = 64  # pixels of renderings of which only the labels are used
+THINNED = 320  # frames on which small changes of the optics are judged
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetEntry:
-    """One link: rms phase error over the pillars (rad), relative L2 error of the PSFs,
-    gaze error (rad, mean angle).
+    """Errors by one link of the chain; nan where the link has none.
 
-    nan where the link has none. method: how it was determined. counted: whether the
-    sum holds it.
+    phase_rad: rms phase error over the pillars. psf: relative L2 error of the PSFs.
+    gaze_rad: gaze error, mean angle. method: how it was determined.
+    counted: whether the sum includes it.
     """
 
     link: str
@@ -53,37 +53,44 @@ class BudgetEntry:
 
 
 def quadrature_difference(error: float, before: float) -> float:
-    """What an error has more than before, in quadrature; 0 where it has less."""
+    """Growth of an ``error`` over that ``before`` it, in quadrature; 0 where smaller."""
     return math.sqrt(max(error**2 - before**2, 0.0))
 
 
 def quadrature_total(rows: list[BudgetEntry]) -> BudgetEntry:
-    """The root of the sum of squares of the rows that count; nan of what none knows."""
+    """Root of the sum of squares of the counted rows, column by column.
 
-    def together(name: str) -> float:
-        values = [getattr(e, name) for e in rows if e.counted]
-        known = [v for v in values if math.isfinite(v)]
-        return math.hypot(*known) if known else NONE
+    Rows without a value (nan) are left out; nan where no row has one.
+    """
 
-    missing = [e.link for e in rows if e.counted and math.isnan(e.gaze_rad)]
-    without = f"; gaze without {', '.join(missing)}" if missing else ""
+    def root_sum_square(name: str) -> float:
+        values = [getattr(row, name) for row in rows if row.counted]
+        finite = [value for value in values if math.isfinite(value)]
+        return math.hypot(*finite) if finite else NONE
+
+    without_gaze = [
+        row.link for row in rows if row.counted and math.isnan(row.gaze_rad)
+    ]
+    suffix = f"; gaze without {', '.join(without_gaze)}" if without_gaze else ""
     return BudgetEntry(
         TOTAL,
-        together("phase_rad"),
-        together("psf"),
-        together("gaze_rad"),
-        f"root of the sum of squares{without}",
+        root_sum_square("phase_rad"),
+        root_sum_square("psf"),
+        root_sum_square("gaze_rad"),
+        f"root of the sum of squares{suffix}",
     )
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetInputs:
-    """What is known beside the lens: each adds its entries.
+    """Optional inputs of the budget; each adds its links.
 
-    fwhm_nm: of the light source. mask: of the PROCESS.toml. library: that the proxy was
-    fitted to. asbuilt: of a fit. run: of a finished co-design run, whose network reads.
-    frames: that it is shown. draws: of process and fit. tolerance: of the pillar solver,
-    where no library says it.
+    fwhm_nm: spectral width of the light source. mask: grid and spread of PROCESS.toml.
+    library: pillar library that the proxy was fitted to. asbuilt: fit of the built
+    lens.
+    run: finished co-design run with its network. frames: experiment that it reads.
+    draws: number of draws of process and fit.
+    tolerance: of the pillar solver, where no library states it.
     """
 
     fwhm_nm: float = 0.0
@@ -99,19 +106,22 @@ class BudgetInputs:
 
 
 def image_difference(one: Imager, other: Imager) -> float:
-    """Relative L2 difference of the PSFs of two images over field and depth, each PSF
-    of sum 1.
+    """|p - q| / |q|: relative L2 difference of the PSFs of two imagers over field and
+    depth, each PSF of sum 1.
 
     Args:
-        one: image to compare. other: the image it is compared with.
+        one: imager of the PSFs p.
+        other: imager of the PSFs q.
     """
     return float((one.stack - other.stack).norm() / other.stack.norm())
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImagingDevice:
-    """A lens plane, its films and its sensor, with its image. Images of other optics
-    share field points, depths, wavelengths and kernels: they differ by the cause alone.
+    """Lens plane, films and sensor, with their imager.
+
+    Imagers of changed optics share field points, depths, wavelengths and kernels with
+    it, so that they differ by the change alone.
     """
 
     optics: Optics
@@ -119,30 +129,28 @@ class ImagingDevice:
 
     @torch.no_grad()
     def image(self, optics: Optics) -> Imager:
-        """The image through other optics."""
+        """Imager of other optics at the same field points and depths."""
         light = node_light(optics, self.whole.plan).detach()
         return with_psfs(self.whole, *normalise_psfs(light, optics, self.whole.plan))
 
     def one_psf(self) -> Imager:
-        """The image by the PSFs of the middle of the field alone."""
+        """Imager with the PSFs of the middle of the field everywhere."""
         stack = self.whole.stack
         rows, columns = (n // 2 for n in stack.shape[:2])
-        same = stack[rows, columns].expand_as(stack).contiguous()
-        return with_psfs(self.whole, same, self.whole.energy)
+        middle = stack[rows, columns].expand_as(stack).contiguous()
+        return with_psfs(self.whole, middle, self.whole.energy)
 
     def evenly_lit(self) -> Imager:
-        """The image of a lens that collects as much light from every direction: no
-        cos⁴, no vignetting.
-        """
-        level = self.whole.energy.mean().expand_as(self.whole.energy).contiguous()
-        return with_psfs(self.whole, self.whole.stack, level)
+        """Imager with the same light from every direction: without cos⁴ and vignetting."""
+        even = self.whole.energy.mean().expand_as(self.whole.energy).contiguous()
+        return with_psfs(self.whole, self.whole.stack, even)
 
     @torch.no_grad()
     def one_wavelength(self, wavelength_um: float) -> Imager:
-        """The image in light of one wavelength.
+        """Imager in light of one wavelength.
 
         Args:
-            wavelength_um: of the light.
+            wavelength_um: wavelength of the light.
         """
         waves = SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
         plan = replace(self.whole.plan, waves=waves)
@@ -151,46 +159,61 @@ class ImagingDevice:
 
     @torch.no_grad()
     def both_polarisations(self) -> Imager:
-        """The image by the flux of both polarisations through the sensor; the device's
-        own where it is that already.
+        """Imager by the flux of both polarisations through the sensor, in place of the
+        intensity of a scalar field.
 
-        What they change is small and smooth: it is computed at 5 x 5 field points at
-        most, and interpolated.
+        The difference of the two is small and smooth: it is computed at 5 x 5 field
+        points at most, interpolated bilinearly, and added to the scalar PSFs.
         """
-        plan, optics = self.whole.plan, self.optics
+        plan = self.whole.plan
+        optics = self.optics
         if plan.window.components:
             return self.whole
-        y, x = (
+        coarse_y, coarse_x = (
             torch.linspace(float(a[0]), float(a[-1]), min(5, len(a)), dtype=a.dtype)
             for a in (plan.y_um, plan.x_um)
         )
-        scalar, both = (
+        scalar, vectorial = (
             node_light(
                 optics,
                 replace(
-                    plan, y_um=y, x_um=x, window=replace(plan.window, components=count)
+                    plan,
+                    y_um=coarse_y,
+                    x_um=coarse_x,
+                    window=replace(plan.window, components=count),
                 ),
             )
             for count in (0, plan.window.whole)
         )
-        to_y, to_x = (
-            (1 - (wanted[:, None] - at).abs() / (at[1] - at[0])).clamp_min(0)
-            for wanted, at in ((plan.y_um, y), (plan.x_um, x))
+        weights_y, weights_x = (
+            (1 - (fine[:, None] - coarse).abs() / (coarse[1] - coarse[0])).clamp_min(0)
+            for fine, coarse in ((plan.y_um, coarse_y), (plan.x_um, coarse_x))
         )
         change = torch.einsum(
-            "ya,xb,abzhw->yxzhw", to_y.to(both), to_x.to(both), both - scalar
+            "ya,xb,abzhw->yxzhw",
+            weights_y.to(vectorial),
+            weights_x.to(vectorial),
+            vectorial - scalar,
         )
         light = node_light(optics, plan) + change
         return with_psfs(self.whole, *normalise_psfs(light, optics, plan))
 
 
 class NetworkReading:
-    """A run's network with the frames of the virtual experiment, and the persons that
-    its answers calibrate. Changes of the optics are judged once :meth:`path` is through.
+    """A run's network with the frames of the virtual experiment, and the calibrated
+    persons.
+
+    :meth:`path` calibrates the persons; :meth:`changed` and :meth:`turn_rad` need it
+    first.
     """
 
     def __init__(self, source: FinishedRun, config: ExperimentConfig) -> None:
-        """``source``: of the run. ``config``: what is shown to whom."""
+        """Render the frames of all subjects.
+
+        Args:
+            source: finished run with its network.
+            config: subjects, stimuli, slippage and calibration.
+        """
         self.source, self.config = source, config
         self.scenes = source.run.scenes(EXPERIMENT)
         self.sensor = experiment.experiment_sensors([source], config)[0]
@@ -203,8 +226,8 @@ class NetworkReading:
             )
             trials.append(trial)
         self.trial = experiment.join_subjects(trials)
-        known = experiment.calibration_frames(self.trial, config)
-        judged = ~np.isin(np.arange(len(self.trial.subject)), known)
+        calibration = experiment.calibration_frames(self.trial, config)
+        judged = ~np.isin(np.arange(len(self.trial.subject)), calibration)
         self.judged = judged & self.trial.group(experiment.AXIAL)
         self.measured_rad = NONE
         self._people: dict[int, CalibratedPerson] = {}
@@ -214,46 +237,56 @@ class NetworkReading:
     def path(
         self, device: ImagingDevice, settings: OpticsConfig
     ) -> Iterator[BudgetEntry]:
-        """Entries from the true pupil to the predicted gaze.
+        """Entries of the links from the true pupil to the predicted gaze.
+
+        The chain starts at the true pupil and slippage and adds one link a state. A
+        link's error is the growth of the gaze error in quadrature.
 
         Args:
-            device: of the run's own lens in its true image, formed by ``settings``.
+            device: the run's lens with its true image.
+            settings: optics that ``device`` was formed by.
         """
         config, source = self.config, self.source
         sphere = experiment.sphere_calibrator(source, config)
-        true = self._known(config)
-        still = self._known(replace(config, fixation_deg=0.0))
-        believed = experiment.prepare_run(source, image="trained")
-        how = experiment.run_calibrator(source, believed, config, self.sensor)
-        quiet, noisy = (
-            self._read(self.subjects, believed, quiet=q) for q in (True, False)
+        exact = self._true_readings(config)
+        exact_fixed = self._true_readings(replace(config, fixation_deg=0.0))
+        trained_imager = experiment.prepare_run(source, image="trained")
+        calibrator = experiment.run_calibrator(
+            source, trained_imager, config, self.sensor
         )
-        together = self._error_rad(quiet, how)
-        # who reads an axis needs the pupil less than the sphere does
-        alone = self._error_rad(NetworkReadings(quiet.pupil_mm, true.slip_mm), sphere)
+        quiet, noisy = (
+            self._read(self.subjects, trained_imager, quiet=is_quiet)
+            for is_quiet in (True, False)
+        )
+        quiet_error = self._error_rad(quiet, calibrator)
+        # a network that reads the optic axis depends less on the pupil than the sphere
+        pupil_error = self._error_rad(
+            NetworkReadings(quiet.pupil_mm, exact.slip_mm), sphere
+        )
         net = f"network of {source.row['mmacs']:.3g} MMACs, noiseless frames as in training"
         people = (
             f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
         )
         states = [
-            ("subject and calibration", self._error_rad(still, sphere), NONE,
+            ("subject and calibration", self._error_rad(exact_fixed, sphere), NONE,
              f"true pupil and slippage; {people}"),
-            ("fixation", self._error_rad(true, sphere), NONE,
+            ("fixation", self._error_rad(exact, sphere), NONE,
              f"scatter of {config.fixation_deg:g} deg about the stimulus"),
-            ("reader, pupil", min(alone, together), NONE, net),
-            ("reader, slippage", together, NONE, net),
-            ("sensor noise", self._error_rad(noisy, how), NONE, "frames with noise"),
+            ("reader, pupil", min(pupil_error, quiet_error), NONE, net),
+            ("reader, slippage", quiet_error, NONE, net),
+            ("sensor noise", self._error_rad(noisy, calibrator), NONE,
+             "frames with noise"),
         ]  # fmt: skip
         for link, optics, psf, method in self._untrained(device, settings):
-            how = experiment.run_calibrator(source, optics, config, self.sensor)
+            calibrator = experiment.run_calibrator(source, optics, config, self.sensor)
             noisy = self._read(self.subjects, optics)
-            states.append((link, self._error_rad(noisy, how), psf, method))
+            states.append((link, self._error_rad(noisy, calibrator), psf, method))
         before = 0.0
         for link, error, psf, method in states:
-            grown = quadrature_difference(error, before)
-            yield BudgetEntry(link, NONE, psf, grown, method)
+            added = quadrature_difference(error, before)
+            yield BudgetEntry(link, NONE, psf, added, method)
             before = error
-        self._keep(noisy, how)
+        self._store_people(noisy, calibrator)
         yield from self._trained(device, settings)
 
     def changed(
@@ -265,34 +298,40 @@ class NetworkReading:
         *,
         phase_rad: float = NONE,
     ) -> BudgetEntry:
-        """The entry of a change of the optics after the persons were calibrated.
+        """Entry of a change of the optics, with the persons calibrated before it.
 
         Args:
-            link: name of the row. base: image before the change.
-            method: how the entry is determined. phase_rad: phase error of the pillars.
+            link: name of the row.
+            optics: imager after the change.
+            base: imager before the change.
+            method: how the entry is determined.
+            phase_rad: phase error of the pillars.
         """
         gaze = self.turn_rad(optics, base)
         psf = image_difference(optics, base)
         return BudgetEntry(link, phase_rad, psf, gaze, method)
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
-        """Mean angle, rad, between the answers to noiseless frames through two optics;
-        the persons stay calibrated.
+        """Mean angle in rad between the gaze predicted from noiseless frames through
+        two imagers, by the same calibrations.
 
         Args:
-            base: image before the change.
+            optics: imager after the change.
+            base: imager before the change.
         """
         trial = experiment.rows_of_trial(self.trial, self._rows)
         one, other = (
             experiment.predicted_gaze(
-                self._people, self._read(self._thin, o, quiet=True), trial
+                self._people, self._read(self._thin, imager, quiet=True), trial
             )
-            for o in (optics, base)
+            for imager in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
-    def _known(self, config: ExperimentConfig) -> NetworkReadings:
-        """Pupil and slippage of the experiment's frames as they are."""
+    def _true_readings(self, config: ExperimentConfig) -> NetworkReadings:
+        """True pupil (mm) and slippage (mm) of all frames of an experiment, from labels
+        of small renderings.
+        """
         pupil, slip = [], []
         pitch = self.scenes.camera.pitch_um * self.scenes.camera.pixels / LABELS
         for subject in range(config.subjects):
@@ -301,38 +340,42 @@ class NetworkReading:
             labels = render(states, rig=self.scenes.rig, camera=camera).labels
             pupil.append((labels.pupil_px - (LABELS - 1) / 2) * (pitch * 1e-3))
             slip.append(labels.slip_um * 1e-3)
-        return NetworkReadings(*(torch.cat(v).double().numpy() for v in (pupil, slip)))
+        return NetworkReadings(
+            *(torch.cat(values).double().numpy() for values in (pupil, slip))
+        )
 
     def _untrained(
         self, device: ImagingDevice, settings: OpticsConfig
     ) -> Iterator[tuple[str, Imager, float, str]]:
-        """What training left out of its image, one more in each."""
-        believed = self.source.run.trainer.optics
-        if believed.image == "uniform":
-            one = device if not settings.fwhm_nm else replace(
+        """(link, imager, PSF error, method) of each cause that training left out; every
+        imager has one cause more.
+        """
+        trained = self.source.run.trainer.optics
+        if trained.image == "uniform":
+            same_spectrum = device if not settings.fwhm_nm else replace(
                 device, whole=device.one_wavelength(settings.wavelength_nm * 1e-3)
             )  # fmt: skip
-            psf = image_difference(one.one_psf(), one.whole)
+            psf = image_difference(same_spectrum.one_psf(), same_spectrum.whole)
             method = "the whole field; training had the PSFs of one chief ray"
-            yield "field", one.evenly_lit(), psf, method
+            yield "field", same_spectrum.evenly_lit(), psf, method
             method = "cos⁴ and vignetting; training had even light"
-            yield "radiometry", one.whole, 0.0, method
-        if settings.fwhm_nm and believed.fwhm_nm != settings.fwhm_nm:
+            yield "radiometry", same_spectrum.whole, 0.0, method
+        if settings.fwhm_nm and trained.fwhm_nm != settings.fwhm_nm:
             narrow = device.one_wavelength(settings.wavelength_nm * 1e-3)
             psf = image_difference(narrow, device.whole)
-            method = f"{settings.fwhm_nm:g} nm; training had {believed.fwhm_nm:g} nm"
+            method = f"{settings.fwhm_nm:g} nm; training had {trained.fwhm_nm:g} nm"
             yield "spectrum", device.whole, psf, method
 
     def _trained(
         self, device: ImagingDevice, settings: OpticsConfig
     ) -> Iterator[BudgetEntry]:
-        """What the network was trained with, switched off; not in the sum."""
-        believed = self.source.run.trainer.optics
+        """Entries of the causes that training included, each switched off; not counted."""
+        trained_optics = self.source.run.trainer.optics
         method = "trained with, switched off"
         cases: list[tuple[str, Imager]] = []
-        if believed.image == "true":
+        if trained_optics.image == "true":
             cases += [("field", device.one_psf()), ("radiometry", device.evenly_lit())]
-            if settings.fwhm_nm and believed.fwhm_nm == settings.fwhm_nm:
+            if settings.fwhm_nm and trained_optics.fwhm_nm == settings.fwhm_nm:
                 narrow = device.one_wavelength(settings.wavelength_nm * 1e-3)
                 cases.append(("spectrum", narrow))
         for link, optics in cases:
@@ -341,25 +384,36 @@ class NetworkReading:
             )
             yield replace(entry, counted=False)
 
-    def _keep(self, read: NetworkReadings, how: PersonCalibrator) -> None:
-        """Keep the persons of the last state, what it measured, and a thin sample of
-        the judged frames.
+    def _store_people(
+        self, read: NetworkReadings, calibrator: PersonCalibrator
+    ) -> None:
+        """Store the calibrated persons, the measured gaze error, and every n-th of the
+        judged frames, ``THINNED`` or more.
         """
-        self._people = experiment.calibrate_subjects(read, self.trial, self.config, how)
-        self.measured_rad = self._error_rad(read, how)
+        self._people = experiment.calibrate_subjects(
+            read, self.trial, self.config, calibrator
+        )
+        self.measured_rad = self._error_rad(read, calibrator)
         rows = np.flatnonzero(self.judged)
         self._rows = rows[:: max(1, len(rows) // THINNED)]
-        each = len(self.trial.subject) // len(self.subjects)
+        frames_per_subject = len(self.trial.subject) // len(self.subjects)
         self._thin = [
-            made.rows(torch.from_numpy(self._rows[self._rows // each == s] - s * each))
-            for s, made in enumerate(self.subjects)
+            rendered.rows(
+                torch.from_numpy(
+                    self._rows[self._rows // frames_per_subject == subject]
+                    - subject * frames_per_subject
+                )
+            )
+            for subject, rendered in enumerate(self.subjects)
         ]
 
-    def _error_rad(self, read: NetworkReadings, how: PersonCalibrator) -> float:
-        """Mean error of the answers under axial slippage, every person calibrated on
-        what was read.
+    def _error_rad(self, read: NetworkReadings, calibrator: PersonCalibrator) -> float:
+        """Mean gaze error in rad under axial slippage, with calibrations from the same
+        readings.
         """
-        answers, _ = experiment.calibrated_gaze(read, self.trial, self.config, how)
+        answers, _ = experiment.calibrated_gaze(
+            read, self.trial, self.config, calibrator
+        )
         angles = angle_deg(answers, self.trial.stimulus_deg)[self.judged]
         return float(np.radians(angles.mean()))
 
@@ -367,33 +421,34 @@ class NetworkReading:
     def _read(
         self, subjects: list[RenderedFrames], optics: Imager, *, quiet: bool = False
     ) -> NetworkReadings:
-        """What the network reads of frames through these optics; noise of the
-        experiment's seeds.
+        """Readings of the network from frames through an imager, with the noise of the
+        experiment's seeds or ``quiet``.
         """
         net = self.source.run.trainer.model.net
         inner = self.source.settings.inner
-        read = []
-        for subject, made in enumerate(subjects):
+        predictions = []
+        for subject, rendered in enumerate(subjects):
             frames = experiment.image_frames(
-                self.source, made, optics, seed=experiment.NOISE + subject,
+                self.source, rendered, optics, seed=experiment.NOISE + subject,
                 sensor=self.sensor, quiet=quiet,
             )  # fmt: skip
-            read.append(
+            predictions.append(
                 assess.predict_frames(net, self.source.architecture, frames, inner)
             )
-        return experiment.read_from(read, self.source)
+        return experiment.read_from(predictions, self.source)
 
 
 class ErrorBudget:
-    """The lens as a device whose causes are changed one by one, and who reads its
-    images.
+    """Error budget of a lens: each cause of error is changed by itself, and its effect
+    on phase, PSFs and gaze computed.
     """
 
     def __init__(self, lens: Lens, given: BudgetInputs) -> None:
         """Prepare the device of the designed pillars, and the run's network.
 
         Args:
-            lens: to judge. given: what is known beside it.
+            lens: lens to judge.
+            given: optional inputs, which add links.
 
         Raises:
             LensError: the run's lens is another than the one given; turned pillars, or
@@ -411,7 +466,9 @@ class ErrorBudget:
         self.smooth: ImagingDevice | None = None
         self.reading: NetworkReading | None = None
         if given.run is None:
-            self.settings, frame, margin = settings_of(lens, given.fwhm_nm), 80, 8
+            self.settings = settings_of(lens, given.fwhm_nm)
+            frame = 80
+            margin = 8
         else:
             trainer = given.run.run.trainer
             scenes = given.run.settings.scenes
@@ -434,10 +491,12 @@ class ErrorBudget:
 
     @property
     def above(self) -> list[str]:
-        """Why the errors of the images are above their tolerance."""
+        """Sentences on images whose error exceeds the tolerance."""
         devices = (self.device, self.smooth)
-        asked = self.settings.image_tolerance
-        return [one.whole.above(asked) for one in devices if one is not None]
+        tolerance = self.settings.image_tolerance
+        return [
+            device.whole.above(tolerance) for device in devices if device is not None
+        ]
 
     def entries(self) -> Iterator[BudgetEntry]:
         """The budget, link by link from gaze back to the pillars, ending with the sum.
@@ -466,22 +525,32 @@ class ErrorBudget:
 
     def _optics(self, state: State | None = None, *, factor: Array | None = None,
                 made: MadeLens | None = None, shift_um: float = 0.0) -> Optics:  # fmt: skip
-        """The lens plane of a process state (the design's without one), its films and
-        the sensor moved away by ``shift_um``.
+        """Lens plane, films and sensor for a changed lens.
+
+        Args:
+            state: process state; the design's without it.
+            factor: (y, x) factor on the pillars' transmission; the neighbour coupling
+                without it.
+            made: manufactured lens in place of the designed one.
+            shift_um: shift of the sensor away from the lens.
         """
-        both = self.coupling if factor is None else factor
-        plane = (made or self.made).plane(state or State.of(), factor=both)
+        pillar_factor = self.coupling if factor is None else factor
+        plane = (made or self.made).plane(state or State.of(), factor=pillar_factor)
         distance = self.lens.sensor_distance_um + shift_um
         return Optics(plane, self.lens.layers, distance)
 
     def _pillars(self, state: State | None = None, *, factor: Array | None = None,
                  made: MadeLens | None = None) -> Array:  # fmt: skip
-        both = self.coupling if factor is None else factor
-        found = (made or self.made).pillars(state or State.of(), factor=both).numpy()
-        return np.asarray(found[self.lens.diameters.diameter_um > 0])
+        pillar_factor = self.coupling if factor is None else factor
+        t = (
+            (made or self.made)
+            .pillars(state or State.of(), factor=pillar_factor)
+            .numpy()
+        )
+        return np.asarray(t[self.lens.diameters.diameter_um > 0])
 
     def _coupling(self, rows: NeighbourRows) -> Array:
-        """(y, x) factor of unlike neighbours on every pillar."""
+        """(y, x) complex factor on every pillar by coupling to unequal neighbours."""
         alone = self.made.pillars(State.of())
         pitch = self.lens.diameters.pitch_um
         return np.asarray(among.mean_coupling(alone, rows, pitch).numpy())
@@ -489,7 +558,14 @@ class ErrorBudget:
     def _entry(
         self, link: str, optics: Imager, method: str, *, pillars: Array | None = None
     ) -> BudgetEntry:
-        """The entry of a change of the device. pillars: t of the changed pillars."""
+        """Entry of a change of the device.
+
+        Args:
+            link: name of the row.
+            optics: imager after the change.
+            method: how the entry is determined.
+            pillars: (pillars,) complex t after the change; None without a phase error.
+        """
         phase = NONE if pillars is None else scatter_rad(pillars, self.base)
         if self.reading is not None:
             whole = self.device.whole
@@ -500,10 +576,10 @@ class ErrorBudget:
     def _changed(self, link: str, method: str, state: State | None = None, *,
                  factor: Array | None = None, made: MadeLens | None = None,
                  shift_um: float = 0.0) -> BudgetEntry:  # fmt: skip
-        """The entry of other pillars, or of the sensor elsewhere."""
-        about = {"factor": factor, "made": made}
-        optics = self._optics(state, shift_um=shift_um, **about)  # type: ignore[arg-type]
-        pillars = self._pillars(state, **about)  # type: ignore[arg-type]
+        """Entry of changed pillars or a shifted sensor; arguments as :meth:`_optics`."""
+        pillar_changes = {"factor": factor, "made": made}
+        optics = self._optics(state, shift_um=shift_um, **pillar_changes)  # type: ignore[arg-type]
+        pillars = self._pillars(state, **pillar_changes)  # type: ignore[arg-type]
         return self._entry(link, self.device.image(optics), method, pillars=pillars)
 
     def _network(self) -> Iterator[BudgetEntry]:
@@ -514,26 +590,26 @@ class ErrorBudget:
         yield from self.reading.path(self.smooth, self.settings)
 
     def _image_tolerance(self) -> Iterator[BudgetEntry]:
-        """The image of training against one formed at a quarter of its tolerance."""
+        """Entry of the image at its tolerance against one at a quarter of it."""
         link = "image tolerance"
         fine = assess.finer_image(self.settings)
         if self.reading is None or self.smooth is None or fine is None:
             return
-        asked = fine.image_tolerance, self.settings.image_tolerance
-        method = "image formed at {:g} in place of {:g}".format(*asked)
+        tolerances = fine.image_tolerance, self.settings.image_tolerance
+        method = "image formed at {:g} in place of {:g}".format(*tolerances)
         frame, margin = self._frame
         try:
-            exact = formed.imager_through(
+            fine_image = formed.imager_through(
                 fine, self.smooth.optics, frame, margin=margin
             )
         except (SceneError, PropagationError) as problem:
             yield BudgetEntry(link, NONE, NONE, NONE, f"not known: {problem}")
             return
-        turn = self.reading.turn_rad(exact, self.smooth.whole)
+        turn = self.reading.turn_rad(fine_image, self.smooth.whole)
         yield BudgetEntry(link, NONE, NONE, turn, method)
 
     def _pillar_device(self) -> Iterator[BudgetEntry]:
-        """Pillars in place of the smooth phase, films, both polarisations."""
+        """Entries of discrete pillars, of the films and of both polarisations."""
         if self.reading is not None and self.smooth is not None:
             method = (
                 "pillars of the lens file; training had a smooth phase without films"
@@ -551,44 +627,55 @@ class ErrorBudget:
         yield self._entry("polarisation", self.device.both_polarisations(), method)
 
     def _solver(self) -> Iterator[BudgetEntry]:
-        """Solver and proxy, against the solver at thirty times the precision."""
-        lens, library = self.lens, self.given.library
-        at = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
+        """Entries of pillar solver and proxy, against a solver with a tolerance
+        ``FINER`` times smaller.
+
+        The complex ratio at ``SOLVED`` diameters is interpolated to every pillar,
+        linearly in its logarithm.
+        """
+        lens = self.lens
+        library = self.given.library
+        diameters_um = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
         tolerance = library.sweep.bar if library else self.given.tolerance
         engine = engines.choose_engine(lens.cell)
         solve = engines.solve_to_tolerance(
             lens.cell, Incidence(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine
         )  # fmt: skip
-        exact = np.array([solve(float(d)).t for d in at])
-        proxy = lens.proxy.transmission(at, lens.wavelength_um) * np.exp(
-            1j * lens.proxy.phase_rad(at, lens.wavelength_um)
+        precise = np.array(
+            [solve(float(diameter_um)).t for diameter_um in diameters_um]
+        )
+        proxy = lens.proxy.transmission(diameters_um, lens.wavelength_um) * np.exp(
+            1j * lens.proxy.phase_rad(diameters_um, lens.wavelength_um)
         )
         method = f"{engine} solver at {tolerance / FINER:.0e}, {SOLVED} diameters"
-        cases = [("pillar solver and proxy", exact / proxy, f"against the {method}")]
+        cases = [("pillar solver and proxy", precise / proxy, f"against the {method}")]
         if library is not None:
-            stored = stored_response(library, at, lens.wavelength_um)
+            stored = stored_response(library, diameters_um, lens.wavelength_um)
             cases = [
-                ("pillar solver", exact / stored, f"library against the {method}"),
+                ("pillar solver", precise / stored, f"library against the {method}"),
                 ("proxy", stored / proxy, f"against the library, {SOLVED} diameters"),
             ]
-        for link, ratio, words in cases:
-            log = np.log(np.abs(ratio)) + 1j * np.unwrap(np.angle(ratio))
-            d = lens.diameters.diameter_um
+        for link, ratio, description in cases:
+            log_ratio = np.log(np.abs(ratio)) + 1j * np.unwrap(np.angle(ratio))
+            designed_um = lens.diameters.diameter_um
             factor = np.exp(
-                np.interp(d, at, log.real) + 1j * np.interp(d, at, log.imag)
+                np.interp(designed_um, diameters_um, log_ratio.real)
+                + 1j * np.interp(designed_um, diameters_um, log_ratio.imag)
             )
-            both = factor if self.coupling is None else factor * self.coupling
-            yield self._changed(link, words, factor=both)
+            pillar_factor = factor if self.coupling is None else factor * self.coupling
+            yield self._changed(link, description, factor=pillar_factor)
 
     def _neighbours(self) -> Iterator[BudgetEntry]:
-        """Local periodic approximation: rows of unlike pillars solved as one; where the
-        lens holds them, what is open of them.
+        """Entry of the local periodic approximation.
+
+        Rows of unequal pillars are solved as one cell. A lens that includes them has
+        the entry of their open choices instead: the rms over all of these.
         """
         lens = self.lens
         if lens.neighbours is not None:
-            others = lens.neighbours.doubted(turning_sine(lens))
-            rows = [self._of_rows(other, "") for other in others]
-            values = [(e.phase_rad, e.psf, e.gaze_rad) for e in rows]
+            doubted = lens.neighbours.doubted(turning_sine(lens))
+            entries = [self._of_rows(other, "") for other in doubted]
+            values = [(entry.phase_rad, entry.psf, entry.gaze_rad) for entry in entries]
             rms = [math.hypot(*column) for column in zip(*values, strict=True)]
             method = "rows of the lens file: another truncation, a row left out, zones that get shorter"
             yield BudgetEntry("neighbours", rms[0], rms[1], rms[2], method)
@@ -606,58 +693,77 @@ class ErrorBudget:
         return self._changed("neighbours", method, factor=self._coupling(rows))
 
     def _mask(self) -> Iterator[BudgetEntry]:
-        """Diameters as the mask holds them, where one is given."""
+        """Entry of rounding the diameters to the grid of the mask, with a mask."""
         if self.given.mask is None:
             return
         step_um = self.given.mask.diameter_step_nm * 1e-3
-        plain = self.lens.diameters
-        rounded = np.rint(plain.diameter_um / step_um) * step_um
-        there = replace(plain, diameter_um=rounded.astype(np.float32))
-        drawn = self.made.redrawn(replace(self.lens, diameters=there))
+        designed = self.lens.diameters
+        rounded = np.rint(designed.diameter_um / step_um) * step_um
+        on_mask = replace(designed, diameter_um=rounded.astype(np.float32))
+        drawn = self.made.redrawn(replace(self.lens, diameters=on_mask))
         method = f"every diameter rounded to {step_um * 1e3:g} nm"
         yield self._changed("mask grid", method, made=drawn)
 
     def _process(self) -> Iterator[BudgetEntry]:
-        """Draws of the process; what a fit of the built lens would take out again."""
+        """Entry of the process spread, rms over draws; a fit of the built lens removes
+        it.
+        """
         if self.given.mask is None:
             return
-        spread, count = self.given.mask.spread, self.given.draws
+        spread = self.given.mask.spread
+        count = self.given.draws
         lenses = [(draw.state(), 0.0) for draw in draw_lenses(spread, count, seed=5)]
         method = f"{count} draws of the process, lens not measured"
         yield self._rms("process spread", lenses, method)
 
     def _calibration(self) -> Iterator[BudgetEntry]:
-        """What the fit of the built lens leaves open: draws of its posterior against
-        its best estimate.
+        """Entry of the uncertainty of an as-built fit: rms over draws of its posterior
+        about its best estimate.
         """
         fitted = self.given.asbuilt
         if fitted is None:
             return
-        mine, its = (x.diameters.diameter_um for x in (self.lens, fitted.design))
-        if mine.shape != its.shape or not np.allclose(mine, its, atol=1e-6):
+        own_um, fitted_um = (
+            lens.diameters.diameter_um for lens in (self.lens, fitted.design)
+        )
+        if own_um.shape != fitted_um.shape or not np.allclose(
+            own_um, fitted_um, atol=1e-6
+        ):
             raise LensError(
                 "the as-built file is of another lens than the one given; give the lens that was captured"
             )
-        best, lenses = fitted.parameters(), []
+        best = fitted.parameters()
+        lenses = []
         for row in fitted.lens_samples(self.given.draws, seed=3):
-            off = fitted.parameters(row) - best
-            lenses.append((process_state_of(off), float(off[PLACE["distance_um"]])))
+            deviation = fitted.parameters(row) - best
+            lenses.append(
+                (process_state_of(deviation), float(deviation[PLACE["distance_um"]]))
+            )
         method = f"{len(lenses)} draws of the fit's posterior against its best estimate"
         yield self._rms("calibration of the lens", lenses, method)
 
     def _rms(
         self, link: str, lenses: list[tuple[State, float]], method: str
     ) -> BudgetEntry:
-        """Root mean square over process states and shifts of the sensor."""
-        rows = [self._changed(link, method, s, shift_um=shift) for s, shift in lenses]
-        values = np.array([(e.phase_rad, e.psf, e.gaze_rad) for e in rows])
+        """Root mean square of the entries of (process state, sensor shift in um) pairs."""
+        rows = [
+            self._changed(link, method, state, shift_um=shift)
+            for state, shift in lenses
+        ]
+        values = np.array(
+            [(entry.phase_rad, entry.psf, entry.gaze_rad) for entry in rows]
+        )
         rms = np.sqrt((values**2).mean(0)).tolist()
         return BudgetEntry(link, rms[0], rms[1], rms[2], method)
 
 
 def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:
-    """Image settings for a lens file without a run: pixels of 18 um, a field of 64 of
-    them, its own films and light of width ``fwhm_nm``.
+    """Image settings of a lens file without a run: pixels of 18 um, the lens's own
+    films.
+
+    Args:
+        lens: lens to image through.
+        fwhm_nm: spectral width of the light.
     """
     return OpticsConfig(
         aperture_mm=2e-3 * lens.diameters.radius_um,
@@ -675,32 +781,32 @@ def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:
 
 
 def refuse_other_lens(lens: Lens, optics: OpticsConfig) -> None:
-    """Refuse a network that was trained for another lens: one that differs by more than
-    2 %.
+    """Refuse a network that was trained for a lens that differs by more than 2 %.
 
     Args:
-        lens: that is judged. optics: of the network's run.
+        lens: lens to judge.
+        optics: optics of the network's run.
 
     Raises:
         LensError: sensor distance, wavelength or aperture differ.
     """
-    mine = (
+    own = (
         lens.sensor_distance_um * 1e-3,
         lens.wavelength_um * 1e3,
         2e-3 * lens.diameters.radius_um,
     )
-    its = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
-    if any(abs(a - b) > 0.02 * b for a, b in zip(mine, its, strict=True)):
+    of_run = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
+    if any(abs(a - b) > 0.02 * b for a, b in zip(own, of_run, strict=True)):
         raise LensError(
             "the run's network was trained for another lens: sensor distance, wavelength, aperture are "
-            f"{its[0]:g} mm, {its[1]:g} nm, {its[2]:g} mm there and {mine[0]:g} mm, {mine[1]:g} nm, {mine[2]:g} mm in "
+            f"{of_run[0]:g} mm, {of_run[1]:g} nm, {of_run[2]:g} mm there and {own[0]:g} mm, {own[1]:g} nm, {own[2]:g} mm in "
             "the lens file; give the lens.h5 of the run"
         )
 
 
 def scatter_rad(changed: Array, base: Array) -> float:
-    """Standard deviation over pillars of the phase between two complex transmissions
-    (pillars,); a common phase is no error.
+    """Standard deviation in rad over pillars of the phase between two complex
+    transmissions; a common phase is no error.
 
     Args:
         changed: (pillars,) complex t of the changed pillars.
@@ -714,14 +820,18 @@ def scatter_rad(changed: Array, base: Array) -> float:
 def stored_response(
     library: PillarLibrary, at_um: Array, wavelength_um: float
 ) -> Array:
-    """(*at) complex t of a library at the nearest of its wavelengths, the mean of both
-    polarisations; level and unwrapped phase are linear between its diameters.
+    """(*at_um) complex t of a pillar library at its nearest wavelength, mean of both
+    polarisations.
+
+    Modulus and unwrapped phase are interpolated linearly between its diameters.
 
     Args:
-        at_um: diameters. wavelength_um: of the light.
+        library: the pillar library.
+        at_um: diameters.
+        wavelength_um: wavelength of the light.
     """
-    near = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
-    t = library.t[:, 0, near].mean(0)
+    nearest = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
+    t = library.t[:, 0, nearest].mean(0)
     level, phase = (
         np.interp(at_um, library.diameter_um, part)
         for part in (np.abs(t), np.unwrap(np.angle(t)))
@@ -730,19 +840,26 @@ def stored_response(
 
 
 def row_lengths(rows: NeighbourRows, pitch_um: float) -> list[int]:
-    """Pillars of every row along the lattice of ``pitch_um``: it turns light by one
-    wave over its length.
+    """Number of pillars of every row along the lattice: wavelength / (sine * pitch).
+
+    Over the length of a row the phase changes by one wave.
 
     Args:
-        rows: rows of unlike pillars.
+        rows: rows of unequal pillars.
+        pitch_um: lattice constant.
     """
-    return [round(n) for n in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um]
+    return [
+        round(length)
+        for length in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um
+    ]
 
 
 def turning_sine(lens: Lens) -> Array:
-    """(y, x) sine by which the lens turns light from its design source to the sensor."""
-    d = lens.diameters
-    r = np.hypot(d.x_um, d.y_um[:, None])
-    source = lens.source_distance_um
-    behind = 0.0 if math.isinf(source) else np.sin(np.arctan(r / source))
-    return np.asarray(np.sin(np.arctan(r / lens.sensor_distance_um)) + behind)
+    """(y, x) sum of the sines of incidence and exit of light through a ``lens``, from
+    its design source to the middle of the sensor.
+    """
+    diameters = lens.diameters
+    r = np.hypot(diameters.x_um, diameters.y_um[:, None])
+    source_um = lens.source_distance_um
+    source_sine = 0.0 if math.isinf(source_um) else np.sin(np.arctan(r / source_um))
+    return np.asarray(np.sin(np.arctan(r / lens.sensor_distance_um)) + source_sine)

@@ -1,5 +1,5 @@
-"""Lenses as an optical designer looks at them: distortion, field curvature, light and
-MTF over the field angle.
+"""Tables and plots of lenses over the field angle: distortion, field curvature, light
+and MTF.
 """
 
 import math
@@ -57,11 +57,12 @@ class FieldSetting:
             )
 
     def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
-        """A lens over the field, with what was left out from the first one and from
-        other angles.
+        """Aberrations of a lens over the field.
 
         Args:
-            angles_deg: field angles where the setting has none.
+            lens: lens to analyse.
+            first: lens that gives the default frequencies.
+            angles_deg: default field angles.
         """
         return over_field(
             lens,
@@ -72,27 +73,28 @@ class FieldSetting:
 
 
 def field_values(found: OverField) -> dict[str, Any]:
-    """Every number of one lens, ready for JSON: None where there is none.
+    """Every number of one lens, ready for JSON: None in place of nan and inf.
 
     Args:
         found: aberrations over the field.
     """
     arrays = {
-        name: _plain(np.asarray(getattr(found, name)))
+        name: _json_value(np.asarray(getattr(found, name)))
         for name in found.__slots__
         if name != "left_out"
     }
     return arrays | {"left_out": list(found.left_out)}
 
 
-def _plain(array: Array) -> Any:
+def _json_value(array: Array) -> Any:
+    """Nested lists of floats, None in place of nan and inf."""
     if array.ndim:
-        return [_plain(part) for part in array]
+        return [_json_value(part) for part in array]
     return float(array) if math.isfinite(array) else None
 
 
 def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
-    """Rays and light over the field angle, and the MTF.
+    """Table of distortion, foci and light over the field angle, and table of the MTF.
 
     Args:
         seen: aberrations over the field by name of the lens.
@@ -101,78 +103,93 @@ def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
         "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
         "sharpest line T / µm", "S / µm", "vignetting / %", "illumination",
     )  # fmt: skip
-    rows, curves = [], []
-    for name, one in seen.items():
-        for k, angle in enumerate(one.angles_deg):
+    rows, mtf_rows = [], []
+    for name, aberrations in seen.items():
+        for k, angle in enumerate(aberrations.angles_deg):
             label = name if k == 0 else ""
             focus = [
-                _format_value(v, 1) for v in (*one.close_um[k], *one.sharpest_um[k])
+                _format_value(value, 1)
+                for value in (*aberrations.close_um[k], *aberrations.sharpest_um[k])
             ]
-            bent, lost = (
-                _format_value(100 * v[k], 2) for v in (one.distortion, one.vignetting)
+            distortion, vignetting = (
+                _format_value(100 * value[k], 2)
+                for value in (aberrations.distortion, aberrations.vignetting)
             )
-            chief = _format_value(one.chief_um[k, 0], 2)
-            light = _format_value(one.illumination[k], 3)
-            rows.append((label, f"{angle:g}", chief, bent, *focus, lost, light))
-            mtf = [_format_value(v, 3) for pair in one.mtf[k].T for v in pair]
-            curves.append((label, f"{angle:g}", *mtf))
+            chief_ray = _format_value(aberrations.chief_um[k, 0], 2)
+            light = _format_value(aberrations.illumination[k], 3)
+            rows.append(
+                (label, f"{angle:g}", chief_ray, distortion, *focus, vignetting, light)
+            )
+            mtf = [
+                _format_value(value, 3)
+                for pair in aberrations.mtf[k].T
+                for value in pair
+            ]
+            mtf_rows.append((label, f"{angle:g}", *mtf))
     frequencies = next(iter(seen.values())).frequencies_per_mm
-    over = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
+    columns = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
     return [
         Table(head, rows, _caption(seen)),
-        Table(("lens", "angle / °", *over), curves, "Modulation transfer over the field, of all light through the lens "
+        Table(("lens", "angle / °", *columns), mtf_rows, "Modulation transfer over the field, of all light through the lens "
               "(T tangential: along x, S sagittal: along y)."),
     ]  # fmt: skip
 
 
 def _caption(seen: Mapping[str, OverField]) -> str:
     depths = {
-        f"{1e-3 * one.depth_um:.4g} mm" if math.isfinite(one.depth_um) else "infinity"
-        for one in seen.values()
+        f"{1e-3 * aberrations.depth_um:.4g} mm"
+        if math.isfinite(aberrations.depth_um)
+        else "infinity"
+        for aberrations in seen.values()
     }
-    why = "".join(
-        f"\n{name}: {line}." for name, one in seen.items() for line in one.left_out
+    notes = "".join(
+        f"\n{name}: {line}."
+        for name, aberrations in seen.items()
+        for line in aberrations.left_out
     )
     return (
         f"Over the field along x, sources at {', '.join(sorted(depths))}, design wavelength. Foci behind (+) or before "
-        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{why}"
+        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{notes}"
     )
 
 
 def _format_value(value: float, digits: int) -> str:
     if not math.isfinite(value):
         return "–"
-    shown = f"{value:.{digits}f}"
-    return shown.removeprefix("-") if float(shown) == 0 else shown
+    text = f"{value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0 else text
 
 
 def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
-    """Distortion, foci and light over the field angle.
+    """PNG of distortion, field curvature, illumination and vignetting over the field
+    angle.
 
     Args:
         seen: aberrations over the field by name of the lens.
     """
     figure, panels = make_figure(1, 3, size=(10.5, 3.4))
-    for name, one in seen.items():
-        order = np.argsort(one.angles_deg)
-        angle = one.angles_deg[order]
+    for name, aberrations in seen.items():
+        order = np.argsort(aberrations.angles_deg)
+        angle = aberrations.angles_deg[order]
         colour = (
             panels[0]
-            .plot(angle, 100 * one.distortion[order], ".-", label=name)[0]
+            .plot(angle, 100 * aberrations.distortion[order], ".-", label=name)[0]
             .get_color()
         )
         for axis, style, mark in ((0, "-", "o"), (1, "--", "s")):
-            panels[1].plot(angle, one.close_um[order, axis], style, color=colour)
+            panels[1].plot(
+                angle, aberrations.close_um[order, axis], style, color=colour
+            )
             panels[1].plot(
                 angle,
-                one.sharpest_um[order, axis],
+                aberrations.sharpest_um[order, axis],
                 mark,
                 color=colour,
                 markersize=3,
                 fillstyle="none",
             )
-        panels[2].plot(angle, one.illumination[order], ".-", color=colour)
-        panels[2].plot(angle, one.vignetting[order], ":", color=colour)
+        panels[2].plot(angle, aberrations.illumination[order], ".-", color=colour)
+        panels[2].plot(angle, aberrations.vignetting[order], ":", color=colour)
     panels[0].set(title="distortion", ylabel="distortion / %")
     panels[1].set(title="field curvature", ylabel="focus from the sensor / µm")
     panels[2].set(
@@ -185,7 +202,7 @@ def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
 
 
 def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
-    """MTF over the field angle, a panel for each frequency.
+    """PNG of the MTF over the field angle, a panel for each frequency.
 
     Args:
         seen: aberrations over the field by name of the lens.
@@ -198,14 +215,22 @@ def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
         squeeze=False,
         sharey=True,
     )
-    for name, one in seen.items():
-        order = np.argsort(one.angles_deg)
+    for name, aberrations in seen.items():
+        order = np.argsort(aberrations.angles_deg)
         for k, panel in enumerate(panels[0]):
             line = panel.plot(
-                one.angles_deg[order], one.mtf[order, 0, k], ".-", label=name
+                aberrations.angles_deg[order],
+                aberrations.mtf[order, 0, k],
+                ".-",
+                label=name,
             )
             colour = line[0].get_color()
-            panel.plot(one.angles_deg[order], one.mtf[order, 1, k], ".--", color=colour)
+            panel.plot(
+                aberrations.angles_deg[order],
+                aberrations.mtf[order, 1, k],
+                ".--",
+                color=colour,
+            )
     for panel, frequency in zip(panels[0], frequencies, strict=True):
         panel.set(
             title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1)

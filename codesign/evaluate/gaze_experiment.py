@@ -40,20 +40,16 @@ from metalens.image import Imager, Sensor, low_snr
 AXIAL, LATERAL = "axial", "lateral"
 # streams of the random generator
 LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
-TURNS = (
-    4  # corrections of where an eye looks, each twenty times as fine as the one before
-)
-BEFORE, EACH = (
-    100_000,
-    120,
-)  # first number of the people who calibrated before, and their frames
+TURNS = 4  # corrections of an eye's direction, each leaves a twentieth of the error
+BEFORE, EACH = 100_000, 120  # people who calibrated before: first number, frames each
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExperimentTrials:
-    """Of every frame (n,): subject, stimulus, slippage state; and what was true.
+    """Subject, stimulus and slippage state of every frame, with their true values.
 
-    stimulus_deg: (n, 2). slip_mm: (n, 3).
+    subject, stimulus, state: (n,) numbers. stimulus_deg: (n, 2) direction across and
+    down. slip_mm: (n, 3) slippage along x, y and z.
     """
 
     subject: Array
@@ -63,7 +59,7 @@ class ExperimentTrials:
     slip_mm: Array
 
     def group(self, kind: str) -> Array:
-        """(n,) frames of the axial or lateral states, the origin among both.
+        """(n,) True for frames of the axial or lateral states; both hold the origin.
 
         Args:
             kind: "axial" or "lateral".
@@ -75,19 +71,19 @@ class ExperimentTrials:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RunResult:
-    """One run in the experiment.
+    """Readings and gaze errors of one run in the experiment.
 
-    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,).
-    gaze_deg: (n,) error of the
-    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg:
-    (n,) the same error where sphere
-    and regressor are given the pupil as read and the true slippage: what the pupil
-    alone leaves. reach_mm: largest
-    slippage along x, y, z that the run's training saw. how: subjects were calibrated.
-    above: why the error
-    of the images is above what the run asks for; empty where it is not. finer: the same
-    frames on images formed at a quarter of the run's tolerance, calibrated on those;
-    None where they are not known.
+    slip_mm: (n, 3) slippage read by the network.
+    centre: (n, 2) pupil read, fraction of the image. iou: (n,) overlap of the mask.
+    gaze_deg: (n,) error of the calibrated gaze, nan for calibration frames.
+    predicted_deg: (n, 2) calibrated gaze.
+    told_deg: (n,) gaze error of sphere and regressor at the pupil as read and the true
+    slippage: the error due to the pupil alone.
+    reach_mm: largest slippage along x, y, z in the run's training.
+    how: calibrator of the subjects.
+    above: why the error of the images exceeds the run's tolerance; empty otherwise.
+    finer: result on images formed at a quarter of the tolerance, with a calibration of
+    its own; None where they cannot be formed.
     """
 
     name: str
@@ -106,7 +102,7 @@ class RunResult:
 
     @property
     def within(self) -> Array:
-        """(n,) frames whose slippage training saw."""
+        """(n,) True for frames whose slippage lies within that of training."""
         return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
 
     def gaze(self, kind: str) -> float:
@@ -124,45 +120,48 @@ class RunResult:
 
     @property
     def slip_rest_mm(self) -> Array:
-        """(n, 3) absolute errors beside the mean error of the subject's calibration,
-        nan for frames that calibrated.
+        """(n, 3) absolute slippage errors less the subject's mean error over the
+        calibration frames; nan for calibration frames.
 
-        What is constant of a person (size of the face, and the camera's turn on it) is
-        no slippage: a device is zeroed
-        where its wearer calibrates.
+        Constant errors of a person (size of the face, turn of the camera on it) are no
+        slippage: a device is zeroed where its wearer calibrates.
         """
         error = self.slip_mm - self.trial.slip_mm
         judged = np.isfinite(self.gaze_deg)
-        out = np.full_like(error, math.nan)
+        result = np.full_like(error, math.nan)
         for subject in np.unique(self.trial.subject):
-            mine = self.trial.subject == subject
-            out[mine & judged] = np.abs(
-                error[mine & judged] - error[mine & ~judged].mean(0)
+            of_subject = self.trial.subject == subject
+            result[of_subject & judged] = np.abs(
+                error[of_subject & judged] - error[of_subject & ~judged].mean(0)
             )
-        return out
+        return result
 
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
-        """(subjects,) means of (n,) values, of which nan are left out; nan where none
-        is left.
+        """(subjects,) mean of each subject's finite values; nan for a subject without
+        any.
 
         Args:
-            chosen: (n,) frames that count; all without it.
+            values: (n,) value of every frame.
+            chosen: (n,) True for the frames that count; all without it.
         """
-        keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        mine = (
-            values[keep & (self.trial.subject == s)]
+        valid = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
+        groups = (
+            values[valid & (self.trial.subject == s)]
             for s in np.unique(self.trial.subject)
         )
-        return np.array([one.mean() if len(one) else math.nan for one in mine])
+        return np.array([group.mean() if len(group) else math.nan for group in groups])
 
 
 def states_of(
     config: ExperimentConfig, subject: int, scenes: EyeScenes
 ) -> tuple[EyeStates, ExperimentTrials]:
-    """All frames of one subject: slippage states outermost, stimuli within.
+    """Eye states and true values of all frames of one subject, slippage state by state,
+    every stimulus in each.
 
     Args:
-        config: subjects, stimuli, slippage and calibration. scenes: frames by number.
+        config: subjects, stimuli, slippage and calibration.
+        subject: number of the subject, part of every seed.
+        scenes: rig and variety of the scenes.
 
     Raises:
         ConfigError: slippage that takes the eye to the lens.
@@ -183,12 +182,12 @@ def states_of(
     )
     base = person[torch.zeros(n, dtype=torch.int64)]
     state, stimulus = (
-        g.ravel()
-        for g in np.meshgrid(
+        indices.ravel()
+        for indices in np.meshgrid(
             np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"
         )
     )
-    looks = stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2))
+    gaze_deg = stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2))
     traits = base.traits.clone()
     radius = list(POPULATION).index("pupil_radius_um")
     traits[:, radius] *= torch.from_numpy(
@@ -206,18 +205,20 @@ def states_of(
     trial = ExperimentTrials(
         np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state]
     )
-    return turned_to(states, looks, scenes.rig), trial
+    return turned_to(states, gaze_deg, scenes.rig), trial
 
 
 def render_subject(
     states: EyeStates, config: ExperimentConfig, subject: int, scenes: EyeScenes
 ) -> RenderedFrames:
-    """Frames of one subject with the variety of training, worn by a person: spectacles
-    and make-up stay on from frame to frame, before the stage's own camera.
+    """Rendered frames of one subject, with spectacles and make-up that are the same in
+    all of them.
 
     Args:
-        states: subjects with gaze and slippage.
-        config: subjects, stimuli, slippage and calibration. scenes: frames by number.
+        states: (n,) eye states with gaze and slippage.
+        config: subjects, stimuli, slippage and calibration.
+        subject: number of the subject, part of the seed.
+        scenes: rig, camera and variety of the scenes.
     """
     seed = (config.seed, subject, WORN)
     worn = drawn_of_people(
@@ -227,31 +228,32 @@ def render_subject(
 
 
 def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
-    """States whose visual axes point along angles (n, 2) across and down, in the frame
-    of the face: to 1e-5 degrees.
+    """Eye states turned until their visual axes point in given directions, to 1e-5
+    degrees.
 
-    The visual axis lies nasal of and above the optic axis, by which eyes are turned;
-    what that leaves is corrected.
+    Eyes are turned by their optic axis, and the visual axis lies at the angle kappa to
+    it. A first turn adds kappa; fixed-point steps remove the remaining error.
 
     Args:
-        states: subjects with gaze and slippage.
-        looks_deg: (n, 2) wanted gaze across and down. rig: pose of camera and lamps.
+        states: (n,) eye states.
+        looks_deg: (n, 2) gaze across and down in the frame of the face.
+        rig: pose of camera and lamps.
     """
     kappa = torch.stack([states.trait("kappa_x_rad"), states.trait("kappa_y_rad")], 1)
-    straight = torch.zeros_like(states.mount_rad)
-    found = replace(
+    unmounted = torch.zeros_like(states.mount_rad)
+    turned = replace(
         states,
         gaze_rad=torch.from_numpy(np.radians(looks_deg)) + kappa,
-        mount_rad=straight,
+        mount_rad=unmounted,
     )
     for _ in range(TURNS):
-        miss = looks_deg - face_angles(
-            eye.eye_axes(found, rig)[1].numpy(), rig.elevation_rad
+        error_deg = looks_deg - face_angles(
+            eye.eye_axes(turned, rig)[1].numpy(), rig.elevation_rad
         )
-        found = replace(
-            found, gaze_rad=found.gaze_rad + torch.from_numpy(np.radians(miss))
+        turned = replace(
+            turned, gaze_rad=turned.gaze_rad + torch.from_numpy(np.radians(error_deg))
         )
-    return replace(found, mount_rad=states.mount_rad)
+    return replace(turned, mount_rad=states.mount_rad)
 
 
 def image_frames(
@@ -263,13 +265,15 @@ def image_frames(
     sensor: Sensor | None = None,
     quiet: bool = False,
 ) -> SensorFrames:
-    """Rendered frames through a run's lens and sensor, with noise of a seed or
-    ``quiet``.
+    """Sensor frames of rendered scenes through a run's lens.
 
     Args:
-        sensor: of :func:`experiment_sensors`; the run's own without it.
-        source: finished run: its network, lens and sensor. made: rendered frames.
-        prepared: what forms the images.
+        source: finished run: its network, lens and sensor.
+        made: rendered frames.
+        prepared: imager of the run's lens.
+        seed: seed of the noise.
+        sensor: sensor of :func:`experiment_sensors`; the run's own without it.
+        quiet: no noise.
     """
     margin = source.settings.scenes.margin
     return assess.read_batch(
@@ -285,14 +289,15 @@ def image_frames(
 def experiment_sensors(
     sources: Sequence[FinishedRun], config: ExperimentConfig
 ) -> list[Sensor]:
-    """Every run's sensor in the light of the experiment.
+    """Sensor of every run at the exposure and background of the experiment.
 
-    Dim light is one exposure and one background for all runs: those at which a pixel of
-    the first run has ``config.snr_db`` behind a lens of its aperture that images all
-    light. What a lens loses, and a smaller aperture, costs it signal.
+    Dim light: exposure and background at which a pixel of the first run has
+    ``config.snr_db`` behind a lossless lens of its aperture. They scale with the area
+    of a run's aperture and of its base pixel.
 
     Args:
         sources: runs to compare.
+        config: states the signal-to-noise ratio; None leaves the sensors as they are.
     """
     sensors = [source.run.trainer.sensor for source in sources]
     if config.snr_db is None:
@@ -308,18 +313,20 @@ def experiment_sensors(
         snr_db=config.snr_db,
     )
     areas = [source.settings.optics.aperture_mm**2 for source in sources]
-    found = []
+    scaled = []
     for sensor, area in zip(sensors, areas, strict=True):
-        base = (sensor.base_pitch_um / dim.base_pitch_um) ** 2  # counts of a base pixel
-        scale = base * area / areas[0]
-        found.append(
+        pitch_ratio = (
+            sensor.base_pitch_um / dim.base_pitch_um
+        ) ** 2  # counts of a base pixel
+        scale = pitch_ratio * area / areas[0]
+        scaled.append(
             replace(
                 sensor,
                 exposure_e=dim.exposure_e * scale,
                 ambient_e=dim.ambient_e * scale,
             )
         )
-    return found
+    return scaled
 
 
 @torch.no_grad()
@@ -329,71 +336,77 @@ def run_experiment(
     *,
     names: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, list[RunResult]]]:
-    """Run the experiment, subject by subject.
+    """Gaze and slippage errors of runs on the same synthetic subjects.
+
+    Every subject is rendered once. Each run images, reads and calibrates on those
+    frames, and once more on its finer images where they can be formed.
 
     Args:
-        sources: runs to compare. config: subjects, stimuli, slippage and calibration.
-        names: of the runs; numbered without it.
+        sources: runs to compare.
+        config: subjects, stimuli, slippage and calibration.
+        names: names of the runs; numbered without them.
 
     Yields:
-        (subjects done, one :class:`Result` a run); results are there with the last
-        subject only.
+        (subjects done, results): one :class:`RunResult` a run after the last subject,
+        an empty list before.
 
     Raises:
-        ConfigError: runs whose frames differ in size, samples or lens distance: they
-            cannot share subjects' frames; or
-            eyes that slip to where a run's images hold no depth.
+        ConfigError: runs whose frames differ in size, samples or lens distance, so that
+            they cannot share frames; slippage out of the depths of a run's images.
     """
-    _check(sources, config)
+    _check_sources(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[ExperimentTrials] = []
-    answers: list[list[Predictions]] = [[] for _ in sources]
-    on_fine: list[list[Predictions]] = [[] for _ in sources]
-    prepared = [prepare_run(source, image=config.image) for source in sources]
-    fine = [finer_imager(source) for source in sources]
+    predictions: list[list[Predictions]] = [[] for _ in sources]
+    fine_predictions: list[list[Predictions]] = [[] for _ in sources]
+    imagers = [prepare_run(source, image=config.image) for source in sources]
+    fine_imagers = [finer_imager(source) for source in sources]
     sensors = experiment_sensors(sources, config)
-    how = [
+    calibrators = [
         run_calibrator(source, imager, config, sensor)
-        for source, imager, sensor in zip(sources, prepared, sensors, strict=True)
+        for source, imager, sensor in zip(sources, imagers, sensors, strict=True)
     ]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
-        made = render_subject(states, config, subject, scenes)
+        rendered = render_subject(states, config, subject, scenes)
         trials.append(trial)
-        each = [
-            *zip(answers, sources, prepared, sensors, strict=True),
-            *zip(on_fine, sources, fine, sensors, strict=True),
+        passes = [
+            *zip(predictions, sources, imagers, sensors, strict=True),
+            *zip(fine_predictions, sources, fine_imagers, sensors, strict=True),
         ]
-        for kept, source, imager, sensor in each:
+        for outputs, source, imager, sensor in passes:
             if imager is None:
                 continue
-            seen = image_frames(
-                source, made, imager, seed=NOISE + subject, sensor=sensor
+            sensor_frames = image_frames(
+                source, rendered, imager, seed=NOISE + subject, sensor=sensor
             )
-            kept.append(_answers(source, seen))
+            outputs.append(_predict(source, sensor_frames))
         if subject + 1 < config.subjects:
             yield subject + 1, []
-    whole = join_subjects(trials)
+    all_trials = join_subjects(trials)
     labels = names or [f"run {i + 1}" for i in range(len(sources))]
     above = [
-        formed.image_tolerance_problem(source.run.trainer.optics, one)
-        for source, one in zip(sources, prepared, strict=True)
+        formed.image_tolerance_problem(source.run.trainer.optics, imager)
+        for source, imager in zip(sources, imagers, strict=True)
     ]
     results = []
-    for i, (label, source, one) in enumerate(zip(labels, sources, how, strict=True)):
-        found = _result(label, source, answers[i], whole, config, one)
-        exact = (
-            _result(label, source, on_fine[i], whole, config, one)
-            if on_fine[i]
+    for i, (label, source, calibrator) in enumerate(
+        zip(labels, sources, calibrators, strict=True)
+    ):
+        result = _result(label, source, predictions[i], all_trials, config, calibrator)
+        fine_result = (
+            _result(label, source, fine_predictions[i], all_trials, config, calibrator)
+            if fine_predictions[i]
             else None
         )
-        results.append(replace(found, above=above[i], finer=exact))
+        results.append(replace(result, above=above[i], finer=fine_result))
     yield config.subjects, results
 
 
-def _answers(source: FinishedRun, seen: SensorFrames) -> Predictions:
+def _predict(source: FinishedRun, frames: SensorFrames) -> Predictions:
+    """Pupil, slippage and axis that a run's network reads from sensor frames."""
     return assess.predict_frames(
-        source.run.trainer.model.net, source.architecture, seen, source.settings.inner
+        source.run.trainer.model.net, source.architecture, frames, source.settings.inner
     )
 
 
@@ -405,23 +418,27 @@ def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
     """
     return ExperimentTrials(
         *(
-            np.concatenate([getattr(t, f) for t in trials])
-            for f in ExperimentTrials.__slots__
+            np.concatenate([getattr(trial, name) for trial in trials])
+            for name in ExperimentTrials.__slots__
         )
     )
 
 
 def rows_of_trial(trial: ExperimentTrials, rows: Array) -> ExperimentTrials:
-    """Some of the frames; ``rows``: their numbers.
+    """Records of some of the frames.
 
     Args:
         trial: subject, stimulus and slippage of every frame.
+        rows: numbers of the frames to take.
     """
     parts = (getattr(trial, name)[rows] for name in ExperimentTrials.__slots__)
     return ExperimentTrials(*parts)
 
 
-def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
+def _check_sources(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
+    """Refuse runs of different geometry, and slippage out of the depths of a run's
+    images.
+    """
     if not sources:
         raise ConfigError("no run to evaluate; give one run folder or more")
     views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
@@ -434,23 +451,25 @@ def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
     slips = config.slips_mm[:, 2]
     for source in sources:
         eye_mm = 1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um
-        held = source.settings.optics.depths_mm
-        if not held[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= held[1]:
+        limits = source.settings.optics.depths_mm
+        if not limits[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= limits[1]:
             raise ConfigError(
                 f"axial_mm {config.axial_mm}: eyes {eye_mm + slips.min():g} to {eye_mm + slips.max():g} mm before the "
-                f"lens, where the run's images hold optics.depths_mm = {held}: let them slip less, or train on more"
+                f"lens, where the run's images hold optics.depths_mm = {limits}: let them slip less, or train on more"
             )
 
 
 def prepare_run(
     source: FinishedRun, *, image: Literal["true", "trained"] = "true"
 ) -> Imager:
-    """The imager of a run's lens, of a retraining the made one; its network set to
-    statistics of training frames, as
-    they were formed.
+    """Imager of a run's lens; of a retraining, of its manufactured lens.
+
+    The batch normalisation of the run's network is set to the statistics of its
+    training frames first.
 
     Args:
         source: finished run: its network, lens and sensor.
+        image: "true" image, or the image model of the run's training.
 
     Raises:
         SceneError: the true image of this lens cannot be formed at the run's
@@ -458,11 +477,12 @@ def prepare_run(
     """
     trainer = source.run.trainer
     assess.recalibrate_network(trainer, source.architecture)
-    settings, scenes = trainer.optics, source.settings.scenes
-    seen = replace(settings, image="true") if image == "true" else settings
+    settings = trainer.optics
+    scenes = source.settings.scenes
+    image_settings = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
     return formed.make_imager(
-        seen,
+        image_settings,
         trainer.model.coefficients_rad,
         size,
         margin=scenes.margin,
@@ -471,8 +491,10 @@ def prepare_run(
 
 
 def finer_imager(source: FinishedRun) -> Imager | None:
-    """The true image of a run's lens at a quarter of the run's tolerance; None where it
-    cannot be formed so precisely, or the run was trained on a uniform image.
+    """Imager of a run's lens at a quarter of the run's tolerance.
+
+    None where the image cannot be formed that precisely, or the run was trained on a
+    uniform image.
 
     Args:
         source: finished run: its network, lens and sensor.
@@ -496,7 +518,8 @@ def finer_imager(source: FinishedRun) -> Imager | None:
 def sphere_calibrator(
     source: FinishedRun, config: ExperimentConfig
 ) -> SphereCalibrator:
-    """Calibrates before a run's camera by pupil and slippage alone.
+    """Calibrator by pupil and slippage alone, without the optic axis: eye sphere and
+    regressor.
 
     Args:
         source: finished run: its network, lens and sensor.
@@ -511,100 +534,113 @@ def sphere_calibrator(
 def run_calibrator(
     source: FinishedRun, imager: Imager, config: ExperimentConfig, sensor: Sensor
 ) -> PersonCalibrator:
-    """Calibrator of gaze for a run: mixed-effects model where the network reads the
+    """Calibrator of gaze for a run: a mixed-effects model where the network reads the
     optic axis, else sphere and regressor.
 
-    That is learned from ``config.people`` whom neither training nor the experiment
-    shows, before the same stimuli, on
-    the same stage at places of their own between its ends: EACH of their frames, drawn
-    at random, through the run's
-    lens, light and noise.
+    The model is learned from ``config.people`` further subjects at the same stimuli,
+    with slippage drawn uniformly between the ends of the experiment's. ``EACH`` random
+    frames of each pass the run's lens, light and noise.
 
     Args:
         source: finished run: its network, lens and sensor.
-        imager: what forms the images. sensor: with its exposure.
+        imager: imager of the run's lens.
+        config: subjects, stimuli, slippage and calibration.
+        sensor: the run's sensor at the exposure of the experiment.
     """
     scenes = source.run.scenes(EXPERIMENT)
-    found, looked = [], []
+    predictions = []
+    stimuli_deg = []
     for person in range(config.people):
         rng = np.random.default_rng([config.seed, BEFORE + person, POINTS])
         axial, lateral = (
             rng.uniform(min((0.0, *ends)), max((0.0, *ends)), len(ends))
             for ends in (config.axial_mm, config.lateral_mm)
         )
-        theirs = replace(config, axial_mm=tuple(axial), lateral_mm=tuple(lateral))
-        states, trial = states_of(theirs, BEFORE + person, scenes)
-        rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
-        some = states[torch.from_numpy(rows)]
-        made = render_subject(some, theirs, BEFORE + person, scenes)
-        seen = image_frames(
-            source, made, imager, seed=2 * NOISE + person, sensor=sensor
+        person_config = replace(
+            config, axial_mm=tuple(axial), lateral_mm=tuple(lateral)
         )
-        found.append(_answers(source, seen))
-        looked.append(trial.stimulus_deg[rows])
-        if found[0].axis is None:
+        states, trial = states_of(person_config, BEFORE + person, scenes)
+        rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
+        chosen_states = states[torch.from_numpy(rows)]
+        rendered = render_subject(chosen_states, person_config, BEFORE + person, scenes)
+        sensor_frames = image_frames(
+            source, rendered, imager, seed=2 * NOISE + person, sensor=sensor
+        )
+        predictions.append(_predict(source, sensor_frames))
+        stimuli_deg.append(trial.stimulus_deg[rows])
+        if predictions[0].axis is None:
             return sphere_calibrator(source, config)
-    who = np.repeat(np.arange(config.people), [len(one) for one in looked])
+    person_of_frame = np.repeat(
+        np.arange(config.people), [len(angles) for angles in stimuli_deg]
+    )
     return shared.learn_population(
-        read_from(found, source), np.concatenate(looked), who
+        read_from(predictions, source), np.concatenate(stimuli_deg), person_of_frame
     )
 
 
 def read_from(kept: Sequence[Predictions], source: FinishedRun) -> NetworkReadings:
-    """A run's answers to frames one after the other, in the units that gaze is
-    calibrated in.
+    """Readings of all frames in the units of the gaze calibration: pupil and slippage
+    in mm, optic axis as angles in the frame of the face.
 
     Args:
-        kept: one record a subject. source: finished run: its network, lens and sensor.
+        kept: predictions of every subject, in their order.
+        source: finished run: its network, lens and sensor.
     """
-    centre, slip = (
-        torch.cat([getattr(a, f) for a in kept]).double().numpy()
-        for f in ("centre", "slip_mm")
+    centre, slip_mm = (
+        torch.cat([getattr(prediction, name) for prediction in kept]).double().numpy()
+        for name in ("centre", "slip_mm")
     )
-    axes = [a.axis for a in kept if a.axis is not None]
+    axes = [prediction.axis for prediction in kept if prediction.axis is not None]
     tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
     angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
-    return NetworkReadings(centre * source.run.window_um * 1e-3, slip, angles)
+    return NetworkReadings(centre * source.run.window_um * 1e-3, slip_mm, angles)
 
 
 def _result(
     name: str,
     source: FinishedRun,
-    kept: list[Predictions],
+    predictions: list[Predictions],
     trial: ExperimentTrials,
     config: ExperimentConfig,
-    how: PersonCalibrator,
+    calibrator: PersonCalibrator,
 ) -> RunResult:
-    read = read_from(kept, source)
-    predicted, judged = calibrated_gaze(read, trial, config, how)
-    exact, _ = calibrated_gaze(
-        replace(read, slip_mm=trial.slip_mm),
+    """Result of one run from the predictions of all subjects.
+
+    Gaze errors are nan for calibration frames. ``true_slip_error`` is that of sphere
+    and regressor at the true slippage.
+    """
+    readings = read_from(predictions, source)
+    predicted, judged = calibrated_gaze(readings, trial, config, calibrator)
+    true_slip_gaze, _ = calibrated_gaze(
+        replace(readings, slip_mm=trial.slip_mm),
         trial,
         config,
         sphere_calibrator(source, config),
     )
-    error, told_error = (
+    error, true_slip_error = (
         np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
-        for p in (predicted, exact)
+        for p in (predicted, true_slip_gaze)
     )
     mmacs = float(source.row["mmacs"])
     reach = source.settings.scenes.slip_mm
     centre, iou = (
-        torch.cat([getattr(a, f) for a in kept]).double().numpy()
+        torch.cat([getattr(prediction, f) for prediction in predictions])
+        .double()
+        .numpy()
         for f in ("centre", "iou")
     )
     return RunResult(
         name,
         mmacs,
         trial,
-        read.slip_mm,
+        readings.slip_mm,
         centre,
         iou,
         error,
         predicted,
-        told_error,
+        true_slip_error,
         reach,
-        how,
+        calibrator,
     )
 
 
@@ -614,8 +650,8 @@ def calibrated_gaze(
     config: ExperimentConfig,
     how: PersonCalibrator,
 ) -> tuple[Array, Array]:
-    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that
-    it never saw.
+    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) True for
+    frames that took no part in it.
 
     Args:
         read: pupil, slippage and axis as a network reads them.
@@ -624,9 +660,8 @@ def calibrated_gaze(
         how: way to calibrate a person.
     """
     judged = ~np.isin(np.arange(len(read)), calibration_frames(trial, config))
-    return predicted_gaze(
-        calibrate_subjects(read, trial, config, how), read, trial
-    ), judged
+    people = calibrate_subjects(read, trial, config, how)
+    return predicted_gaze(people, read, trial), judged
 
 
 def calibrate_subjects(
@@ -635,8 +670,7 @@ def calibrate_subjects(
     config: ExperimentConfig,
     how: PersonCalibrator,
 ) -> dict[int, CalibratedPerson]:
-    """Every subject's calibration by number, on the stimuli of
-    :func:`calibration_frames`.
+    """{subject: calibration} on the frames of :func:`calibration_frames`.
 
     Args:
         read: pupil, slippage and axis as a network reads them.
@@ -644,10 +678,14 @@ def calibrate_subjects(
         config: subjects, stimuli, slippage and calibration.
         how: way to calibrate a person.
     """
-    known = calibration_frames(trial, config)
-    mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
+    calibration = calibration_frames(trial, config)
+    rows_of = {
+        int(subject): calibration[trial.subject[calibration] == subject]
+        for subject in np.unique(trial.subject)
+    }
     return {
-        s: how.person(read[rows], trial.stimulus_deg[rows]) for s, rows in mine.items()
+        subject: how.person(read[rows], trial.stimulus_deg[rows])
+        for subject, rows in rows_of.items()
     }
 
 
@@ -656,7 +694,8 @@ def predicted_gaze(
     read: NetworkReadings,
     trial: ExperimentTrials,
 ) -> Array:
-    """(n, 2) gaze of frames, each by its subject's calibration.
+    """(n, 2) gaze of frames across and down in degrees, each by its subject's
+    calibration.
 
     Args:
         people: calibrated persons by number of the subject.
@@ -671,14 +710,17 @@ def predicted_gaze(
 
 
 def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Array:
-    """Numbers of the frames that subjects are calibrated on: a share of their stimuli,
-    in every slippage state.
+    """Numbers of the calibration frames: a share of every subject's stimuli, in all
+    slippage states.
+
+    The stimuli are spread by :func:`farthest_points` from a random first one, or drawn
+    at random, as ``config.points`` says.
 
     Args:
         trial: subject, stimulus and slippage of every frame.
         config: subjects, stimuli, slippage and calibration.
     """
-    known = []
+    frames = []
     for subject in np.unique(trial.subject):
         rows = np.flatnonzero(trial.subject == subject)
         points = np.unique(trial.stimulus[rows])
@@ -690,16 +732,18 @@ def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Arr
             )
         else:
             chosen = rng.choice(len(points), count, replace=False)
-        known.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
-    return np.concatenate(known)
+        frames.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
+    return np.concatenate(frames)
 
 
 def farthest_points(places: Array, count: int, *, first: int) -> Array:
-    """(count,) numbers of places (n, 2) that cover them: each next one is the farthest
-    from all before it.
+    """(count,) numbers of points by farthest-point sampling: each next point is the one
+    farthest from all chosen before.
 
     Args:
-        first: number of the first place.
+        places: (n, 2) points.
+        count: points to choose.
+        first: number of the first point.
     """
     chosen = [first]
     while len(chosen) < count:

@@ -19,25 +19,24 @@ from metalens.image import Grid, Imager, imager
 from metalens.lens import Lens
 from metalens.psf import Source, spectrum
 
-FRAMES = 6  # that are imaged
-# of the scene around a frame that is blurred into it: half a window of the PSFs
-BLUR_UM = 144.0
-TOLERANCE = 0.03  # of the image, relative L2 of a texture
-NODES = 3  # PSFs that are kept along x, y and depth: first, middle, last
+FRAMES = 6  # frames that are imaged
+BLUR_UM = 144.0  # width of the scene around a frame: half a window of the PSFs
+TOLERANCE = 0.03  # relative L2 error of the image of a texture
+NODES = 3  # stored PSFs along x, y and depth: first, middle, last
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImagedFrames:
-    """Frames and their images.
+    """Rendered frames, their images and the PSFs.
 
-    scene, image: (frames, y, x), the image scaled to the light of the scenes. psf:
-    (depth, row, column, y, x) of sum
-    1, at depth_um, and at the field angles y_deg and x_deg of the rows and columns; the
-    outermost are those of the
-    samples around the frame that are blurred into it. parts: of the error by cause.
-    light: words for what of it the
-    pillars are not known for; problem: why the error is above :data:`TOLERANCE`. Empty
-    where there are none.
+    scene, image: (frames, y, x); the image is scaled to the light of the scenes.
+    psf: (depth, row, column, y, x) PSFs of sum 1.
+    depth_um: (depth,). y_deg, x_deg: field angles of the PSFs' rows and columns, the
+    outermost at the edge of the margin.
+    pitch_um: pitch of the samples.
+    error: relative L2 error of the image. parts: its contributions by cause.
+    light: wavelengths that the pillar model does not cover, in words, or empty.
+    problem: why the error exceeds :data:`TOLERANCE`, or empty.
     """
 
     scene: Array
@@ -54,10 +53,10 @@ class ImagedFrames:
 
 
 def margin_of(pitch_um: float) -> int:
-    """Samples around a frame that are blurred into it.
+    """Samples around a frame that are blurred into it: ceil(BLUR_UM / pitch).
 
     Args:
-        pitch_um: of the pixels.
+        pitch_um: pitch of the samples.
     """
     return math.ceil(BLUR_UM / pitch_um)
 
@@ -70,11 +69,12 @@ def lens_imager(
     fwhm_nm: float = 0.0,
     tolerance: float = TOLERANCE,
 ) -> Imager:
-    """The true image of a lens file on the samples of a camera, for frames with a
-    margin (:func:`margin_of`) that hold
-    these depths.
+    """Imager of a lens on the samples of a camera, for frames with a margin
+    (:func:`margin_of`).
 
     Args:
+        lens: lens to image through.
+        camera: samples of the frame without margin.
         depths_um: nearest and farthest depth of the scenes.
         fwhm_nm: spectral width of the light; 0 for one wavelength.
         tolerance: relative L2 error allowed.
@@ -94,10 +94,11 @@ def lens_imager(
 
 
 def diode_source(lens: Lens, fwhm_nm: float) -> Source | None:
-    """A diode about the design wavelength; None for one wavelength, a width of 0.
+    """Light source of a width about the design wavelength; None for a width of 0.
 
     Args:
-        lens: to image with. fwhm_nm: spectral width of the light; 0 for one wavelength.
+        lens: lens whose design wavelength is the middle.
+        fwhm_nm: spectral width of the light; 0 for one wavelength.
     """
     return Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
 
@@ -111,37 +112,37 @@ def image_first_frames(
     *,
     fwhm_nm: float = 0.0,
 ) -> ImagedFrames:
-    """Image the first frames.
+    """Render frames and image them through a lens, with the PSFs at the corners, edges
+    and middle of field and depth.
 
     Args:
-        camera: samples of the sensor. rendered: gives the frames of a camera and a rig,
-            whose pinhole is as far from
-            its sensor as this lens through its films
-            (:attr:`metalens.lens.Lens.reduced_um`). fwhm_nm: width of the
-            light; 0 for one wavelength.
+        lens: lens to image through.
+        camera: samples of the sensor.
+        rig: camera pose; its sensor distance becomes the lens's reduced one.
+        rendered: renders the frames of a camera and a rig.
+        fwhm_nm: spectral width of the light; 0 for one wavelength.
 
     Raises:
-        SceneError: a frame that reaches so far aside that part of the face lies behind
-            the lens; a lens that cannot be
-            imaged over this field to 3 %, see :func:`metalens.image.imager`.
+        SceneError: a field so wide that part of the face lies behind the lens; a lens
+            that cannot be imaged to 3 %, see :func:`metalens.image.imager`.
     """
     margin = margin_of(camera.pitch_um)
-    wide = PinholeCamera(camera.pixels + 2 * margin, camera.pitch_um)
-    made = rendered(wide, replace(rig, sensor_distance_um=lens.reduced_um))
-    seen = made.frames.depth_um[made.frames.coverage > 0]
-    if float(seen.min()) <= 0:
-        half_um = wide.pixels * wide.pitch_um / 2
+    wide_camera = PinholeCamera(camera.pixels + 2 * margin, camera.pitch_um)
+    renderings = rendered(wide_camera, replace(rig, sensor_distance_um=lens.reduced_um))
+    visible_um = renderings.frames.depth_um[renderings.frames.coverage > 0]
+    if float(visible_um.min()) <= 0:
+        half_um = wide_camera.pixels * wide_camera.pitch_um / 2
         raise SceneError(
             f"a frame of {camera.pixels} samples of {camera.pitch_um:g} um with {BLUR_UM:g} um about it reaches to "
             f"{math.degrees(math.atan(half_um / lens.reduced_um)):.0f} degrees through a lens {lens.reduced_um:.4g} um "
             "before its sensor, where part of the face lies behind it: take fewer or smaller samples, or a lens "
             "farther from its sensor"
         )
-    reach = 0.98 * float(seen.min()), 1.02 * float(seen.max())
-    optics = lens_imager(lens, camera, reach, fwhm_nm=fwhm_nm)
-    inside = slice(margin, margin + camera.pixels)
-    plain = made.pinhole()[:, inside, inside]
-    light = optics(made.frames)
+    depths_um = 0.98 * float(visible_um.min()), 1.02 * float(visible_um.max())
+    optics = lens_imager(lens, camera, depths_um, fwhm_nm=fwhm_nm)
+    inner = slice(margin, margin + camera.pixels)
+    scene = renderings.pinhole()[:, inner, inner]
+    light = optics(renderings.frames)
     if not float(light.sum()) > 0:
         raise SceneError("no light of these frames reaches the sensor")
     rows, columns, depths = (
@@ -151,8 +152,8 @@ def image_first_frames(
     y_um = optics.plan.y_um.numpy()[rows]
     x_um = optics.plan.x_um.numpy()[columns]
     return ImagedFrames(
-        plain.numpy().astype(np.float32),
-        (light * (plain.sum() / light.sum())).numpy().astype(np.float32),
+        scene.numpy().astype(np.float32),
+        (light * (scene.sum() / light.sum())).numpy().astype(np.float32),
         psf.numpy().astype(np.float32),
         optics.plan.depths_um.numpy()[depths],
         np.degrees(np.arctan(y_um / lens.reduced_um)),
@@ -168,36 +169,43 @@ def image_first_frames(
 
 
 def write_images(folder: Path, found: ImagedFrames, about: Provenance) -> None:
-    """image.h5 (kind ``image``) and image.png.
+    """Write image.h5 (kind ``image``) and image.png.
 
     Args:
-        folder: of the files. found: frames with their images. about: of the file.
+        folder: folder to write to.
+        found: frames with their images.
+        about: provenance of image.h5.
     """
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
     arrays = {name: np.asarray(getattr(found, name)) for name in names}
-    said = {"pitch_um": found.pitch_um, "error": found.error} | {
-        f"error_{k}": v for k, v in found.parts.items()
+    attributes = {"pitch_um": found.pitch_um, "error": found.error} | {
+        f"error_{cause}": error for cause, error in found.parts.items()
     }
-    store.save(folder / "image.h5", "image", arrays, attributes=said, provenance=about)
+    store.save(
+        folder / "image.h5", "image", arrays, attributes=attributes, provenance=about
+    )
     store.write_bytes(folder / "image.png", plot_image(found))
 
 
 def plot_image(found: ImagedFrames) -> bytes:
-    """The first frame: scene, image, and what the lens took away and added.
+    """PNG of the first frame: scene, image, and image minus scene.
 
     Args:
         found: frames with their images.
     """
     figure, axes = report.make_figure(1, 3, size=(9.6, 3.3))
-    apart = found.image[0] - found.scene[0]
-    top, most = float(found.scene[0].max()), float(np.abs(apart).max())
-    half = found.pitch_um * len(apart) / 2000
-    shown = {"extent": (-half, half, half, -half)}
-    axes[0].imshow(found.scene[0], cmap="gray", vmin=0, vmax=top, **shown)
-    axes[1].imshow(found.image[0], cmap="gray", vmin=0, vmax=top, **shown)
-    last = axes[2].imshow(apart, cmap="RdBu_r", vmin=-most, vmax=most, **shown)
-    for one, title in zip(axes, ("scene", "image", "image − scene"), strict=True):
-        one.set(title=title, xlabel="x on the sensor / mm")
-        one.grid(visible=False)
-    figure.colorbar(last, ax=axes[2], label="light, as of the scene")
+    difference = found.image[0] - found.scene[0]
+    brightest = float(found.scene[0].max())
+    largest = float(np.abs(difference).max())
+    half_mm = found.pitch_um * len(difference) / 2000
+    extent = {"extent": (-half_mm, half_mm, half_mm, -half_mm)}
+    axes[0].imshow(found.scene[0], cmap="gray", vmin=0, vmax=brightest, **extent)
+    axes[1].imshow(found.image[0], cmap="gray", vmin=0, vmax=brightest, **extent)
+    drawn = axes[2].imshow(
+        difference, cmap="RdBu_r", vmin=-largest, vmax=largest, **extent
+    )
+    for panel, title in zip(axes, ("scene", "image", "image − scene"), strict=True):
+        panel.set(title=title, xlabel="x on the sensor / mm")
+        panel.grid(visible=False)
+    figure.colorbar(drawn, ax=axes[2], label="light, as of the scene")
     return report.figure_png(figure)

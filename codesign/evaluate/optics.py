@@ -1,7 +1,7 @@
-"""Lenses compared as the paper compares them: axial information on and off axis (Table
-3, Fig. 7), and the sensitivity
-of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals over
-scenes."""
+"""Comparison of lenses as in the paper: axial information on and off axis (Table 3,
+Fig. 7), and sensitivity of whole scenes to gaze and slip (Table 1, Fig. 5), with
+confidence intervals over scenes.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -72,46 +72,50 @@ class MeasurementSettings:
                 f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
                 f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
             )
-        sample = 1e-6 if self.sample_um is None else self.sample_um
-        wide = self.window_um is None or self.window_um >= 4 * sample
+        sample_um = 1e-6 if self.sample_um is None else self.sample_um
+        wide_enough = self.window_um is None or self.window_um >= 4 * sample_um
         lengths = [
             1.0 if length is None else length
             for length in (self.pixel_um, self.radius_um)
         ]
-        if not (wide and sample > 0 and min(lengths) > 0):
+        if not (wide_enough and sample_um > 0 and min(lengths) > 0):
             raise ConfigError(
                 f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
                 f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
             )
 
     def about(self, lens: Lens) -> "ResolvedSettings":
-        """These with what was left to the lens."""
-        near, far = (
+        """These settings with the defaults of a lens in place of None."""
+        nearest_um, farthest_um = (
             (1e3 * z for z in self.depths_mm)
             if self.depths_mm
             else reach.depth_range_um(lens)
         )
-        pixel = self.pixel_um or reach.pixel_um(lens)
-        sample = self.sample_um or reach.sample_um(lens, pixel * min(self.binnings))
-        window = self.window_um or reach.window_um(lens, (near, far), airy=WINDOW)
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        own |= {
-            "pixel_um": pixel,
-            "depths_mm": (near * 1e-3, far * 1e-3),
+        pixel_um = self.pixel_um or reach.pixel_um(lens)
+        sample_um = self.sample_um or reach.sample_um(
+            lens, pixel_um * min(self.binnings)
+        )
+        window_um = self.window_um or reach.window_um(
+            lens, (nearest_um, farthest_um), airy=WINDOW
+        )
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {
+            "pixel_um": pixel_um,
+            "depths_mm": (nearest_um * 1e-3, farthest_um * 1e-3),
             "radius_um": self.radius_um or reach.disc_um(lens),
         }
-        own |= {
-            "sample_um": sample,
-            "window_um": max(4, round(window / sample)) * sample,
+        values |= {
+            "sample_um": sample_um,
+            "window_um": max(4, round(window_um / sample_um)) * sample_um,
         }
-        return ResolvedSettings(**own, step_um=reach.depth_step_um(lens, near))
+        return ResolvedSettings(**values, step_um=reach.depth_step_um(lens, nearest_um))
 
 
 @dataclass(frozen=True, slots=True)
 class ResolvedSettings(MeasurementSettings):
-    """A :class:`MeasurementSettings` with nothing left to the lens. step_um: of the
-    difference in
-    Eq. 11.
+    """:class:`MeasurementSettings` without None.
+
+    step_um: depth step of the difference in Eq. 11.
     """
 
     depths_mm: tuple[float, float] = field(kw_only=True)
@@ -159,14 +163,13 @@ class SensitivityScenes:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AxialInformation:
-    """Honest axial information of one lens.
+    """Axial information of one lens.
 
-    information: (angles, binnings, depths) per mm², over sub-pixel positions.
-    encircled: (angles, depths) share of the
-    light through the lens that a circle of the radius holds, placed where it holds
-    most. psf_error: of the engine.
-    slices: (depths, x) the light on axis summed over y, on samples: what a line across
-    the PSF's image shows.
+    information: (angles, binnings, depths) I(z) per mm², mean over sub-pixel positions.
+    encircled: (angles, depths) share of the light through the lens in a circle of
+    ``radius_um``, placed where it holds most.
+    psf_error: relative error of the PSF engine.
+    slices: (depths, x) PSF on axis summed over y, on the samples.
     """
 
     information: Tensor
@@ -178,47 +181,60 @@ class AxialInformation:
 def measure_axial_information(
     lens: Lens, setting: MeasurementSettings | None = None
 ) -> AxialInformation:
-    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the
-    PSF engine.
+    """Axial information I(z) of Eq. 11 of the full pillar lens, at every field angle
+    and binning.
 
-    What the setting leaves out is that of this lens: to compare lenses, take
-    :meth:`Setting.about` of one.
+    PSFs at every depth z and z + step give the derivative by z.
+
+    Args:
+        lens: lens to measure.
+        setting: depths, angles and pixels. None in them takes the default of this lens:
+            to compare lenses, pass :meth:`MeasurementSettings.about` of one.
     """
-    s = (
+    resolved = (
         setting
         if isinstance(setting, ResolvedSettings)
         else (setting or MeasurementSettings()).about(lens)
     )
-    depths = np.linspace(1e3 * s.depths_mm[0], 1e3 * s.depths_mm[1], s.count)
-    both = np.sort(np.concatenate([depths, depths + s.step_um]))
-    samples = round(s.window_um / s.sample_um)
-    angles = tuple((math.radians(a), 0.0) for a in s.angles_deg)
-    stack = from_lens(
-        lens, View(tuple(both), angles, s.window_um, samples), tolerance=s.tolerance
+    depths = np.linspace(
+        1e3 * resolved.depths_mm[0], 1e3 * resolved.depths_mm[1], resolved.count
     )
-    where = [int(np.argmin(np.abs(both - d))) for d in (*depths, *(depths + s.step_um))]
-    intensity = torch.as_tensor(stack.intensity)[..., where, :, :].reshape(
-        len(angles), 2, s.count, samples, samples
+    all_depths = np.sort(np.concatenate([depths, depths + resolved.step_um]))
+    samples = round(resolved.window_um / resolved.sample_um)
+    angles = tuple((math.radians(angle_deg), 0.0) for angle_deg in resolved.angles_deg)
+    stack = from_lens(
+        lens,
+        View(tuple(all_depths), angles, resolved.window_um, samples),
+        tolerance=resolved.tolerance,
+    )
+    order = [
+        int(np.argmin(np.abs(all_depths - depth)))
+        for depth in (*depths, *(depths + resolved.step_um))
+    ]
+    intensity = torch.as_tensor(stack.intensity)[..., order, :, :].reshape(
+        len(angles), 2, resolved.count, samples, samples
     )
     values = []
-    for b in s.binnings:
+    for binning in resolved.binnings:
         values.append(
             axial_information(
                 intensity[:, 0],
                 intensity[:, 1],
-                step_um=s.step_um,
-                sample_um=s.sample_um,
-                pixel_um=s.pixel_um * b,
-                normalisation=s.normalisation,
+                step_um=resolved.step_um,
+                sample_um=resolved.sample_um,
+                pixel_um=resolved.pixel_um * binning,
+                normalisation=resolved.normalisation,
             )
         )
-    light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(
-        len(angles), s.count
-    )
-    share = light / torch.as_tensor(
+    energy_um2 = torch.as_tensor(stack.energy_um2)[
+        ..., order[: resolved.count]
+    ].reshape(len(angles), resolved.count)
+    share = energy_um2 / torch.as_tensor(
         np.array([passed_um2(lens, angle, tuple(depths)) for angle in angles])
     )
-    inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
+    inside = most_encircled(
+        intensity[:, 0], resolved.sample_um, radius_um=resolved.radius_um
+    )
     slices = intensity[0, 0].sum(1)
     return AxialInformation(
         torch.stack(values, 1),
@@ -229,30 +245,32 @@ def measure_axial_information(
 
 
 def most_encircled(intensity: Tensor, sample_um: float, *, radius_um: float) -> Tensor:
-    """Largest share of the light (..., y, x) that a circle of this radius holds,
-    wherever in the window it lies.
+    """(...) largest light within a circle of a radius, over all places of the circle in
+    the window.
 
-    Off axis the core of a PSF is neither at the chief ray nor at the centroid, which
-    haze pulls away.
+    Sums over the circle are the cyclic convolution with a disc whose rim samples count
+    by their coverage. Off axis the core of a PSF is neither at the chief ray nor at the
+    centroid.
 
     Args:
-        intensity: (..., y, x) PSFs. sample_um: distance of the samples.
-        radius_um: of the circle.
+        intensity: (..., y, x) PSFs.
+        sample_um: distance of the samples.
+        radius_um: radius of the circle.
     """
-    n = intensity.shape[-1]
-    grid = (
-        torch.arange(n, dtype=torch.float64) + n // 2
-    ) % n - n // 2  # 0 first, as the transform counts
-    inside = (
-        (radius_um / sample_um + 0.5 - torch.hypot(grid[:, None], grid))
+    count = intensity.shape[-1]
+    offset = (
+        torch.arange(count, dtype=torch.float64) + count // 2
+    ) % count - count // 2  # distance from index 0, cyclic
+    disc = (
+        (radius_um / sample_um + 0.5 - torch.hypot(offset[:, None], offset))
         .clamp(0, 1)
         .to(intensity)
     )
-    summed: Tensor = torch.fft.irfft2(
-        torch.fft.rfft2(intensity) * torch.fft.rfft2(inside), s=(n, n)
+    encircled: Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(intensity) * torch.fft.rfft2(disc), s=(count, count)
     )
-    most: Tensor = summed.amax((-2, -1))
-    return most
+    largest: Tensor = encircled.amax((-2, -1))
+    return largest
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -260,12 +278,12 @@ class SceneEnergy:
     """Table 1 of one lens: (scenes,) squared differences of energy-matched images,
     summed over pixels.
 
-    gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
-    image_error: of the images, relative L2 of a texture.
+    gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|².
+    separability: |I_gaze - I_slip|².
+    image_error: relative L2 error of the image of a texture.
     maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared
     difference of gaze and slip (Fig. 5).
-    above: why the error of the true image is above what it aims at; empty where it is
-    not.
+    above: why the image error exceeds its tolerance; empty otherwise.
     """
 
     gaze: Tensor
@@ -287,15 +305,15 @@ class SceneEnergy:
 def scene_energies(
     lenses: Sequence[Lens], states: EyeStates, settings: SensitivityScenes | None = None
 ) -> list[SceneEnergy]:
-    """Table 1: how much the images of the same scenes change with gaze and with axial
-    slip.
+    """Change of the images of the same scenes with gaze and with axial slip, lens by
+    lens (Table 1).
 
-    Images of all lenses are scaled to the same mean (the paper normalises the PSFs'
-    sums). The steps are the paper's
-    kind of perturbation, not infinitesimal ones.
+    Images of all lenses are scaled to the same mean; the paper normalises the PSFs'
+    sums. The steps are finite as in the paper, not infinitesimal.
 
     Args:
-        states: subjects with gaze and slippage.
+        lenses: lenses of one sensor distance.
+        states: eye states of the anchor views.
         settings: of the scenes; their defaults without it.
 
     Raises:
@@ -304,32 +322,37 @@ def scene_energies(
     if not lenses:
         raise SceneError("no lens to evaluate; give at least one")
     settings = settings or SensitivityScenes()
-    distance = lenses[0].reduced_um
+    distance_um = lenses[0].reduced_um
     for number, lens in enumerate(lenses):
-        if abs(lens.reduced_um / distance - 1) > 1e-3:
+        if abs(lens.reduced_um / distance_um - 1) > 1e-3:
             raise SceneError(
                 f"lens {number + 1} is made for a sensor at {lens.reduced_um:g} um (through films: reduced), the first "
-                f"for {distance:g} um: their images differ in size; compare lenses of one sensor distance"
+                f"for {distance_um:g} um: their images differ in size; compare lenses of one sensor distance"
             )
-    views = scene_views(states, settings, sensor_distance_um=distance)
-    window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
-    grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
-    out = []
+    views = scene_views(states, settings, sensor_distance_um=distance_um)
+    window_samples = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
+    grid = Grid(
+        (settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window_samples
+    )
+    results = []
     for lens in lenses:
-        whole = imager(lens, grid, tolerance=settings.image_tolerance)
-        found = energies_of(whole, views)
-        out.append(replace(found, above=whole.above(settings.image_tolerance)))
-    return out
+        optics = imager(lens, grid, tolerance=settings.image_tolerance)
+        energies = energies_of(optics, views)
+        results.append(replace(energies, above=optics.above(settings.image_tolerance)))
+    return results
 
 
 def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
-    """Depth of the nearest and the farthest visible surface, um.
+    """Depths in um of the nearest and the farthest visible surface, at least 5 and 6
+    mm.
 
     Args:
         views: rendered views of the scenes.
     """
-    seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
-    return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
+    visible_um = torch.cat(
+        [view.frames.depth_um[view.frames.coverage > 0] for view in views]
+    )
+    return max(float(visible_um.min()), 5e3), max(float(visible_um.max()), 6e3)
 
 
 def scene_views(
@@ -338,10 +361,13 @@ def scene_views(
     *,
     sensor_distance_um: float = 2000.0,
 ) -> list[RenderedFrames]:
-    """Anchor, gaze and slip views of the states, at one exposure.
+    """Rendered anchor, gaze and slip views of eye states, at the exposure of the
+    anchor.
 
     Args:
-        settings: of the scenes. sensor_distance_um: lens to sensor.
+        states: eye states of the anchor views.
+        settings: steps, pitch and pixels.
+        sensor_distance_um: distance from lens to sensor.
     """
     motions = (
         ("gaze_rad", 0, math.radians(settings.gaze_step_deg)),
@@ -350,21 +376,28 @@ def scene_views(
     rig = replace(CameraRig(), sensor_distance_um=sensor_distance_um)
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     return [
-        render(one, rig=rig, camera=camera, exposed=states)
-        for one in moved_states(states, motions)
+        render(moved, rig=rig, camera=camera, exposed=states)
+        for moved in moved_states(states, motions)
     ]
 
 
 def energies_of(optics: Imager, views: Sequence[RenderedFrames]) -> SceneEnergy:
-    """Table 1 of any PSFs, see :func:`scene_energies`.
+    """Squared differences between the energy-matched images of three views, for any
+    imager; see :func:`scene_energies`.
 
     Args:
-        optics: what forms the images. views: anchor, gaze and slip views.
+        optics: imager of the lens.
+        views: anchor, gaze and slip views.
     """
     images = [optics(view.frames) for view in views]
-    anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
-    maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
-    sums = [m.sum((1, 2)) for m in maps]
+    anchor, gaze, slip = (
+        image / images[0].mean((1, 2), keepdim=True) for image in images
+    )
+    maps = [
+        (image_a - image_b) ** 2
+        for image_a, image_b in ((gaze, anchor), (slip, anchor), (gaze, slip))
+    ]
+    sums = [change.sum((1, 2)) for change in maps]
     return SceneEnergy(
         sums[0],
         sums[1],
@@ -377,15 +410,18 @@ def energies_of(optics: Imager, views: Sequence[RenderedFrames]) -> SceneEnergy:
 def lens_ratios(
     scenes: Mapping[str, SceneEnergy],
 ) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1.
+    """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1, with 95 %
+    bootstrap intervals over the scenes.
 
     Args:
         scenes: scene sensitivity by name of the lens.
     """
-    first = next(iter(scenes.values()))
+    reference = next(iter(scenes.values()))
     return {
         name: {
-            kind: bootstrap_ratio(*(getattr(e, kind).numpy() for e in (energy, first)))
+            kind: bootstrap_ratio(
+                *(getattr(compared, kind).numpy() for compared in (energy, reference))
+            )
             for kind in KINDS
         }
         for name, energy in scenes.items()
@@ -404,27 +440,27 @@ def table_values(
         scenes: scene sensitivity by name of the lens.
         setting: how the lenses were measured.
     """
-    out: dict[str, Any] = {
+    values: dict[str, Any] = {
         "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
         "angles_deg": list(setting.angles_deg),
         "binnings": list(setting.binnings),
         "normalisation": setting.normalisation,
         "lenses": {},
     }
-    compared = lens_ratios(scenes)
-    for name, found in axial.items():
+    ratios = lens_ratios(scenes)
+    for name, measured in axial.items():
         energy = scenes[name]
-        out["lenses"][name] = {
-            "information_per_mm2": found.information.tolist(),
-            "encircled_energy": found.encircled.tolist(),
-            "psf_error": found.psf_error,
+        values["lenses"][name] = {
+            "information_per_mm2": measured.information.tolist(),
+            "encircled_energy": measured.encircled.tolist(),
+            "psf_error": measured.psf_error,
             "scene_ratios": {
-                kind: list(interval) for kind, interval in compared[name].items()
+                kind: list(interval) for kind, interval in ratios[name].items()
             },
             "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
             "image_error": energy.image_error,
         }
-    return out
+    return values
 
 
 def table_failures(
@@ -432,20 +468,24 @@ def table_failures(
     scenes: Mapping[str, SceneEnergy],
     setting: ResolvedSettings,
 ) -> list[str]:
-    """What of the numbers misses its tolerance, in words.
+    """Sentences on every PSF and image whose error exceeds its tolerance.
 
     Args:
         axial: axial information by name of the lens.
         scenes: scene sensitivity by name of the lens.
         setting: how the lenses were measured.
     """
-    asked = setting.tolerance
+    tolerance = setting.tolerance
     above = [
-        f"{name}: the PSFs' error {one.psf_error:.2g} is above axial.tolerance = {asked:g}"
-        for name, one in axial.items()
-        if one.psf_error > asked
+        f"{name}: the PSFs' error {measured.psf_error:.2g} is above axial.tolerance = {tolerance:g}"
+        for name, measured in axial.items()
+        if measured.psf_error > tolerance
     ]
-    return above + [f"{name}: {one.above}" for name, one in scenes.items() if one.above]
+    return above + [
+        f"{name}: {measured.above}"
+        for name, measured in scenes.items()
+        if measured.above
+    ]
 
 
 def format_tables(
@@ -455,22 +495,25 @@ def format_tables(
     *,
     spread: Sequence[str] = (),
 ) -> list[Table]:
-    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1;
-    spread: what is said of lenses that do not focus, a line each.
+    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1.
 
     Args:
         axial: axial information by name of the lens.
         scenes: scene sensitivity by name of the lens.
         setting: how the lenses were measured.
+        spread: lines of the caption on lenses that do not focus.
     """
-    return [_axial(axial, setting, spread), _scenes(scenes)]
+    return [_axial_table(axial, setting, spread), _scene_table(scenes)]
 
 
-def _axial(
+def _axial_table(
     axial: Mapping[str, AxialInformation],
     setting: ResolvedSettings,
     spread: Sequence[str],
 ) -> Table:
+    """Table 3: mean I(z) at every angle, a row for each lens and binning, and the least
+    encircled energy on axis and at all angles.
+    """
     low, high = setting.depths_mm
     caption = (
         f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
@@ -486,33 +529,43 @@ def _axial(
         "light at all angles",
     )
     rows: list[tuple[str, ...]] = []
-    for name, found in axial.items():
-        for k, b in enumerate(setting.binnings):
-            means = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
-            least = (
+    for name, measured in axial.items():
+        for k, binning in enumerate(setting.binnings):
+            means = [
+                f"{float(mean):.3g}" for mean in measured.information[:, k].mean(-1)
+            ]
+            shares = (
                 [
-                    f"{float(found.encircled[0].min()):.2f}",
-                    f"{float(found.encircled.min()):.2f}",
+                    f"{float(measured.encircled[0].min()):.2f}",
+                    f"{float(measured.encircled.min()):.2f}",
                 ]
                 if k == 0
                 else []
             )
             rows.append(
-                (name if k == 0 else "", f"{b} × {b}", *means, *(least or ["", ""]))
+                (
+                    name if k == 0 else "",
+                    f"{binning} × {binning}",
+                    *means,
+                    *(shares or ["", ""]),
+                )
             )
     return Table(head, rows, caption)
 
 
-def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
+def _scene_table(scenes: Mapping[str, SceneEnergy]) -> Table:
+    """Table 1: ratios to the first lens with 95 % intervals, span angle, image
+    error.
+    """
     first = next(iter(scenes))
     caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
     rows: list[tuple[str, ...]] = []
-    for name, found in lens_ratios(scenes).items():
-        one = scenes[name]
-        parts = [
+    for name, ratios in lens_ratios(scenes).items():
+        energy = scenes[name]
+        intervals = [
             f"{value:.2f} [{low:.2f}, {high:.2f}]"
-            for value, low, high in found.values()
+            for value, low, high in ratios.values()
         ]
-        angle = float(torch.rad2deg(one.angle_rad).mean())
-        rows.append((name, *parts, f"{angle:.1f}°", f"{one.image_error:.3f}"))
+        angle = float(torch.rad2deg(energy.angle_rad).mean())
+        rows.append((name, *intervals, f"{angle:.1f}°", f"{energy.image_error:.3f}"))
     return Table(("lens", *KINDS, "span angle", "image error"), rows, caption)

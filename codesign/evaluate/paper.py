@@ -1,8 +1,7 @@
-"""The paper's tables and figures as claims, and what was measured here beside each:
-paper, ours, ratio, conditions.
+"""Tables and figures of the paper as claims, each with our measurement: paper, ours,
+ratio, conditions.
 
-What was not measured says so, with the command that would measure it: no number is
-filled in.
+A claim without a measurement names the command that measures it.
 """
 
 import functools
@@ -27,16 +26,11 @@ from metalens.core.errors import StoreError, TrainingError
 
 Shown = tuple[bench.PeopleFrames, SensorFrames]
 
-ROLES = (
-    "proposed",
-    "hyperbolic",
-    "best_focus",
-    "double_helix",
-)  # of the runs, in the order they are given
+# roles of the runs, in the order of the command line
+ROLES = ("proposed", "hyperbolic", "best_focus", "double_helix")
 
-PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
-# other people of as many frames, whose gaze tells what an axis that is read means
-BEFORE = 32
+PEOPLE, EACH = 16, 40  # people of the gaze test, frames of each; a fifth calibrates
+BEFORE = 32  # further people, on whom a network that reads an axis is calibrated
 WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 
@@ -44,9 +38,10 @@ WORDS = "visual axis after a personal calibration on a fifth of the frames"
 class PaperClaim:
     """A number or picture of the paper.
 
-    place: table, figure or section. value: nan where the paper prints a picture only.
-    key: of our measurement.
-    how: the command that measures it. note: conditions of the paper.
+    place: table, figure or section. what: quantity in words.
+    key: key of our measurement. how: the command that measures it.
+    value, unit: of the paper; inf where it prints a picture only.
+    note: conditions of the paper.
     """
 
     place: str
@@ -72,9 +67,7 @@ class PaperClaims:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredNumber:
-    """A number of ours with its 95 % interval (nan: none) and the conditions that it
-    holds for.
-    """
+    """A measured number with its 95 % interval (nan without one) and its conditions."""
 
     value: float
     low: float = math.nan
@@ -84,9 +77,9 @@ class MeasuredNumber:
 
 @dataclass(frozen=True, slots=True)
 class ClaimLine:
-    """A claim and what stands beside it.
+    """A claim of the paper and our measurement of it.
 
-    ours: None where it was not measured. picture: file of ours, '' for none.
+    ours: None where it was not measured. picture: name of our file, '' without one.
     """
 
     claim: PaperClaim
@@ -139,29 +132,37 @@ def load_claims() -> tuple[PaperClaim, ...]:
 def claim_lines(
     measured: Mapping[str, MeasuredNumber], folder: Path | None = None
 ) -> list[ClaimLine]:
-    """Every claim beside what was measured; pictures are looked for in ``folder``."""
-    out = []
+    """Every claim of the paper with our measurement of it.
+
+    Args:
+        measured: measurements by the claims' keys.
+        folder: folder of our pictures; None for none.
+    """
+    lines = []
     for claim in load_claims():
         name = claim.key.removeprefix("picture/")
-        there = claim.picture and folder is not None and (folder / name).is_file()
-        out.append(ClaimLine(claim, measured.get(claim.key), name if there else ""))
-    return out
+        has_picture = claim.picture and folder is not None and (folder / name).is_file()
+        lines.append(
+            ClaimLine(claim, measured.get(claim.key), name if has_picture else "")
+        )
+    return lines
 
 
 def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
-    """Measurements in an experiment.json whose runs are named by :data:`ROLES`.
+    """Measurements in an experiment.json whose runs are named by :data:`ROLES`: error
+    of every run, and ratios to the hyperbolic one.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         StoreError: no such file, or of another version.
     """
-    content = _json(path, "runs", "ratios", "settings")
-    about = content["settings"]
-    found: dict[str, MeasuredNumber] = {}
+    content = _load_json(path, "runs", "ratios", "settings")
+    settings = content["settings"]
+    numbers: dict[str, MeasuredNumber] = {}
     for run in content["runs"]:
-        words = f"{about['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {about['seed']}"
+        conditions = f"{settings['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {settings['seed']}"
         for key, name in (
             ("slip", "slip_mm"),
             ("gaze_axial", "gaze_axial_deg"),
@@ -170,8 +171,8 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
         ):
             low, high = run.get(f"{name}_interval", (math.nan, math.nan))
             if run[name] is not None:  # a network without a mask has no overlap
-                found[f"{key}/{run['name']}"] = MeasuredNumber(
-                    run[name], low, high, words
+                numbers[f"{key}/{run['name']}"] = MeasuredNumber(
+                    run[name], low, high, conditions
                 )
     for entry in content["ratios"]:
         if entry["against"] != "hyperbolic":
@@ -183,99 +184,111 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
         ):
             if entry["quantity"] == name:
                 low, high = entry["interval"]
-                found[f"{key}/ratio"] = MeasuredNumber(
+                numbers[f"{key}/ratio"] = MeasuredNumber(
                     entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
                 )
-    return found
+    return numbers
 
 
 def of_dim(bright: Path, dim: Path) -> dict[str, MeasuredNumber]:
-    """The 15 dB test from an experiment in good light and one in dim light.
+    """Loss by dim light (the 15 dB test): gaze error of the proposed run in dim over
+    good light, and of other runs over the proposed one in dim light.
 
     Args:
         bright: experiment.json in good light.
+        dim: experiment.json in dim light.
 
     Raises:
         StoreError: no such file, or of another version.
     """
-    good, poor = (
-        {r["name"]: r["gaze_axial_deg"] for r in _json(p, "runs")["runs"]}
-        for p in (bright, dim)
+    bright_deg, dim_deg = (
+        {run["name"]: run["gaze_axial_deg"] for run in _load_json(path, "runs")["runs"]}
+        for path in (bright, dim)
     )
-    words = "gaze under axial slip, networks trained in good light"
-    found = {}
-    if "proposed" in poor:
-        found["dim/proposed"] = MeasuredNumber(
-            poor["proposed"] / good["proposed"], conditions=words
+    conditions = "gaze under axial slip, networks trained in good light"
+    numbers = {}
+    if "proposed" in dim_deg:
+        numbers["dim/proposed"] = MeasuredNumber(
+            dim_deg["proposed"] / bright_deg["proposed"], conditions=conditions
         )
         for name in ("hyperbolic", "double_helix"):
-            if name in poor:
-                found[f"dim/{name}"] = MeasuredNumber(
-                    poor[name] / poor["proposed"], conditions=words
+            if name in dim_deg:
+                numbers[f"dim/{name}"] = MeasuredNumber(
+                    dim_deg[name] / dim_deg["proposed"], conditions=conditions
                 )
-    return found
+    return numbers
 
 
 def of_optics(path: Path) -> dict[str, MeasuredNumber]:
-    """Measurements in an optics.json whose lenses are named by :data:`ROLES`,
-    hyperbolic first.
+    """Measurements in an optics.json whose lenses are named by :data:`ROLES`: scene
+    ratios, and axial information over that of the hyperbolic lens.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         StoreError: no such file, or of another version.
     """
-    content = _json(path, "lenses", "angles_deg", "normalisation")
-    found: dict[str, MeasuredNumber] = {}
-    base = content["lenses"].get("hyperbolic")
+    content = _load_json(path, "lenses", "angles_deg", "normalisation")
+    numbers: dict[str, MeasuredNumber] = {}
+    reference = content["lenses"].get("hyperbolic")
     for name, values in content["lenses"].items():
         for kind, (value, low, high) in values["scene_ratios"].items():
-            found[f"scenes/{kind}/{name}"] = MeasuredNumber(
+            numbers[f"scenes/{kind}/{name}"] = MeasuredNumber(
                 value, low, high, "same states, images of equal light"
             )
-        if base is None:
+        if reference is None:
             continue
         for i, angle in enumerate(content["angles_deg"]):
-            one, other = (sum(v["information_per_mm2"][i][0]) for v in (values, base))
-            words = f"honest I(z), {content['normalisation']} normalisation, pixels not binned"
-            found[f"information/{angle:g}/{name}"] = MeasuredNumber(
-                one / other, conditions=words
+            information, reference_information = (
+                sum(lens_values["information_per_mm2"][i][0])
+                for lens_values in (values, reference)
             )
-    return found
+            conditions = f"honest I(z), {content['normalisation']} normalisation, pixels not binned"
+            numbers[f"information/{angle:g}/{name}"] = MeasuredNumber(
+                information / reference_information, conditions=conditions
+            )
+    return numbers
 
 
 def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumber]:
-    """Fig. 8 a from the rows of result.json of the proposed and the hyperbolic run:
-    errors at equal budgets.
+    """Fig. 8 a: proposed over hyperbolic run, as error at the least common budget and
+    as compute for the best slippage of the hyperbolic run.
+
+    Args:
+        rows: rows of result.json by role of the run.
     """
     if not {"proposed", "hyperbolic"} <= rows.keys():
         return {}
-    ours, theirs = (
-        {r["budget_mmacs"]: r for r in rows[name] if "axial_slip_mm" in r}
+    ours, reference = (
+        {row["budget_mmacs"]: row for row in rows[name] if "axial_slip_mm" in row}
         for name in ("proposed", "hyperbolic")
     )
-    shared = sorted(ours.keys() & theirs.keys())
+    shared = sorted(ours.keys() & reference.keys())
     if not shared:
         return {}
-    least = shared[0]
-    error = ours[least]["axial_slip_mm"] / theirs[least]["axial_slip_mm"]
-    found = {
+    budget = shared[0]
+    error = ours[budget]["axial_slip_mm"] / reference[budget]["axial_slip_mm"]
+    numbers = {
         "fig8a/error": MeasuredNumber(
-            error, conditions=f"axial slippage at {ours[least]['mmacs']:.1f} MMACs"
+            error, conditions=f"axial slippage at {ours[budget]['mmacs']:.1f} MMACs"
         )
     }
-    goal = min(r["axial_slip_mm"] for r in theirs.values())
-    best = min(r["mmacs"] for r in theirs.values() if r["axial_slip_mm"] == goal)
-    enough = [r["mmacs"] for r in ours.values() if r["axial_slip_mm"] <= goal]
-    if enough:
-        found["fig8a/compute"] = MeasuredNumber(
-            min(enough) / best, conditions=f"axial slippage of {goal:.2f} mm or less"
+    goal = min(row["axial_slip_mm"] for row in reference.values())
+    reference_mmacs = min(
+        row["mmacs"] for row in reference.values() if row["axial_slip_mm"] == goal
+    )
+    sufficient = [row["mmacs"] for row in ours.values() if row["axial_slip_mm"] <= goal]
+    if sufficient:
+        numbers["fig8a/compute"] = MeasuredNumber(
+            min(sufficient) / reference_mmacs,
+            conditions=f"axial slippage of {goal:.2f} mm or less",
         )
-    return found
+    return numbers
 
 
-def _json(path: Path, *needed: str) -> dict[str, Any]:
+def _load_json(path: Path, *needed: str) -> dict[str, Any]:
+    """Content of a JSON file; refuses one that lacks a ``needed`` key."""
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -293,24 +306,23 @@ def _json(path: Path, *needed: str) -> dict[str, Any]:
 
 
 def frozen_parts(folder: Path) -> tuple[str, ...]:
-    """Parts of a finished run that did not move, from its result.json.
+    """Parts of a finished run that were frozen in training, from its result.json.
 
     Args:
-        folder: of the files.
+        folder: folder of the run.
 
     Raises:
         TrainingError: no finished run, or of another version.
     """
     finished.rows_of(folder)  # refuses what is missing, cut short or empty
-    return tuple(_json(folder / "result.json").get("frozen", ()))
+    return tuple(_load_json(folder / "result.json").get("frozen", ()))
 
 
 def image_tolerance(folders: Sequence[Path]) -> float:
-    """Of the true image that lenses of these runs are compared by: the largest that one
-    of them is imaged at.
+    """Image tolerance to compare the lenses of runs at: the largest of theirs.
 
     Args:
-        folders: of finished runs.
+        folders: folders of finished runs.
     """
     return max(
         runs.load_run_settings(folder / "run.toml").optics.image_tolerance
@@ -322,90 +334,112 @@ def image_tolerance(folders: Sequence[Path]) -> float:
 def gaze_rows(
     folder: Path, *, people: int = PEOPLE, seed: int = 5
 ) -> list[dict[str, Any]]:
-    """Gaze errors of every network of a finished run on people whom training never saw,
-    after a calibration on a fifth of their frames; least compute first.
+    """Gaze errors of every network of a finished run on new people, least compute
+    first.
+
+    Each person is calibrated on a fifth of the frames. A network that reads the optic
+    axis is calibrated on ``BEFORE`` further people first.
 
     Args:
-        folder: of the files. people: how many. seed: of the random generator.
+        folder: folder of the run.
+        people: number of test people.
+        seed: seed of their frames.
+
+    Returns:
+        Rows of compute in MMACs, conditions, and mean error ``personal_deg``.
 
     Raises:
         TrainingError: no finished run, half written, or of another version.
     """
     settings = runs.load_run_settings(folder / "run.toml")
-    going = runs.resume_run(folder / "checkpoint.safetensors", settings)
-    trainer, net = going.trainer, going.trainer.model.net
+    run = runs.resume_run(folder / "checkpoint.safetensors", settings)
+    trainer = run.trainer
+    net = trainer.model.net
 
     def simulate(stream: int, count: int, seed: int) -> Shown:
-        found = bench.simulate_people(going.scenes(stream), count, EACH, seed=seed)
-        return found, assess.frames_of(trainer, found)
+        people_frames = bench.simulate_people(
+            run.scenes(stream), count, EACH, seed=seed
+        )
+        return people_frames, assess.frames_of(trainer, people_frames)
 
     def read(architecture: Architecture, shown: Shown) -> NetworkReadings:
-        one = assess.predict_frames(net, architecture, shown[1], settings.inner)
-        return bench.read_of(shown[0], one.centre, one.slip_mm, one.axis)
+        prediction = assess.predict_frames(net, architecture, shown[1], settings.inner)
+        return bench.read_of(
+            shown[0], prediction.centre, prediction.slip_mm, prediction.axis
+        )
 
     test = simulate(TEST, people, seed)
-    before = functools.cache(lambda: simulate(CALIBRATION, BEFORE, seed + 1))
-    known = assess.training_frames(trainer)
-    out = []
+    calibration_people = functools.cache(
+        lambda: simulate(CALIBRATION, BEFORE, seed + 1)
+    )
+    training = assess.training_frames(trainer)
+    results = []
     for row in sorted(finished.rows_of(folder), key=lambda r: float(r["mmacs"])):
-        architecture = finished.architecture_of(row["architecture"], going, folder)
-        finished.restore_network(going, row, folder)
-        recalibrate_batch_norm(net, architecture, known)
-        found, how = read(architecture, test), None
-        if found.axis_deg is not None:
-            others = before()
-            how = bench.learn_from_people(others[0], read(architecture, others))
-        error = bench.calibrated_error_deg(test[0], found, how=how)
-        about = {"people": people, "frames_each": EACH, "seed": seed}
-        out.append({"mmacs": row["mmacs"], **about, "personal_deg": error})
-    return out
+        architecture = finished.architecture_of(row["architecture"], run, folder)
+        finished.restore_network(run, row, folder)
+        recalibrate_batch_norm(net, architecture, training)
+        readings = read(architecture, test)
+        calibrator = None
+        if readings.axis_deg is not None:
+            people_before = calibration_people()
+            calibrator = bench.learn_from_people(
+                people_before[0], read(architecture, people_before)
+            )
+        error = bench.calibrated_error_deg(test[0], readings, how=calibrator)
+        test_settings = {"people": people, "frames_each": EACH, "seed": seed}
+        results.append({"mmacs": row["mmacs"], **test_settings, "personal_deg": error})
+    return results
 
 
 def of_gaze(content: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
-    """Table 2 from gaze.json, {folder: {rows of :func:`gaze_rows`}}: the first run is
-    the proposed one. Networks of others are not rebuilt here.
+    """Table 2: gaze errors of the fastest and of the most accurate network of the first
+    run, the proposed one.
 
     Args:
-        content: of gaze.json.
+        content: content of gaze.json, {folder: {"rows": rows of :func:`gaze_rows`}}.
     """
     for entry in content.values():
         rows = entry["rows"]
         accurate = min(rows, key=lambda r: float(r["personal_deg"]))
         return {
-            "table2/proposed_efficient": _measured(rows[0]),
-            "table2/proposed_accurate": _measured(accurate),
+            "table2/proposed_efficient": _gaze_number(rows[0]),
+            "table2/proposed_accurate": _gaze_number(accurate),
         }
     return {}
 
 
-def _measured(row: Mapping[str, Any]) -> MeasuredNumber:
-    words = f"{row['mmacs']:.1f} MMACs, {row['people']} synthetic people, seed {row['seed']}, {WORDS}"
-    return MeasuredNumber(float(row["personal_deg"]), conditions=words)
+def _gaze_number(row: Mapping[str, Any]) -> MeasuredNumber:
+    """Gaze error of one row of :func:`gaze_rows` with its conditions."""
+    conditions = f"{row['mmacs']:.1f} MMACs, {row['people']} synthetic people, seed {row['seed']}, {WORDS}"
+    return MeasuredNumber(float(row["personal_deg"]), conditions=conditions)
 
 
 def of_ablations(
     ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, MeasuredNumber]:
-    """Fig. 8b: compute of a run with one part frozen over ours, at the best axial
-    slippage that the frozen one reaches.
+    """Fig. 8b: compute of a run with one part frozen over that of the joint run, at the
+    best axial slippage of the frozen run.
 
-    ours: rows of the joint run. others: {frozen part: rows}. A part whose best error
-    ours never reaches is left out.
+    A part whose best error the joint run does not reach is left out.
+
+    Args:
+        ours: rows of the joint run.
+        others: rows by frozen part.
     """
-    found = {}
+    numbers = {}
     for part, rows in others.items():
-        best = min(rows, key=lambda r: float(r["axial_slip_mm"]))
-        enough = [
-            float(r["mmacs"])
-            for r in ours
-            if r["axial_slip_mm"] <= best["axial_slip_mm"]
+        best = min(rows, key=lambda row: float(row["axial_slip_mm"]))
+        sufficient = [
+            float(row["mmacs"])
+            for row in ours
+            if row["axial_slip_mm"] <= best["axial_slip_mm"]
         ]
-        if enough:
-            words = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(enough):.1f} MMACs"
-            found[f"fig8b/{part}"] = MeasuredNumber(
-                float(best["mmacs"]) / min(enough), conditions=words
+        if sufficient:
+            conditions = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(sufficient):.1f} MMACs"
+            numbers[f"fig8b/{part}"] = MeasuredNumber(
+                float(best["mmacs"]) / min(sufficient), conditions=conditions
             )
-    return found
+    return numbers
 
 
 def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -417,15 +451,15 @@ def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, A
     Raises:
         TrainingError: two runs with the same part frozen.
     """
-    seen: dict[str, Path] = {}
+    owner: dict[str, Path] = {}
     for folder in folders:
         parts = frozen_parts(folder)
         if len(parts) != 1:
             continue
         (part,) = parts
-        if part in seen:
+        if part in owner:
             raise TrainingError(
-                f"{seen[part]} and {folder} both have {part} frozen; give one of them"
+                f"{owner[part]} and {folder} both have {part} frozen; give one of them"
             )
-        seen[part] = folder
+        owner[part] = folder
         yield part, finished.rows_of(folder)

@@ -38,7 +38,7 @@ COLOURS = ("#e9812b", "#1f6feb", "#2a9d8f", "#6d597a")
 def plot_axial_information(
     axial: Mapping[str, AxialInformation], setting: ResolvedSettings
 ) -> bytes:
-    """I(z) over depth on axis, a panel for each binning.
+    """PNG of I(z) over depth on axis, a panel for each binning.
 
     Args:
         axial: axial information by name of the lens.
@@ -48,9 +48,9 @@ def plot_axial_information(
     count = len(setting.binnings)
     figure, panels = make_figure(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
     for k, (panel, binning) in enumerate(zip(panels[0], setting.binnings, strict=True)):
-        for name, found in axial.items():
-            mean = float(found.information[0, k].mean())
-            shown = found.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
+        for name, info in axial.items():
+            mean = float(info.information[0, k].mean())
+            shown = info.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
             panel.semilogy(depths, shown, ".-", label=f"{name}: {mean:.3g}")
         panel.set(
             title=f"{binning} × {binning} of {setting.pixel_um:g} µm",
@@ -64,7 +64,8 @@ def plot_axial_information(
 def plot_depth_slices(
     axial: Mapping[str, AxialInformation], setting: ResolvedSettings
 ) -> bytes:
-    """Light along x over depth, lenses down, binnings across.
+    """PNG of line spreads over depth (PSF on axis summed over y, in pixels), lenses
+    down, binnings across.
 
     Args:
         axial: axial information by name of the lens.
@@ -77,29 +78,29 @@ def plot_depth_slices(
         squeeze=False,
         sharex=True,
     )
-    (low, high), half = setting.depths_mm, HALF * setting.window_um
-    for place, (row, (name, found)) in enumerate(
+    (low, high), half_um = setting.depths_mm, HALF * setting.window_um
+    for row_number, (row, (name, info)) in enumerate(
         zip(panels, axial.items(), strict=True)
     ):
         for panel, binning in zip(row, setting.binnings, strict=True):
             pixel = setting.pixel_um * binning
-            pixels = int(2 * half / pixel) // 2 * 2 + 1
+            pixels = int(2 * half_um / pixel) // 2 * 2 + 1
             weights = pixel_weights(
-                found.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels
+                info.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels
             )
-            light = found.slices @ weights.to(found.slices).mT
-            shown = (light / light.amax(1, keepdim=True).clamp_min(1e-30)).numpy()
+            light = info.slices @ weights.to(info.slices).mT
+            relative = (light / light.amax(1, keepdim=True).clamp_min(1e-30)).numpy()
             edge = pixels * pixel / 2
             panel.imshow(
-                shown,
+                relative,
                 extent=(-edge, edge, high, low),
                 aspect="auto",
                 vmin=0,
                 interpolation="nearest",
             )
             panel.grid(False)
-            panel.set_xlim(-half, half)
-            if place == 0:
+            panel.set_xlim(-half_um, half_um)
+            if row_number == 0:
                 panel.set_title(f"{binning} × {binning} of {setting.pixel_um:g} µm")
         row[0].set_ylabel(f"{name}\ndepth / mm", fontsize=8)
     for panel in panels[-1]:
@@ -108,8 +109,8 @@ def plot_depth_slices(
 
 
 def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
-    """The first scene through every lens: image, change with gaze, difference of gaze
-    and slip.
+    """PNG of the first scene through every lens: image, squared change with gaze,
+    squared difference of gaze and slip.
 
     Args:
         energies: scene sensitivity by name of the lens.
@@ -118,28 +119,33 @@ def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
     figure, panels = make_figure(
         len(energies), 3, size=(8.4, 0.5 + 2.6 * len(energies)), squeeze=False
     )
-    tops = [
+    maxima = [
         float(
-            torch.quantile(torch.stack([e.maps[k] for e in energies.values()]), 0.998)
+            torch.quantile(
+                torch.stack(
+                    [scene_energy.maps[k] for scene_energy in energies.values()]
+                ),
+                0.998,
+            )
         )
         for k in range(3)
     ]
-    for place, (row, (name, energy)) in enumerate(
+    for number, (row, (name, energy)) in enumerate(
         zip(panels, energies.items(), strict=True)
     ):
-        for panel, picture, top, title in zip(
-            row, energy.maps, tops, titles, strict=True
+        for panel, picture, maximum, title in zip(
+            row, energy.maps, maxima, titles, strict=True
         ):
-            grey = title == "image"
+            is_image = title == "image"
             panel.imshow(
                 picture.numpy(),
-                cmap="gray" if grey else "magma",
+                cmap="gray" if is_image else "magma",
                 vmin=0,
-                vmax=max(top, 1e-12),
+                vmax=max(maximum, 1e-12),
             )
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
-            if place == 0:
+            if number == 0:
                 panel.set_title(title)
         row[0].set_ylabel(name, fontsize=8)
     return figure_png(figure)
@@ -149,8 +155,8 @@ def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
 def plot_samples(
     source: FinishedRun, config: ExperimentConfig, *, subjects: int = 4
 ) -> bytes:
-    """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is
-    (green) and as it is read (red).
+    """Fig. 9 b: sensor frames of a few subjects in every slippage state, with the
+    outlines of the true (green) and the predicted (red) pupil.
 
     Args:
         source: finished run: its network, lens and sensor.
@@ -158,40 +164,50 @@ def plot_samples(
     """
     scenes = source.run.scenes(EXPERIMENT)
     net = source.run.trainer.model.net
-    prepared = prepare_run(source, image=config.image)
+    imager = prepare_run(source, image=config.image)
     slips = config.slips_mm
     sensor = experiment_sensors([source], config)[0]
     points = len(config.stimuli_deg)
-    count = min(subjects, config.subjects)
+    rows_shown = min(subjects, config.subjects)
     figure, axes = make_figure(
-        count, len(slips), size=(1.25 * len(slips), 1.3 * count), squeeze=False
+        rows_shown,
+        len(slips),
+        size=(1.25 * len(slips), 1.3 * rows_shown),
+        squeeze=False,
     )
     net.eval()
-    for subject in range(count):
+    for subject in range(rows_shown):
         rows = torch.arange(len(slips)) * points + (points // 2 + 5 * subject) % points
         states, _ = states_of(config, subject, scenes)
-        made = render_subject(states[rows], config, subject, scenes)
-        seen = image_frames(source, made, prepared, seed=subject, sensor=sensor)
-        logits = net(seen.frames, source.architecture).mask_logits
+        rendered = render_subject(states[rows], config, subject, scenes)
+        frames = image_frames(source, rendered, imager, seed=subject, sensor=sensor)
+        logits = net(frames.frames, source.architecture).mask_logits
         for column, slip in enumerate(slips):
-            ax = axes[subject, column]
-            ax.imshow(seen.frames[column, 0].numpy(), cmap="gray", extent=(0, 1, 1, 0))
+            panel = axes[subject, column]
+            panel.imshow(
+                frames.frames[column, 0].numpy(), cmap="gray", extent=(0, 1, 1, 0)
+            )
             for mask, level, colour in (
-                (seen.mask[column], 0.5, "#39d353"),
+                (frames.mask[column], 0.5, "#39d353"),
                 (logits[column], 0.0, "#ff4d4d"),
             ):
                 if mask.numel() and float(mask.min()) < level < float(
                     mask.max()
                 ):  # some networks give no mask
-                    n = mask.shape[-1]
-                    place = (np.arange(n) + 0.5) / n
-                    ax.contour(
-                        place, place, mask.numpy(), [level], colors=colour, linewidths=1
+                    side = mask.shape[-1]
+                    centres = (np.arange(side) + 0.5) / side
+                    panel.contour(
+                        centres,
+                        centres,
+                        mask.numpy(),
+                        [level],
+                        colors=colour,
+                        linewidths=1,
                     )
-            ax.set(xticks=[], yticks=[])
-            ax.grid(visible=False)
+            panel.set(xticks=[], yticks=[])
+            panel.grid(visible=False)
             if subject == 0:
-                ax.set_title(f"dx {slip[0]:g}, dz {slip[2]:g}", fontsize=7)
+                panel.set_title(f"dx {slip[0]:g}, dz {slip[2]:g}", fontsize=7)
     return figure_png(figure)
 
 
@@ -202,29 +218,31 @@ def plot_ambiguity(result: RunResult) -> bytes:
     Args:
         result: of one run.
     """
-    trial, percent = result.trial, result.centre * 100
+    trial = result.trial
+    percent = result.centre * 100
     figure, axes = make_figure(1, 3, size=(10.5, 3.2))
-    for ax, kind, along in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
-        keep = trial.group(kind)
-        dots = ax.scatter(
-            *percent[keep].T, c=trial.slip_mm[keep, along], s=2, cmap="viridis"
+    for panel, kind, axis_index in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
+        chosen = trial.group(kind)
+        dots = panel.scatter(
+            *percent[chosen].T, c=trial.slip_mm[chosen, axis_index], s=2, cmap="viridis"
         )
-        figure.colorbar(dots, ax=ax, label=f"d{'xyz'[along]} / mm")
-        ax.set(
+        figure.colorbar(dots, ax=panel, label=f"d{'xyz'[axis_index]} / mm")
+        panel.set(
             title=f"{kind} slippage",
             xlabel="pupil x / % of the frame",
             ylabel="pupil y / %",
         )
-        ax.invert_yaxis()
+        panel.invert_yaxis()
     for state in np.unique(trial.state):
-        mine = trial.state == state
-        middle, slip = percent[mine].mean(0), trial.slip_mm[mine][0]
-        low, high = np.percentile(percent[mine], [2.5, 97.5], axis=0)
-        reach = np.abs(np.stack([low - middle, high - middle]))
+        of_state = trial.state == state
+        mean = percent[of_state].mean(0)
+        slip = trial.slip_mm[of_state][0]
+        low, high = np.percentile(percent[of_state], [2.5, 97.5], axis=0)
+        half_range = np.abs(np.stack([low - mean, high - mean]))
         axes[2].errorbar(
-            *middle,
-            xerr=reach[:, :1],
-            yerr=reach[:, 1:],
+            *mean,
+            xerr=half_range[:, :1],
+            yerr=half_range[:, 1:],
             fmt="o",
             label=f"({slip[0]:g}, {slip[2]:g})",
         )
@@ -246,33 +264,33 @@ def plot_gaze_errors(results: Sequence[RunResult]) -> bytes:
         results: one a run.
     """
     figure, axes = make_figure(1, 2, size=(10.5, 3.8))
-    for ax, kind in zip(axes, (AXIAL, LATERAL), strict=True):
-        for i, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
+    for panel, kind in zip(axes, (AXIAL, LATERAL), strict=True):
+        for number, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
             trial = result.trial
-            shift = (i - (len(results) - 1) / 2) * 1.1
-            keep = trial.group(kind) & np.isfinite(result.gaze_deg)
-            for point in np.unique(trial.stimulus[keep]):
-                mine = keep & (trial.stimulus == point)
-                x, y = trial.stimulus_deg[mine][0]
-                ax.scatter(
+            shift = (number - (len(results) - 1) / 2) * 1.1
+            chosen = trial.group(kind) & np.isfinite(result.gaze_deg)
+            for point in np.unique(trial.stimulus[chosen]):
+                at_point = chosen & (trial.stimulus == point)
+                x, y = trial.stimulus_deg[at_point][0]
+                panel.scatter(
                     x + shift,
                     y,
-                    s=24 * result.gaze_deg[mine].mean() ** 2 + 2,
+                    s=24 * result.gaze_deg[at_point].mean() ** 2 + 2,
                     color=colour,
                     alpha=0.75,
                     lw=0,
                 )
-            ax.scatter(
+            panel.scatter(
                 [], [], color=colour, label=f"{result.name}: {result.gaze(kind):.2f}°"
             )
-        ax.set(
+        panel.set(
             title=f"{kind} slippage",
             xlabel="stimulus across / deg",
             ylabel="stimulus down / deg",
             aspect="equal",
         )
-        ax.invert_yaxis()
-        ax.legend(
+        panel.invert_yaxis()
+        panel.legend(
             loc="upper center",
             bbox_to_anchor=(0.5, -0.18),
             ncols=len(results),

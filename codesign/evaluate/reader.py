@@ -1,5 +1,5 @@
-"""A fixed, cheap reader that judges any lens by what a small reader really collects of
-the depth in its images.
+"""A fixed, small network that is trained on the images of any lens; its depth and
+slippage errors rate the lens.
 """
 
 import math
@@ -33,7 +33,7 @@ from metalens.core.report import Table
 from metalens.image import Imager, Sensor
 from metalens.lens import Lens
 
-SHARE = 0.9  # of the intervals
+SHARE = 0.9  # coverage of the intervals
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +81,8 @@ class ReaderConfig:
                 f"reader: pixels = {self.pixels}, pitch_um = {self.pitch_um}, electrons = {self.electrons}, fwhm_nm = "
                 f"{self.fwhm_nm}: need 32 to 512 pixels, pitch and electrons above 0, a width of 0 or more"
             )
-        near, far = self.depths_mm
-        if not 0 < near < far < math.inf:
+        nearest, farthest = self.depths_mm
+        if not 0 < nearest < farthest < math.inf:
             raise ConfigError(
                 f"reader: depths_mm = {self.depths_mm}: need 0 < least < largest"
             )
@@ -113,15 +113,15 @@ SLIP_SCALE_MM = torch.tensor([1.4, 1.2, 2.3])
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ReaderResult:
-    """What was read of the test frames through one lens; errors absolute, (frames,).
+    """Absolute errors of the reader on the test frames of one lens.
 
-    axial_mm, lateral_mm: of the slippage. window_mm: of the windows' depths, mean of
-    each frame; guess_mm: of the best
-    constant; trusted_mm: of the half of all windows whose depths it says it is surest
-    of. covered: share of frames
-    within the calibrated 90 % interval of the axial slippage, whose mean half width is
-    interval_mm. image_error: of the
-    image, relative L2.
+    axial_mm, lateral_mm: (frames,) error of the slippage.
+    window_mm: (frames,) error of the windows' depths, mean over a frame.
+    guess_mm: mean error of the best constant depth.
+    covered: share of frames within the calibrated 90 % interval of axial slippage.
+    interval_mm: mean half width of that interval.
+    image_error: relative L2 error of the images.
+    trusted_mm: mean depth error of the half of all windows of least predicted spread.
     """
 
     axial_mm: Tensor
@@ -134,7 +134,7 @@ class ReaderResult:
     trusted_mm: float
 
     def values(self) -> dict[str, float]:
-        """The numbers by name, axial with its 95 % interval by a bootstrap over the
+        """Mean errors by name, the axial one with its 95 % bootstrap interval over the
         frames.
         """
         low, high = bootstrap_interval(self.axial_mm.numpy())
@@ -147,8 +147,8 @@ class ReaderResult:
 
 
 class ReferenceReader(nn.Module):
-    """The blur branch and a small network from its depths to the slippage with the
-    logarithm of its spread.
+    """The blur branch, and a small network from its features to the slippage (x, y, z)
+    and the logarithms of its spreads, both in units of ``SLIP_SCALE_MM``.
     """
 
     def __init__(self) -> None:
@@ -168,8 +168,9 @@ class ReferenceReader(nn.Module):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LensFrames:
-    """Frames of one lens with their truth: pixels (n, 1, y, x), vergence (n, windows,
-    windows), slip_mm (n, 3).
+    """Sensor frames of one lens with their true values.
+
+    pixels: (n, 1, y, x). vergence: (n, windows, windows). slip_mm: (n, 3).
     """
 
     pixels: Tensor
@@ -179,8 +180,8 @@ class LensFrames:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JudgingScenes:
-    """Scenes that are the same for every lens: to learn from, to calibrate and to
-    judge.
+    """Scenes that are the same for every lens: to train on, to calibrate intervals on
+    and to test on.
     """
 
     learn: SceneSource
@@ -189,60 +190,70 @@ class JudgingScenes:
 
 
 def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> JudgingScenes:
-    """Render what all lenses of this sensor distance are judged on; size tells no
+    """Render the training, calibration and test scenes for lenses of one sensor
+    distance.
+
+    Frames are drawn at random scales, so that the size of an eye does not give away its
     depth.
 
     Args:
-        config: of the reference reader. sensor_distance_um: lens to sensor.
+        config: frames, sensor and light of the reader.
+        sensor_distance_um: distance from lens to sensor.
 
     Raises:
         ConfigError: eyes out of the depths of the PSFs.
     """
     scenes = SceneConfig(pixels=config.pixels, margin=config.margin)
-    near, far = (1e-3 * depth for depth in scenes.pupil_depths_um)
-    if not config.depths_mm[0] <= near <= far <= config.depths_mm[1]:
+    nearest, farthest = (1e-3 * depth for depth in scenes.pupil_depths_um)
+    if not config.depths_mm[0] <= nearest <= farthest <= config.depths_mm[1]:
         raise ConfigError(
-            f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {near:g} to {far:g} mm before the lens"
+            f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
         )
-    of = {
+    eye_scenes = {
         stream: EyeScenes(
             scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream
         )
         for stream in (EXPERIMENT, VALIDATION, TEST)
     }
     pools = {
-        stream: render_pool(one, config.test if stream != EXPERIMENT else config.pool)
-        for stream, one in of.items()
+        stream: render_pool(
+            stream_scenes, config.test if stream != EXPERIMENT else config.pool
+        )
+        for stream, stream_scenes in eye_scenes.items()
     }
-    kept = {
-        s: PoolScenes(p, config.margin, scenes.scale, config.seed + s)
-        for s, p in pools.items()
+    sources = {
+        s: PoolScenes(pool, config.margin, scenes.scale, config.seed + s)
+        for s, pool in pools.items()
     }
-    return JudgingScenes(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
+    return JudgingScenes(sources[EXPERIMENT], sources[VALIDATION], sources[TEST])
 
 
 def train_reader(
     optics: Imager, seen: JudgingScenes, config: ReaderConfig
 ) -> ReaderResult:
-    """Train the reader on images through ``optics`` and judge it; the same seed gives
-    the same numbers.
+    """Train the reference reader on images of a lens and test it.
+
+    The result is reproducible: torch's random state is seeded and restored.
 
     Args:
-        seen: scenes to learn from, to calibrate and to judge.
-        config: of the reference reader.
+        optics: imager of the lens.
+        seen: scenes to train, calibrate and test on.
+        config: frames, sensor and light of the reader.
     """
     threads.keep_memory()
     state = torch.get_rng_state()
     torch.manual_seed(config.seed)
     try:
-        made = ReferenceReader()
-        learn = lens_frames(optics, seen.learn, config, config.frames)
-        _learn_depth(made, learn)
-        _learn_slip(made, learn)
-        made.eval()
-        spare = lens_frames(optics, seen.calibrate, config, config.test)
-        judged = lens_frames(optics, seen.judge, config, config.test)
-        return _judge(made, spare, judged, float(getattr(optics, "error", math.nan)))
+        reader = ReferenceReader()
+        training = lens_frames(optics, seen.learn, config, config.frames)
+        _train_depth(reader, training)
+        _train_slip(reader, training)
+        reader.eval()
+        calibration = lens_frames(optics, seen.calibrate, config, config.test)
+        test = lens_frames(optics, seen.judge, config, config.test)
+        return _evaluate(
+            reader, calibration, test, float(getattr(optics, "error", math.nan))
+        )
     finally:
         torch.set_rng_state(state)
 
@@ -251,14 +262,17 @@ def train_reader(
 def lens_frames(
     optics: Imager, scenes: SceneSource, config: ReaderConfig, count: int
 ) -> LensFrames:
-    """``count`` frames of a stream through a lens onto the sensor, with noise of the
-    batch's number.
+    """Noisy sensor frames of a stream of scenes through a lens.
 
     Args:
-        optics: what forms the images. scenes: frames by number.
-        config: of the reference reader.
+        optics: imager of the lens.
+        scenes: source of the frames.
+        config: frames, sensor and light of the reader; seed of the noise.
+        count: frames, a multiple of 32.
     """
-    pixels, vergence, slip = [], [], []
+    pixels = []
+    vergence = []
+    slip = []
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
     for number in range(count // BATCH):
         batch = scenes.batch(number, BATCH)
@@ -281,106 +295,135 @@ def lens_frames(
     return LensFrames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
 
 
-def _learn_depth(
-    made: ReferenceReader, learn: LensFrames, *, passes: int = 4, batch: int = 64
+def _train_depth(
+    reader: ReferenceReader, training: LensFrames, *, passes: int = 4, batch: int = 64
 ) -> None:
-    for rows in _steps(
-        made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01
+    """Train the blur branch on the vergence of the windows."""
+    for rows in _training_batches(
+        reader.branch, len(training.pixels), passes, batch, rate=3e-3, decay=0.01
     ):
-        predicted, _ = made.branch(learn.pixels[rows])
-        losses.depth_loss(predicted, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
+        predicted, _ = reader.branch(training.pixels[rows])
+        losses.depth_loss(predicted, training.vergence[rows]).backward()  # type: ignore[no-untyped-call]
 
 
-def _learn_slip(
-    made: ReferenceReader, learn: LensFrames, *, passes: int = 12, batch: int = 128
+def _train_slip(
+    reader: ReferenceReader, training: LensFrames, *, passes: int = 12, batch: int = 128
 ) -> None:
-    features = _features(made, learn)
-    truth = learn.slip_mm / SLIP_SCALE_MM
-    for rows in _steps(made.slip, len(features), passes, batch, rate=2e-3, decay=0.03):
-        found = made.slip(features[rows])
-        miss = found[:, :3] - truth[rows]
-        spread = found[:, 3:].clamp(-4, 2)
-        uncertainty = (
-            0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread
+    """Train the slippage network on the features of the trained blur branch.
+
+    Loss: smooth L1 of the slippage + 0.1 times the Gaussian negative log-likelihood
+    exp(-2 l) r² / 2 + l of its residuals r, with log-spread l; it trains l alone.
+    """
+    features = _features(reader, training)
+    truth = training.slip_mm / SLIP_SCALE_MM
+    for rows in _training_batches(
+        reader.slip, len(features), passes, batch, rate=2e-3, decay=0.03
+    ):
+        prediction = reader.slip(features[rows])
+        residual = prediction[:, :3] - truth[rows]
+        log_spread = prediction[:, 3:].clamp(-4, 2)
+        likelihood = (
+            0.5 * residual.detach() ** 2 * torch.exp(-2 * log_spread) + log_spread
         ).mean()
-        loss = F.smooth_l1_loss(found[:, :3], truth[rows], beta=0.3) + 0.1 * uncertainty
+        loss = (
+            F.smooth_l1_loss(prediction[:, :3], truth[rows], beta=0.3)
+            + 0.1 * likelihood
+        )
         loss.backward()
 
 
-def _steps(
-    part: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float
+def _training_batches(
+    module: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float
 ) -> Iterator[Tensor]:
-    """Rows of every batch; a step of AdamW on one rising and falling rate after each."""
-    part.train()
-    optimiser = torch.optim.AdamW(part.parameters(), lr=rate, weight_decay=decay)
+    """Row numbers of each training batch; after each, one step of AdamW.
+
+    The caller computes the gradients between two batches. The learning rate follows one
+    cycle (OneCycleLR).
+
+    Args:
+        module: network to train.
+        count: number of training frames.
+        passes: passes over all frames.
+        batch: frames of a batch.
+        rate: highest learning rate.
+        decay: weight decay.
+    """
+    module.train()
+    optimiser = torch.optim.AdamW(module.parameters(), lr=rate, weight_decay=decay)
     total = passes * max(count // batch, 1)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total)
     for _ in range(passes):
         order = torch.randperm(count)
-        for k in range(max(count // batch, 1)):
+        for step in range(max(count // batch, 1)):
             optimiser.zero_grad(set_to_none=True)
-            yield order[k * batch : (k + 1) * batch]
+            yield order[step * batch : (step + 1) * batch]
             optimiser.step()
             schedule.step()
-    part.eval()
+    module.eval()
 
 
 @torch.no_grad()
-def _features(made: ReferenceReader, seen: LensFrames) -> Tensor:
+def _features(reader: ReferenceReader, frames: LensFrames) -> Tensor:
+    """(n, features) of the blur branch, 256 frames at a time."""
     parts = [
-        made.branch(seen.pixels[i : i + 256])[1]
-        for i in range(0, len(seen.pixels), 256)
+        reader.branch(frames.pixels[first : first + 256])[1]
+        for first in range(0, len(frames.pixels), 256)
     ]
     return torch.cat(parts)
 
 
 @torch.no_grad()
-def _judge(
-    made: ReferenceReader, spare: LensFrames, judged: LensFrames, image_error: float
+def _evaluate(
+    reader: ReferenceReader,
+    calibration: LensFrames,
+    test: LensFrames,
+    image_error: float,
 ) -> ReaderResult:
-    def slip(seen: LensFrames) -> tuple[Tensor, Tensor]:
-        found = made.slip(_features(made, seen))
-        return (found[:, :3] * SLIP_SCALE_MM - seen.slip_mm).abs(), found[:, 5].clamp(
-            -4, 2
-        ).exp() * SLIP_SCALE_MM[2]
+    """Errors on the test frames, with intervals from the calibration frames.
 
-    error, spread = slip(spare)
-    ratio = (error[:, 2] / spread).sort().values
-    reach = float(ratio[min(math.ceil(SHARE * (len(ratio) + 1)), len(ratio)) - 1])
-    error, spread = slip(judged)
+    The half width of a 90 % interval is the predicted spread times one factor: the
+    split-conformal quantile of |error| / spread over the calibration frames.
+    """
+
+    def slip(frames: LensFrames) -> tuple[Tensor, Tensor]:
+        prediction = reader.slip(_features(reader, frames))
+        error = (prediction[:, :3] * SLIP_SCALE_MM - frames.slip_mm).abs()
+        return error, prediction[:, 5].clamp(-4, 2).exp() * SLIP_SCALE_MM[2]
+
+    error, spread = slip(calibration)
+    ratios = (error[:, 2] / spread).sort().values
+    factor = float(ratios[min(math.ceil(SHARE * (len(ratios) + 1)), len(ratios)) - 1])
+    error, spread = slip(test)
     predicted = torch.cat(
         [
-            made.branch(judged.pixels[i : i + 256])[0]
-            for i in range(0, len(judged.pixels), 256)
+            reader.branch(test.pixels[first : first + 256])[0]
+            for first in range(0, len(test.pixels), 256)
         ]
     )
-    truth = blur.depth_mm(judged.vergence)
+    truth = blur.depth_mm(test.vergence)
     depth = blur.depth_mm(predicted[:, 0])
-    window = (depth - truth).abs()
-    trusted = window.flatten()[
-        (depth**2 * predicted[:, 1].exp()).flatten().argsort()[: window.numel() // 2]
-    ]
-    guess = float((truth - truth.median()).abs().mean())
-    inside = float((error[:, 2] <= reach * spread).float().mean())
-    wide = float((reach * spread).mean())
-    lateral, windows = error[:, :2].mean(1), window.mean((1, 2))
+    window_error = (depth - truth).abs()
+    variance = depth**2 * predicted[:, 1].exp()
+    surest = variance.flatten().argsort()[: window_error.numel() // 2]
+    trusted = window_error.flatten()[surest]
     return ReaderResult(
-        error[:, 2],
-        lateral,
-        windows,
-        guess,
-        inside,
-        wide,
-        image_error,
-        float(trusted.mean()),
+        axial_mm=error[:, 2],
+        lateral_mm=error[:, :2].mean(1),
+        window_mm=window_error.mean((1, 2)),
+        guess_mm=float((truth - truth.median()).abs().mean()),
+        covered=float((error[:, 2] <= factor * spread).float().mean()),
+        interval_mm=float((factor * spread).mean()),
+        image_error=image_error,
+        trusted_mm=float(trusted.mean()),
     )
 
 
 def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
-    """A row a lens.
+    """Table with a row of errors for each lens.
 
     Args:
-        found: result by name of the lens. config: of the reference reader.
+        found: result by name of the lens.
+        config: frames, sensor and light of the reader.
     """
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
     caption = (
@@ -397,23 +440,21 @@ def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
         "image error",
     )
     rows = []
-    for name, one in found.items():
-        v = one.values()
-        axial = (
-            f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
-        )
-        wide = f"±{v['interval_mm']:.2f} mm"
-        covered = f"{100 * v['covered']:.0f} %"
-        windows = f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})"
+    for name, result in found.items():
+        values = result.values()
+        axial = f"{values['axial_mm']:.2f} [{values['axial_low_mm']:.2f}, {values['axial_high_mm']:.2f}]"
+        interval = f"±{values['interval_mm']:.2f} mm"
+        covered = f"{100 * values['covered']:.0f} %"
+        windows = f"{values['window_mm']:.2f} ({values['guess_mm']:.2f})"
         rows.append(
             (
                 name,
                 axial,
-                wide,
+                interval,
                 covered,
-                f"{v['lateral_mm']:.2f}",
+                f"{values['lateral_mm']:.2f}",
                 windows,
-                f"{v['image_error']:.3f}",
+                f"{values['image_error']:.3f}",
             )
         )
     return Table(head, rows, caption)
@@ -422,10 +463,11 @@ def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
 def judge_lenses(
     lenses: dict[str, Lens], config: ReaderConfig
 ) -> Iterator[tuple[str, ReaderResult]]:
-    """Every lens by name, on the same scenes.
+    """Name and result of every lens, trained and tested on the same scenes.
 
     Args:
-        config: of the reference reader.
+        lenses: lenses by name.
+        config: frames, sensor and light of the reader.
 
     Raises:
         ConfigError: lenses of different sensor distances (through films: reduced),
@@ -436,15 +478,17 @@ def judge_lenses(
         raise ConfigError(
             f"lenses of different sensor distances {distances} um: compare lenses of one distance"
         )
-    seen = render_scenes(config, sensor_distance_um=next(iter(distances.values())))
-    near, far = config.depths_mm
-    about = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
+    scenes = render_scenes(config, sensor_distance_um=next(iter(distances.values())))
+    nearest, farthest = config.depths_mm
+    options = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
     for name, lens in lenses.items():
         yield (
             name,
             train_reader(
-                lens_imager(lens, config.camera, (near * 1e3, far * 1e3), **about),
-                seen,
+                lens_imager(
+                    lens, config.camera, (nearest * 1e3, farthest * 1e3), **options
+                ),
+                scenes,
                 config,
             ),
         )

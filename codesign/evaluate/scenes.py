@@ -1,5 +1,5 @@
-"""A free-form lens from Eq. 6 itself: triplets of rendered eyes through the PSFs of the
-phase, and their Fisher matrix.
+"""Objective of Eq. 6 for free-form lenses: Fisher matrix of rendered eyes, imaged
+through the PSFs of the phase.
 """
 
 import torch
@@ -19,7 +19,7 @@ from metalens.image import (
 from metalens.image import pupil as pupils
 from metalens.psf import integrate_pixels
 
-DEPTHS = 14  # of the PSF stack, at equal steps of 1/z over what the scenes hold
+DEPTHS = 14  # depths of the PSF stack, at equal steps of 1/z over those of the scenes
 
 
 class SceneObjective:
@@ -31,9 +31,11 @@ class SceneObjective:
         settings: ResolvedFisherSettings,
         scenes: SensitivityScenes | None = None,
     ) -> None:
-        """Render the triplets once.
+        """Render the scenes at anchor, gaze step and slip step.
 
         Args:
+            pupil: grid of the phase.
+            settings: of the Fisher objective.
             scenes: pixels, pitch and steps; by default 128 pixels of 9 um and
                 ``settings.scenes`` scenes.
         """
@@ -46,10 +48,13 @@ class SceneObjective:
             states, self.scenes, sensor_distance_um=pupil.sensor_distance_um
         )
         self.frames = [view.frames for view in views]
-        seen = torch.cat([f.depth_um[f.coverage > 0] for f in self.frames])
-        low, high = float(seen.min()), float(seen.max())
+        visible_um = torch.cat(
+            [frame.depth_um[frame.coverage > 0] for frame in self.frames]
+        )
+        nearest_um = float(visible_um.min())
+        farthest_um = float(visible_um.max())
         self.depths_um = 1 / torch.linspace(
-            1 / low, 1 / high, DEPTHS, dtype=torch.float64
+            1 / nearest_um, 1 / farthest_um, DEPTHS, dtype=torch.float64
         )
         self.size = (
             int(min(self.scenes.window_um, pupil.period_um) / self.scenes.pitch_um)
@@ -60,72 +65,79 @@ class SceneObjective:
         self.grid = Grid(
             (self.scenes.pixels, self.scenes.pixels),
             self.scenes.pitch_um,
-            (low, high),
+            (nearest_um, farthest_um),
             window=self.size,
         )
-        sharp = [f.radiance.sum(1) for f in self.frames]
-        self.reference = self._fisher(sharp).diagonal().detach()
+        pinhole_images = [frame.radiance.sum(1) for frame in self.frames]
+        self.reference = self._fisher(pinhole_images).diagonal().detach()
 
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Eq. 6 without its last term, and the encircled energy at every depth (which
-        the design holds instead).
+        """Loss of Eq. 6 without its compactness term, and the encircled energy at every
+        depth, which the design constrains instead.
 
         Args:
             phase_rad: (y, x) phase on the nodes of the pupil.
             focus_um: source distance that the phase images onto the sensor.
-            generator: of the draws.
+            generator: unused, the scenes are fixed.
         """
-        found, energy = self.evaluate(phase_rad, focus_um)
-        return found.value, energy
+        loss, energy = self.evaluate(phase_rad, focus_um)
+        return loss.value, energy
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """Minus Eq. 6 as the figure to climb.
+        """Score of a design, minus the loss of Eq. 6, and its encircled energy.
 
         Args:
             phase_rad: (y, x) phase on the nodes of the pupil.
             focus_um: source distance that the phase images onto the sensor.
         """
         with torch.no_grad():
-            found, energy = self.evaluate(phase_rad, focus_um)
-        return DesignScore(-found.value[None], energy)
+            loss, energy = self.evaluate(phase_rad, focus_um)
+        return DesignScore(-loss.value[None], energy)
 
     def evaluate(self, phase_rad: Tensor, focus_um: float) -> tuple[OpticsLoss, Tensor]:
-        """The loss with its parts, and the encircled energy at every depth.
+        """Loss of Eq. 6 with its parts, and the encircled energy at every depth.
+
+        The Fisher matrix is that of the images, scaled by its diagonal for an ideal
+        pinhole image.
 
         Args:
             phase_rad: (y, x) phase on the nodes of the pupil.
             focus_um: source distance that the phase images onto the sensor.
         """
-        sample = self.settings.sample_um
+        sample_um = self.settings.sample_um
         samples = min(
-            int((self.size + 2) * self.scenes.pitch_um / sample),
-            int(self.pupil.period_um / sample),
+            int((self.size + 2) * self.scenes.pitch_um / sample_um),
+            int(self.pupil.period_um / sample_um),
         )
         fine = pupils.psf(
             phase_rad,
             self.pupil,
             depths_um=self.depths_um,
             focus_um=focus_um,
-            sample_um=sample,
+            sample_um=sample_um,
             samples=samples,
         )
-        energy = encircled_energy(fine, sample, radius_um=self.settings.radius_um)
+        energy = encircled_energy(fine, sample_um, radius_um=self.settings.radius_um)
         stack = integrate_pixels(
-            fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size)
+            fine, sample_um, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size)
         )
         optics = uniform_imager(stack, self.depths_um, self.grid)
         images = [optics(frames) for frames in self.frames]
         scale = torch.sqrt(self.reference)
         fisher = self._fisher(images) / torch.outer(scale, scale)
-        found = optics_loss(
+        loss = optics_loss(
             fisher, energy, orthogonality=self.settings.orthogonality, compactness=0.0
         )
-        return found, energy
+        return loss, energy
 
     def _fisher(self, images: list[Tensor]) -> Tensor:
-        """(2, 2) Fisher matrix of gaze and slip, summed over scenes of one mean."""
-        anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
+        """(2, 2) Fisher matrix of gaze and slip: products of the image changes, summed
+        over pixels and scenes; images are scaled to the mean of the anchor.
+        """
+        anchor, gaze, slip = (
+            image / images[0].mean((1, 2), keepdim=True) for image in images
+        )
         steps = torch.stack([(gaze - anchor).flatten(), (slip - anchor).flatten()])
         return steps @ steps.mT
