@@ -44,7 +44,7 @@ def imager(
 ) -> Imager:
     """Imager of a lens: its PSFs over the field, depth and spectrum as kernels.
 
-    PSFs are computed at nodes of the field and of 1/z, and expanded in low-rank kernels.
+    PSFs are computed at nodes of the field and of 1/z and expanded in low-rank kernels.
     Behind a stop that dims the image, the tolerance is lowered by that factor, at most
     8, where enough nodes are allowed.
 
@@ -66,7 +66,8 @@ def imager(
             pixel counts), ``scalar``,
             ``auto``: one scalar where its error, ``parts["polarisation"]``, is below
             the tolerance, else the flux, or
-            ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
+            ``vector``: |Ex|² + |Ey|² + |Ez|², as a thin absorbing film on the sensor's
+            plane detects.
         device: where PSFs and kernels are computed and frames will be; a few PSFs are
             judged on the processor.
 

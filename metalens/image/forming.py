@@ -34,8 +34,8 @@ COVER_SHARE, COVER_FEWEST = 0.3, 12
 class Imager:
     """A lens ready to image frames of one grid.
 
-    grid, plan: where the scene is sampled, and where the PSFs are known (one node on the
-        axis, and no wavelengths, where they were given for all of the field).
+    grid, plan: samples of the scene, and nodes of the PSFs. A uniform imager has one
+        node, on the axis, and no wavelengths.
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1.
     energy: (rows, columns, depths) relative illumination E of each; of a uniform imager
         the same at all depths.
@@ -104,7 +104,7 @@ class Imager:
         return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
-        """(frames, y, x) image by shift-invariant PSFs; constant radiance stays constant.
+        """(frames, y, x) image by uniform PSFs, which keep constant radiance constant.
 
         Blurred light is divided by blurred coverage. The mean radiance is subtracted
         before and added after, so that rounding grows with the contrast alone.
@@ -134,7 +134,7 @@ class Imager:
         return self._returned(self._blurred(light, depth_um, illuminated=True), light)
 
     def _continued(self, *parts: Tensor) -> list[Tensor]:
-        """Frames with the border samples repeated outward, so that no PSF ends there."""
+        """Frames with border samples repeated outward, so that no PSF ends at them."""
         size = tuple(n + 2 * self.grid.margin for n in self.grid.samples)
         if tuple(parts[0].shape[-2:]) != size:
             raise SceneError(
@@ -290,7 +290,7 @@ def _assembled(
 
 
 def occlude(light: Tensor, cover: Tensor) -> Tensor:
-    """(frames, y, x) radiance of a near sheet over a far sheet that continues behind it.
+    """(frames, y, x) radiance of a near sheet over a far sheet that extends behind it.
 
     (L_near + b L_far) / (C_near + b C_far) with b = (1 - C_near) / C_far, which fades
     where the far sheet covers less than :data:`FAINT`.

@@ -30,8 +30,8 @@ MOST = 57  # nodes along an axis of the field or of 1/z
 # Largest errors of interpolation, and of aliased light, whatever the tolerance:
 # uniformly illuminated planes then vary by half a percent between the nodes.
 NODES_MOST, FOLDED_MOST = 0.005, 0.001
-# Places (x, y) in half fields, out to the rims, where a blur is widest and the transform
-# aliases most light.
+# Places (x, y) in half fields, out to the rims, where a blur is widest and most light
+# is aliased.
 PLACES = (
     (-0.95, -0.3),
     (-0.7, 0.6),
@@ -93,7 +93,7 @@ class Grid:
         )
 
     def crop(self, whole: Tensor) -> Tensor:
-        """(…, y, x) samples of an image of the whole frame, without margin and spare."""
+        """(…, y, x) image without margin and spare, from one of the whole frame."""
         edge = self.margin + self.spare
         y, x = (slice(edge, edge + n) for n in self.samples)
         return whole[..., y, x]

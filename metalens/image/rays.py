@@ -19,8 +19,7 @@ VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rays:
-    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the
-    lens.
+    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64.
 
     width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed:
     root of the power that faces let
@@ -242,7 +241,7 @@ def source_paths(
     """Optical path from each source to the lens at (x, y), less that to its middle, um.
 
     More depths than ``VERGENCES`` are interpolated between that many Chebyshev points
-    of 1/z. The path is smooth in 1/z, and singular only where a source touches the lens.
+    of 1/z. The path is smooth in 1/z but for a source that touches the lens.
 
     Args:
         layers: films and stop of the lens.

@@ -138,7 +138,7 @@ def area_spreading(media: Media, p: Any) -> Any:
 
 
 def ray_direction(media: Media, reach_um: Any) -> Any:
-    """p of the ray that reaches so far: the inverse of :func:`lateral_reach`, to rounding.
+    """p of the ray of this reach: the inverse of :func:`lateral_reach`, to rounding.
 
     Args:
         media: plane-parallel media.
@@ -355,8 +355,8 @@ class SaddleCorrection:
     lowest first.
 
     rarest: index n in s = √(n² - p²).
-    normal, left: (n,) values of s, ascending, and the relative error of the amplitude at
-        each, estimated with fewer plane waves.
+    normal, left: (n,) values of s, ascending, and the relative error of the amplitude
+        at each, estimated with fewer plane waves.
     """
 
     rarest: float
