@@ -149,7 +149,7 @@ def gathering_error(
 ) -> float:
     """Relative error of averaging pillars over cells; 0 of a wave without pillars.
 
-    PSFs of sum 1 are compared with exact sums over every pillar, on the same samples.
+    PSFs of sum 1 are compared with those of :func:`psf_stack` of every pillar, on the same samples.
     The error includes light of other orders in the window.
 
     Args:
@@ -181,7 +181,7 @@ def gathering_error(
                 (place, at[1]),
                 (window.step_um, count + 1, finer),
             )
-            exact = share @ light @ share.T
+            reference = share @ light @ share.T
             psf = psfs(
                 optics,
                 place[None],
@@ -192,7 +192,7 @@ def gathering_error(
             errors.append(
                 texture_error(
                     psf / psf.sum((-1, -2), keepdim=True),
-                    exact / exact.sum((-1, -2), keepdim=True),
+                    reference / reference.sum((-1, -2), keepdim=True),
                 )
             )
             lights.append(psf.sum((-1, -2)))
@@ -220,7 +220,7 @@ def _of_pillars(
     at: tuple[Tensor, Tensor],
     sampled: tuple[float, int, int],
 ) -> Tensor:
-    """(depths, y, x) PSFs of point sources as exact sums over every pillar, float64.
+    """(depths, y, x) PSFs of point sources from every pillar, float64.
 
     The window is centred on the field point.
 
