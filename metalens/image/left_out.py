@@ -149,7 +149,8 @@ def gathering_error(
 ) -> float:
     """Relative error of averaging pillars over cells; 0 of a wave without pillars.
 
-    PSFs of sum 1 are compared with those of :func:`psf_stack` of every pillar, on the same samples.
+    PSFs of sum 1 are compared with those of every pillar (:func:`psf_stack`), on the
+    same samples.
     The error includes light of other orders in the window.
 
     Args:

@@ -13,18 +13,15 @@ from metalens.optics import media
 from metalens.psf.spectrum import SpectralNodes
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
-# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
-# amplitude 0.986, -0.066 rad at sine
-# 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is
-# metalens.design.neighbours.estimate_neighbour_coupling
+# coupling of unequal neighbours in solved rows of 12 and 8 pillars of the default cell:
+# amplitude 0.986, -0.066 rad at sine 0.236, and 0.959, -0.100 rad at 0.354; that of
+# another cell is metalens.design.neighbours.estimate_neighbour_coupling
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst
 # pillar off resonance
 ANGLE = 2.5
-RINGS, SPOKES = (
-    8,
-    24,
-)  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
+# of an aperture over which obliquity is averaged: to rounding at NA 0.6, 25 degrees
+RINGS, SPOKES = 8, 24
 HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
@@ -38,15 +35,15 @@ CURES = {  # of an error above the tolerance, by its largest part
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """What is known of pillars that the model of a lens leaves out; by default rough,
-    of another cell.
+    """Sizes of the pillar effects that the model of a lens leaves out.
 
-    neighbours: rows of the lens's own pillars, whose factor its PSFs hold (at the rows'
-    wavelength and at normal
-        incidence; what other light changes is counted); or (a, b) of the factor 1 + a s
-        + b s² on
-        light that unlike neighbours turn by the sine s, which they lack.
-    angle: relative change of t over sin² of the incidence. of: whose numbers they are.
+    By default they are rough, those of another cell.
+
+    neighbours: solved rows of the lens's own pillars, whose coupling its PSFs include at
+        the rows' wavelength and at normal incidence. Or (a, b) of the coupling
+        1 + a s + b s² of light that is deflected by the sine s, which its PSFs lack.
+    angle: relative change of t over sin² of the incidence.
+    of: name of the cell that the numbers are of.
     """
 
     neighbours: NeighbourRows | tuple[complex, complex] = NEIGHBOURS
@@ -65,29 +62,25 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is
-    not known.
+    """Relative L2 errors of the PSFs by cause, the worst over angles; nan if unknown.
 
-    numerical: of the propagation, measured on the result. sampling: of the integration
-    over the cells of the window.
-    spectrum: of the quadrature over wavelengths. source: of a source of finite size,
-    whose points are taken as alike.
-    polarisation: of one scalar in place of both polarisations (of plain maps only that
-    of films, which let s and p
-        through unlike, measured on the light); of both, of rays whose fields are those
-        on their way to the window's
-        middle. neighbours: of pillars taken as if each stood among its like, or of the
-        factor of solved rows where the
-        lens holds them. angle: of pillars that answer as at normal incidence. glass: of
-        light that goes twice between
-        two faces. proxy: of pillars that answer by a curve, which follows those of
-        their library to some error, and of
-        what their solver knows of them; of two sizes that alone. posterior: of a lens
-        that
-    was fitted to captures, what its parameters leave open.
-    outside: share of the light that falls beside the window, worst over angles and
-    depths; a PSF of sum 1 does not
-        show it, so it is in no total.
+    numerical: of the propagation, measured on the result.
+    sampling: of the integration over the cells of the window.
+    spectrum: of the quadrature over wavelengths.
+    source: of one PSF for all points of a finite source.
+    polarisation: of one scalar for both polarisations. Of plain maps only that of
+        films, which transmit s and p differently, measured on the light. Of both
+        polarisations, that of rays to the window's middle for the whole window.
+    neighbours: of pillars computed in a lattice of equal pillars; or of the coupling of
+        solved rows where the lens has them.
+    angle: of pillars that respond as at normal incidence.
+    glass: of light reflected twice between two faces.
+    stop: of the shadow of the aperture stop.
+    proxy: of the response curve against the library, and of the library's solver; of
+        pillars of two sizes the second alone.
+    posterior: of a lens that was fitted to captures, by the spread of its parameters.
+    outside: share of the light outside the window, worst over angles and depths. A PSF
+        of sum 1 does not show it, so it is in no total.
     """
 
     numerical: float
