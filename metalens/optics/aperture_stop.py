@@ -20,12 +20,12 @@ BENT, INNER = 0.005, 0.055  # of PSFs of 60 lenses against plane waves through t
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A round hole, about the axis or beside it.
+    """A round hole in an opaque plane, on the axis or off it.
 
-    radius_um: of the hole. distance_um: from its plane to that of the pillars, through
-    the films in front of them that
-    lie there, the last one at the pillars, and air where they are thinner. centre_um:
-    (x, y) of its middle.
+    radius_um: of the hole.
+    distance_um: from its plane to that of the pillars, through the films between them,
+        the last film at the pillars, and through air where the films are thinner.
+    centre_um: (x, y) of its middle.
 
     Raises:
         ConfigError: a radius that is not above 0, a distance below 0, a centre that is
@@ -136,8 +136,9 @@ def stop_shadow(
 
     Args:
         stop: the aperture stop.
-        media_um: media from source and from stop to the pillars, and
-        tangents: of the ray, both as in :func:`stop_crossing`.
+        media_um: media from source and from stop to the pillars; each may be None, as
+            in :func:`stop_crossing`.
+        tangents: (x, y) in air of the ray to the middle of the lens.
         wavelength_um: in vacuum.
         at_um: (x, y) of the pillars, numpy arrays that broadcast.
         width_um: of a place, over which the amplitude is averaged.
@@ -278,7 +279,7 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyped-def]
-    """Write S at places (x, y) of the stop into ``out`` (:func:`edge_diffraction_factor`).
+    """Write S of :func:`edge_diffraction_factor` at places (x, y) into ``out``.
 
     The edge at the nearest point of the rim is straight, with its curvature to first
     order.
@@ -316,7 +317,7 @@ def edge_diffraction_factor(
     radius_um: float,
     wavelength_um: float,
 ) -> Array:
-    """Complex amplitude S of light diffracted by the edge of the stop, mean over a width.
+    """Complex amplitude S of light diffracted by the stop's edge, mean over a width.
 
     S is derived in :mod:`metalens.optics.aperture_stop`: Fresnel's straight edge, with
     the curvature of the rim to first order.
