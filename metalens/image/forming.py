@@ -51,7 +51,7 @@ class Imager:
         kernels (low rank) alone.
     stray: light of other diffraction orders, None where the lens has no pillars.
     asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are
-        wanted; None for all.
+        computed; None for all.
     """
 
     grid: Grid

@@ -72,7 +72,7 @@ def optics_loss(
     floor: float = 1e-8,
     relative: bool = True,
 ) -> OpticsLoss:
-    """Loss of the optics (paper Eq. 6): more information, less correlation, a small PSF.
+    """Loss of the optics (paper Eq. 6): information, correlation and compactness.
 
     -Σ log F_ii + orthogonality Σ_{i≠j} F_ij² + compactness (1 - E)
 
@@ -188,7 +188,7 @@ def axial_information(
         positions: of the image on the pixels, along each axis.
 
     Raises:
-        SceneError: less than three samples a pixel, or no position asked for.
+        SceneError: less than three samples a pixel, or less than one position.
     """
     if sample_um > pixel_um / 3 * (1 + 1e-9):
         raise SceneError(

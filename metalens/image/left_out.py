@@ -163,7 +163,7 @@ def gathering_error(
     if not isinstance(wave, PillarWave):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
-    # points per sample, at half of Nyquist's step: a sample's triangle is then summed to
+    # points per sample, at half of Nyquist's step: its triangle is then summed to
     # 2e-3 of fine detail, at Nyquist's step to 5e-3
     finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
     most = 256  # points along an axis

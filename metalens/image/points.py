@@ -98,7 +98,7 @@ class Samples:
     """Along one axis: (2 samples, points) light of the points of a transform on each
     sample, and below it the
     derivative of that by the sample's place in um; place_um: (samples,) from where the
-    rays are seen."""
+    rays are traced to."""
 
     both: Tensor
     place_um: Tensor
@@ -182,28 +182,24 @@ def psfs(
     shift_um: tuple[float, float] = (0.0, 0.0),
     finest_um: float = math.inf,
 ) -> Tensor:
-    """(points, depths, h, w) share of the light on the aperture that falls on each
-    sample from a source of that size.
+    """(points, depths, h, w) PSFs: share of the light on the aperture on each sample.
 
-    The aperture is the stop where the layers have one.
-
-    Source and sample are squares of one step: the light of a point, twice averaged over
-    a square (sinc² in frequency,
-    kept up to its second zero, 2 / step). Constant radiance is then kept to rounding,
-    and nothing rings.
+    The aperture is the stop where the layers have one. Source and sample are squares of
+    one step: the light of a point is averaged twice over a square (sinc² in frequency,
+    cut off at its second zero, 2 / step). Constant radiance then stays constant to
+    rounding, without ringing.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with
-            tangents at_um / reduced
-            distance through the middle of the lens comes from. Without films that is
-            the chief ray.
-        depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in
-            vacuum.
-        shift_um: the window's rays are seen from a place (x, y) beside
-            :func:`metalens.image.rays.landing_offset`;
-            the samples stay. A check of
-            what the transform neglects.
+        optics: wave of the lens, layers and lens-sensor distance.
+        at_um: (points, [x, y]) float64 on the sensor. The source lies on the ray with
+            tangents at_um / reduced distance through the middle of the lens. Without
+            films that is the chief ray.
+        depths_um: (depths,) of the sources, inf for collimated light.
+        wavelength_um: in vacuum.
+        window: samples of the PSFs and components of the field.
+        shift_um: (x, y) from :func:`metalens.image.rays.landing_offset` to where the
+            window's rays are traced; the samples stay. It checks the second-order
+            transform.
         finest_um: shortest wavelength of a spectrum, whose nodes are then those of all
             its wavelengths.
 
@@ -398,7 +394,7 @@ def _on_samples(
 
 
 def _around(to_samples: tuple[Samples, ...]) -> Tensor:
-    """([x, y], h, w) places of the samples from where the rays are seen, um."""
+    """([x, y], h, w) places of the samples from where the rays are traced to, um."""
     y, x = torch.meshgrid(to_samples[1].place_um, to_samples[0].place_um, indexing="ij")
     return torch.stack([x, y])
 

@@ -21,12 +21,14 @@ VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 class Rays:
     """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64.
 
-    width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed:
-    root of the power that faces let
-    through; away_um: path to the window's centre less that along the normal. offset_p:
-    (nodes,) p - p0 along x and along
-    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`path_derivatives`
-    there.
+    x_um, y_um: where the rays leave the lens.
+    width_um: of a node on the lens.
+    whole: √spread of each ray, 0 beyond the rim.
+    passed: root of the power that passes the faces.
+    away_um: path to the window's centre less that along the normal.
+    offset_p: (nodes,) p - p0 along x and along y.
+    middle: (x, y) of p0, the middle of the pupil.
+    slope, curvature: :func:`path_derivatives` at p0.
     """
 
     x_um: Tensor
@@ -339,5 +341,5 @@ def _paths_by_depth(
 
 
 def _chord(before: Media, reach2: Any) -> Any:
-    """:func:`metalens.optics.media.path_of_reach` of the squared reach; NumPy or torch."""
+    """:func:`metalens.optics.media.path_of_reach` of the squared reach, um."""
     return media.path_of_reach(before, reach2**0.5)

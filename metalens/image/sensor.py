@@ -120,7 +120,7 @@ def expose(
     generator: torch.Generator | None = None,
     reads: float | Tensor = 1.0,
 ) -> Tensor:
-    """Electrons read from pixels: Poisson counts, clipped at full well, plus read noise.
+    """Electrons read from pixels: Poisson counts up to full well, plus read noise.
 
     The read noise is Gaussian, of √reads times that of one read. Saturated pixels have
     gradient 0.
@@ -199,8 +199,8 @@ def low_snr(
 ) -> Sensor:
     """The sensor with exposure and ambient light that give a signal-to-noise ratio.
 
-    It is 20 log10(S / √(S (1 + ambient_ratio) + read noise²)) dB, with S the mean signal
-    electrons at the sensor's own pitch. As in the paper's low-light test, the ambient
+    It is 20 log10(S / √(S (1 + ambient_ratio) + read noise²)) dB, with S the mean
+    signal electrons at the sensor's own pitch. As in the paper's low-light test, the ambient
     light enters before the photon noise.
 
     Args:

@@ -199,7 +199,7 @@ class PillarWave:
         return self._with_neighbours(self._pillars(wavelength_um, tilt)[0])
 
     def _with_neighbours(self, t: Tensor) -> Tensor:
-        """Transmission t times the mean coupling of its neighbours, if the lens has it."""
+        """Transmission t times the mean coupling of neighbours, if there is any."""
         if self.lens.neighbours is None:
             return t
         return t * among.mean_coupling(
@@ -290,7 +290,7 @@ class PillarWave:
         return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
 
     def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
-        """(3, cells y, cells x) means per cell: Re and Im of t exp(-i carrier), and fill.
+        """(3, cells y, cells x) means per cell: Re, Im of t exp(-i carrier), and fill.
 
         As :func:`metalens.image.compiled.cells`, with derivatives and the factor of
         neighbours.

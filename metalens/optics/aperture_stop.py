@@ -191,10 +191,11 @@ def stop_model_error(
 ) -> float:
     """Relative L2 error of a PSF by the approximations of :func:`stop_shadow`.
 
-    (``BENT`` + ``INNER`` zones) / N, with N = R² / (λ L) the Fresnel number. The next term of the edge's
-    curvature is ½ <(y² / 2R)²> d²E/ds², 0.04 |w| / N at the edge. Waves from the whole
-    edge also meet near the axis, with the amplitude of the light at the axis itself. A
-    defocused lens shows them: a blur of radius b on the sensor spans R b / (λ d) zones.
+    (``BENT`` + ``INNER`` zones) / N, with N = R² / (λ L) the Fresnel number. The next
+    term of the edge's curvature is ½ <(y² / 2R)²> d²E/ds², 0.04 |w| / N at the edge.
+    Waves from the whole edge also meet near the axis, with the amplitude of the light
+    at the axis itself. A defocused lens shows them: a blur of radius b on the sensor
+    spans R b / (λ d) zones.
 
     Args:
         stop: the aperture stop.

@@ -70,7 +70,7 @@ class Media:
 
     @property
     def reduced_um(self) -> float:
-        """Σ t / n: the distance in air that bends paraxial light as much."""
+        """Σ t / n, um: the distance in air of equal paraxial refraction."""
         return sum(t / n for n, t in self.layers)
 
 

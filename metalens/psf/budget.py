@@ -1,4 +1,4 @@
-"""What the error of a PSF is made of: what was computed, and what the model leaves out."""
+"""Error budget of a PSF: errors of the computation, and of the model."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -39,7 +39,7 @@ class LeftOut:
 
     By default they are rough, those of another cell.
 
-    neighbours: solved rows of the lens's own pillars, whose coupling its PSFs include at
+    neighbours: solved rows of the lens's own pillars. Its PSFs include their coupling at
         the rows' wavelength and at normal incidence. Or (a, b) of the coupling
         1 + a s + b s² of light that is deflected by the sine s, which its PSFs lack.
     angle: relative change of t over sin² of the incidence.
@@ -363,7 +363,7 @@ def _crossed(aperture: float, psf: Array, area: float) -> float:
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:
-    """(p,) Gauss nodes of sin θ, (p,) weights p dp, and (ρ,) k ρ over some ten rings."""
+    """(p,) Gauss nodes of sin θ, (p,) weights p dp, (ρ,) k ρ over some ten rings."""
     t, w = np.polynomial.legendre.leggauss(64)
     edge = min(aperture, 0.999)
     p = edge * (t + 1) / 2

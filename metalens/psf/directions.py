@@ -1,4 +1,4 @@
-"""Light far behind a lens, over direction cosines: beam deflectors, holograms, axicons."""
+"""Far field of a lens over direction cosines: beam deflectors, holograms, axicons."""
 
 import math
 from dataclasses import dataclass
@@ -305,8 +305,8 @@ def _beams(
     """Brightest beams in turn, the circle of each set to 0 before the next is searched.
 
     A beam has ``SPOT`` of its circle's light within half the radius, which rings and
-    haze have not. The search ends at ``BEAMS`` circles, or at one of less than ``LEAST`` of the
-    light.
+    haze have not. The search ends at ``BEAMS`` circles, or at a circle of less than
+    ``LEAST`` of the light.
 
     Args:
         exact: sum over pillars that refines each direction.

@@ -98,7 +98,7 @@ def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
     """(depth, 2, 2) matrices from the source, in its sizes, to the sensor, in um.
 
     M of the module's heading times the size; rows and columns are [x, y]. It is the
-    product of ∂(place on the sensor)/∂(tangents) and ∂(tangents)/∂(place of the source).
+    product of ∂(place on sensor)/∂(tangents) and ∂(tangents)/∂(place of source).
 
     Args:
         case: direction, depths and films.

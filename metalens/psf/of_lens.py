@@ -40,7 +40,7 @@ from metalens.psf.stack import psf_stack
 PLACES = 9  # along each axis of the window, to which optical paths are computed
 ROWS = 64  # rows of pillars whose delays are computed
 NEARBY = 1e-4  # relative step of the wavelength for those delays
-TRIES = 3  # at a spectrum: the light of one tells the paths for the next
+TRIES = 3  # at a spectrum: the PSFs of one give the paths for the next
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 

@@ -124,8 +124,8 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
 class MeasuredSpectrum:
     """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
 
-    beside: share of the light that is left out at its ends, outside of what the pillars
-    are known for.
+    beside: share of the light that is cut off at its ends, outside the wavelengths of
+        the pillars' library.
     """
 
     wavelengths_um: Array
@@ -136,7 +136,7 @@ class MeasuredSpectrum:
 def read_measured_spectrum(
     files: Sequence[Path], *, within_um: tuple[float, float]
 ) -> MeasuredSpectrum:
-    """Normalised product of measured curves (LED, filter, sensor) on their common range.
+    """Normalised product of measured curves (LED, filter, sensor), where all exist.
 
     A file has two columns, wavelength in nm and value, separated by commas, semicolons
     or blanks. Lines that start with # or with a word are skipped. Where semicolons,
@@ -314,7 +314,7 @@ def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
     """(n,) largest error of the mean of exp(2πi·path/λ), over paths up to each span.
 
     Args:
-        nodes: wavelengths with weights, and the spectrum of which they are a quadrature.
+        nodes: wavelengths with weights, and the spectrum that they integrate.
         span_um: (n,) largest difference of optical paths, um.
     """
     if nodes.source is None:
@@ -432,7 +432,7 @@ def _refusal(
 
 
 def library_sweep_hint(nm: Array) -> str:
-    """The key of CELL.toml that sweeps a library over wavelengths (n,) in nm, ascending."""
+    """The key of CELL.toml that sweeps a library over wavelengths (n,), nm, ascending."""
     ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
     return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 

@@ -151,7 +151,7 @@ def has_faces(case: PropagationCase) -> bool:
 def rays_to(
     case: PropagationCase, at_um: tuple[Array, Array], index: float | None = None
 ) -> Tensor:
-    """(3, y, x) unit vectors of the rays from places of the lens to the window's centre.
+    """(3, y, x) unit vectors of the rays from the lens to the window's centre.
 
     Args:
         case: geometry, media and window of the propagation.
@@ -222,7 +222,7 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
 def apart_maps(
     maps: tuple[Tensor, Tensor], fields: NeighbourJonesFactors
 ) -> tuple[Tensor, Tensor]:
-    """(…, wavelength · 3, y, x) phase in rad and transmission of x to x, y to y, x to y.
+    """(…, wavelength · 3, y, x) phase, rad, and transmission of xx, yy and xy.
 
     Args:
         maps: (…, wavelength, y, x) phase and transmission of the pillars.
@@ -265,7 +265,7 @@ def _polarisations(a: Tensor) -> list[Tensor]:
 
 
 def of_flux(electric: Tensor, b: Tensor) -> VectorPupil:
-    """Eight pupils and signs whose Σ sign |·|² is the flux E_x H_y - E_y H_x, H = b x E.
+    """Eight pupils and signs; Σ sign |·|² is the flux E_x H_y - E_y H_x, H = b x E.
 
     E_x H_y = ((E_x + H_y)² - (E_x - H_y)²) / 4 of each polarisation, and so for y.
 
