@@ -383,7 +383,7 @@ def _node_count(
     tolerance. Up to ``MOST`` nodes are tried.
 
     Args:
-        at: function from places 0 … 1 of the line to PSFs (places, depths, h, w).
+        psfs_at: function from places 0 … 1 of the line to PSFs (places, depths, h, w).
         tolerance: relative L2 error.
         cure: words for what to narrow, in the error's text.
     """

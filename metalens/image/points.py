@@ -328,7 +328,7 @@ def _shown(
 
     Args:
         fluxes: (depths, size, size) |U|², then the flux along x and y if any.
-        ends: transform to the samples along x and along y.
+        to_samples: transform to the samples along x and along y.
         moves: shift and divergence of each flux (:func:`_move`).
     """
     plain, change = _moved(fluxes[0], to_samples, moves[0])
@@ -383,7 +383,7 @@ def _on_samples(
 
     Args:
         power: (…, size, size) light on the points of the padded transform.
-        ends: transform to the samples along x and along y.
+        to_samples: transform to the samples along x and along y.
     """
     along_x, along_y = to_samples
     height, width = len(along_y.place_um), len(along_x.place_um)
@@ -404,7 +404,7 @@ def _move(slope: Tensor, to_samples: tuple[Samples, ...]) -> Tensor:
 
     Args:
         slope: (2, 2, 2) symmetric matrices slope_j, 1/um.
-        ends: transform to the samples along x and along y; δ is their place.
+        to_samples: transform to the samples along x and along y; δ is their place.
     """
     delta = _around(to_samples)
     gradient = torch.einsum("jab,byx->jayx", slope.to(delta), delta)
@@ -419,7 +419,7 @@ def _moved(
 
     Args:
         power: (depths, size, size) |U|², or a component of the flux.
-        ends: transform to the samples along x and along y.
+        to_samples: transform to the samples along x and along y.
         move: shift s along x and y, and its divergence (:func:`_move`).
     """
     plain, by_x, by_y = _on_samples(power, to_samples)

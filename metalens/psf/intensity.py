@@ -525,7 +525,7 @@ def _noisy_power(powers: list[float], mixing: tuple[Array, Array] | None) -> flo
 
     Args:
         powers: sum of squares of each map's transmission.
-        at: signs and factors of the mixing at the nodes; each factor counts at its
+        mixing: signs and factors of the mixing at the nodes; each factor counts at its
             largest. None for one scalar.
     """
     if mixing is None:
