@@ -38,8 +38,16 @@ def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
-    """Row by row, so that the sum of a depth stays in the nearest cache; of a row what
-    the aperture lets through.
+    """Write weight · exp(2πi (turns + mix @ paths)) into ``out``, real and imaginary.
+
+    Row by row, so that the sum of a depth stays in the first cache. Of each row only
+    the part from the first to the last open node is computed.
+
+    Args:
+        weight, turns: (nodes, nodes) amplitude and phase / 2π.
+        paths: (few, nodes, nodes) over the wavelength.
+        mix: (depths, few).
+        out: (depths, nodes, nodes, 2) float32.
     """
     depths, few = mix.shape
     line = np.empty(turns.shape[1])
@@ -64,12 +72,16 @@ def cells(
     polynomials: response.Polynomials,
     block: tuple[int, int, int],
 ) -> Array:
-    """(3, cells y, cells x) float32 means over square cells of |T| cos(φ - ideal), |T| sin(φ - ideal), and of pillars.
+    """(3, cells y, cells x) float32 means over square cells of sites.
+
+    Of |T| cos(φ - ideal), of |T| sin(φ - ideal), and of 1 at each pillar.
 
     Args:
-        ideal_rad: (y, x) float32. polynomials: of the diameters, by
+        diameter_um: (y, x) diameters, 0 at sites without a pillar.
+        ideal_rad: (y, x) float32 carrier phase.
+        polynomials: phase and |T| of the diameters, by
             :func:`metalens.lens.response.response_polynomials`.
-        block: pillars along a cell, and rows and columns of the first one that lie
+        block: sites along a cell, and rows and columns of the first cell that lie
             before the map.
     """
     side, *before = block
@@ -86,7 +98,15 @@ def cells(
 
 @numba.njit(cache=True, fastmath=response.FASTMATH, nogil=True, error_model="numpy")
 def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped-def]
-    """Some rows of cells; sums of a row of them are held in float64."""
+    """Write some rows of cells into ``out``, each summed in float64.
+
+    Args:
+        d, ideal: (y, x) diameters and carrier phase.
+        polynomials: phase and |T| of the diameters.
+        block: sites along a cell, and rows and columns before the map.
+        out: (3, rows, cells x) float32.
+        first: number of the first row of cells.
+    """
     side, top, left = block
     x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
     for row in range(out.shape[1]):
@@ -96,15 +116,15 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
             min((first + row + 1) * side - top, d.shape[0]),
         ):
             for start in range(0, d.shape[1], PART):
-                some = d[i, start : start + PART]
-                n = some.size
-                put(some, polynomials, x[:n], phase[:n], level[:n])
+                diameters = d[i, start : start + PART]
+                n = diameters.size
+                put(diameters, polynomials, x[:n], phase[:n], level[:n])
                 for j in range(n):
                     t = (phase[j] - ideal[i, start + j]) / (2 * np.pi)
                     c, s = sincos_turns32(t - np.rint(t))
                     x[j], phase[j] = level[j] * c, level[j] * s
                 for j in range(n):
-                    if some[j] > 0:
+                    if diameters[j] > 0:
                         cell = (start + j + left) // side
                         sums[0, cell] += x[j]
                         sums[1, cell] += phase[j]
@@ -115,15 +135,16 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
 def weigh_sources(
     content: Tensor, depth_um: Tensor, table: Tensor, vergence: tuple[float, float]
 ) -> Tensor:
-    """(rank, *content) float32 sources times the weights of all kernels at their depths.
+    """(rank, *content) float32 sources times the kernels' weights at their depths.
 
     Args:
-        content: (frames, kinds, *sheets, y, x). depth_um: the same with 1 kind; or both
-            (frames, y, x).
-        table: (codes, rank) weights at equal steps of 1/z. vergence: (first, last) 1/z
-            of them.
+        content: (frames, kinds, *sheets, y, x) light and coverage; or (frames, y, x).
+        depth_um: the same with 1 kind; or (frames, y, x).
+        table: (codes, rank) weights at equal steps of 1/z.
+        vergence: (first, last) 1/z of the table, 1/um.
     """
-    frame, frames = content.shape[-2:], len(content)
+    frame = content.shape[-2:]
+    frames = len(content)
     kinds = content.numel() // max(depth_um.numel(), 1)
     light = content.reshape(frames, kinds, -1, *frame).contiguous().numpy()
     depth = depth_um.reshape(frames, -1, *frame).contiguous().numpy()
@@ -137,7 +158,16 @@ def weigh_sources(
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _weigh(light, depth, table, near, far, start, stop, out):  # type: ignore[no-untyped-def]
-    """Row by row: the weight of the nearest depth of the table."""
+    """Write light times the weight at the nearest depth of the table into ``out``.
+
+    Args:
+        light: (frames, kinds, sheets, y, x).
+        depth: (frames, sheets, y, x), um.
+        table: (rank, codes) weights at equal steps of 1/z.
+        near, far: 1/z of the first and last code.
+        start, stop: frames that are written.
+        out: (rank, frames, kinds, sheets, y, x).
+    """
     _, kinds, sheets, height, width = light.shape
     top = np.float32(table.shape[1] - 1)
     unit = top / max(near - far, np.float32(1e-30))
@@ -152,10 +182,10 @@ def _weigh(light, depth, table, near, far, start, stop, out):  # type: ignore[no
                 for k in range(table.shape[0]):
                     row = table[k]
                     for kind in range(kinds):
-                        given = light[n, kind, sheet, y]
-                        made = out[k, n, kind, sheet, y]
+                        source = light[n, kind, sheet, y]
+                        weighted = out[k, n, kind, sheet, y]
                         for x in range(width):
-                            made[x] = row[code[x]] * given[x]
+                            weighted[x] = row[code[x]] * source[x]
 
 
 def is_compilable(a: Tensor) -> bool:
@@ -169,7 +199,7 @@ def is_compilable(a: Tensor) -> bool:
 
 
 def is_plain_value(a: Tensor) -> bool:
-    """Whether it lies in main memory and carries no derivatives, backward or forward.
+    """Whether a tensor lies in main memory and carries no gradient of either mode.
 
     Args:
         a: a tensor.
@@ -178,7 +208,7 @@ def is_plain_value(a: Tensor) -> bool:
 
 
 def has_no_gradient(a: Tensor) -> bool:
-    """Whether it carries no derivatives, backward or forward.
+    """Whether a tensor carries no gradient, of reverse or of forward mode.
 
     Args:
         a: a tensor.

@@ -25,9 +25,9 @@ from metalens.optics import Layers
 from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
 from metalens.psf import spectrum as spectra
 
-# pixels of the frame at which the PSFs that are used are compared with true ones
+# samples of the frame at which interpolated PSFs are compared with true ones
 HELD_OUT = 16
-FEW = 5  # of them at which the transform and the components of the field are judged
+FEW = 5  # of them, at which the transform and the field's components are judged
 
 
 def imager(
@@ -42,12 +42,16 @@ def imager(
     polarisation: Polarisation = "auto",
     device: torch.device | str = "cpu",
 ) -> Imager:
-    """Prepare a lens for frames of a grid.
+    """Imager of a lens: its PSFs over the field, depth and spectrum as kernels.
+
+    PSFs are computed at nodes of the field and of 1/z and expanded in low-rank kernels.
+    Behind a stop that dims the image, the tolerance is lowered by that factor, at most
+    8, where enough nodes are allowed.
 
     Args:
-        scene_grid: samples, step, depths and margin of the image.
         lens: a lens file's content, or a wave (:class:`SmoothWave`,
             :class:`PillarWave`).
+        scene_grid: samples, step, depths and margin of the image.
         spectrum: a diode, curves as measured
             (:func:`metalens.psf.spectrum.read_measured_spectrum`),
             wavelengths with weights, or
@@ -62,7 +66,8 @@ def imager(
             pixel counts), ``scalar``,
             ``auto``: one scalar where its error, ``parts["polarisation"]``, is below
             the tolerance, else the flux, or
-            ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
+            ``vector``: |Ex|² + |Ey|² + |Ez|², as a thin absorbing film on the sensor's
+            plane detects.
         device: where PSFs and kernels are computed and frames will be; a few PSFs are
             judged on the processor.
 
@@ -83,21 +88,28 @@ def imager(
         layers = lens.layers if isinstance(lens, Lens) else Layers()
     wave = wave_of(lens, layers, scene_grid.window * scene_grid.step_um, distance_um)
     focus = wave.focus  # type: ignore[attr-defined]
-    optics = Optics(
-        wave, layers, focus.sensor_distance_um if distance_um is None else distance_um
-    )
+    if distance_um is None:
+        distance_um = focus.sensor_distance_um
+    optics = Optics(wave, layers, distance_um)
     source = spectrum or SpectralNodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
-    reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
-    middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
-    round_ = (
-        isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
+    reduced_um = layers.after(distance_um, focus.wavelength_um).reduced_um
+    middle_um = reduced_um * math.tan(field[0]), reduced_um * math.tan(field[1])
+    is_round = (
+        isinstance(wave, SmoothWave)
+        and wave.added_rad is None
+        and field == (0.0, 0.0)
+        and (layers.stop is None or layers.stop.centred)
     )
-    round_ = round_ and (layers.stop is None or layers.stop.centred)
-    given = optics, scene_grid, source, middle
 
     def build(within: float) -> Imager:
         plan = plan_nodes(
-            *given, tolerance=within, folds=round_, polarisation=polarisation
+            optics,
+            scene_grid,
+            source,
+            middle_um,
+            tolerance=within,
+            folds=is_round,
+            polarisation=polarisation,
         )
         stack, energy = node_psfs(optics, plan, device)
         with torch.no_grad():
@@ -111,15 +123,15 @@ def imager(
             prepared = build(tolerance / min(dimmer, 8))
     with torch.no_grad():
         parts = _error_parts(optics, prepared)
-    depth = float(1 / (1 / prepared.plan.depths_um).mean())
-    stray = stray_of(optics, scene_grid, depth, middle)
-    return replace(
-        prepared, parts=parts, stray=None if stray is None else stray.to(device)
-    )
+    depth_um = float(1 / (1 / prepared.plan.depths_um).mean())
+    stray = stray_of(optics, scene_grid, depth_um, middle_um)
+    if stray is not None:
+        stray = stray.to(device)
+    return replace(prepared, parts=parts, stray=stray)
 
 
 def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
-    """Refuse a field beyond 90 degrees and a polarisation that is none."""
+    """Raise for a field angle beyond 90 degrees or an unknown polarisation."""
     if not all(abs(angle) < math.pi / 2 for angle in field):
         raise SceneError(
             f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2"
@@ -133,13 +145,18 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
 def node_psfs(
     optics: Optics, plan: Plan, device: torch.device | str = "cpu"
 ) -> tuple[Tensor, Tensor]:
-    """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in
-    the wave's factor.
+    """PSFs of all nodes, each of sum 1, and their relative illumination.
+
+    Both are differentiable in the wave's factor. A round lens on a square grid is
+    computed on one eighth of the nodes.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         plan: field nodes, depths and wavelengths.
-        device: torch device.
+        device: where they are computed.
+
+    Returns:
+        ((rows, columns, depths, h, w) PSFs, (rows, columns, depths) illumination).
     """
     if plan.folds:
         light = _folded(optics, plan, device)
@@ -152,31 +169,35 @@ def node_psfs(
 
 
 def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
-    """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes'
-    windows.
+    """PSFs of sum 1, and relative illumination: light in the window times cos⁴ θ.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        light: (rows, columns, depths, h, w) share of the light on each sample.
+        optics: wave of the lens, layers and lens-sensor distance.
         plan: field nodes, depths and wavelengths.
     """
     total = light.sum((-2, -1))
     wave = float(plan.waves.wavelengths_um.mean())
     cosine4 = _cosine4(optics, plan.places_um, plan.depths_um, wave)
-    return light / total[..., None, None], total * cosine4.reshape(total.shape).to(
-        total
-    )
+    illumination = total * cosine4.reshape(total.shape).to(total)
+    return light / total[..., None, None], illumination
 
 
 def _cosine4(
     optics: Optics, at_um: Tensor, depths_um: Tensor, wavelength_um: float
 ) -> Tensor:
-    """(…, depths) cos⁴ of the field angles of places (…, [x, y]), at the middle of the
-    stop where there is one.
+    """(…, depths) cos⁴ θ = 1 / (1 + tan² θ)² of the field angles of field points.
+
+    θ is the angle at the middle of the stop, or of the lens without a stop.
+
+    Args:
+        optics: layers and lens-sensor distance.
+        at_um: (…, [x, y]) field points on the sensor, um.
+        depths_um: (depths,) source depths, um.
+        wavelength_um: in vacuum, um.
     """
-    tangents = (
-        at_um.numpy()
-        / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    )
+    after = optics.layers.after(optics.distance_um, wavelength_um)
+    tangents = at_um.numpy() / after.reduced_um
     rays = [
         optics.layers.through_middle(tangents, depth, wavelength_um)
         for depth in depths_um.tolist()
@@ -185,30 +206,41 @@ def _cosine4(
 
 
 def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
-    """PSFs of a round lens on a square grid about its axis, from one eighth of the
-    nodes.
+    """(nodes, nodes, depths, h, w) PSFs of a round lens on a square grid on its axis.
+
+    One eighth of the nodes is computed. The others follow by mirror images in x, in y
+    and in the diagonal.
+
+    Args:
+        optics: wave of the lens, layers and lens-sensor distance.
+        plan: field nodes, depths and wavelengths.
+        device: where they are computed.
     """
     count = len(plan.x_um)
     half = (count + 1) // 2
     pairs = [(i, j) for i in range(half) for j in range(i, half)]
-    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs]).to(
-        device
+    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs])
+    octant = sum_over_spectrum(
+        optics, at.to(device), plan.depths_um, plan.waves, plan.window
     )
-    few = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
-    out = few.new_zeros(count, count, *few.shape[1:])
-    for (i, j), psf in zip(pairs, few, strict=True):
-        for row, up in ((i, psf), (count - 1 - i, psf.flip(-2))):
-            for column, whole in ((j, up), (count - 1 - j, up.flip(-1))):
-                out[row, column], out[column, row] = whole, whole.mT
+    out = octant.new_zeros(count, count, *octant.shape[1:])
+    for (i, j), psf in zip(pairs, octant, strict=True):
+        for row, in_row in ((i, psf), (count - 1 - i, psf.flip(-2))):
+            for column, image in ((j, in_row), (count - 1 - j, in_row.flip(-1))):
+                out[row, column] = image
+                out[column, row] = image.mT
     return out
 
 
 def textured_frames(grid: Grid) -> Frames:
-    """One frame of two sheets over all depths, of mean 1 with a 1/f texture of standard
-    deviation 0.3.
+    """One test frame of two sheets with a 1/f texture of mean 1 and deviation 0.3.
+
+    The near sheet covers part of the far one with a soft border. Depths vary linearly
+    in 1/z over each sheet, within the grid's range. The random texture is always the
+    same.
 
     Args:
-        grid: samples, step, depths and margin of the image.
+        grid: samples, depths and margin of the image.
     """
     draw = torch.Generator().manual_seed(11)
     y, x = (n + 2 * grid.margin for n in grid.samples)
@@ -232,25 +264,36 @@ def textured_frames(grid: Grid) -> Frames:
 
 
 def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
-    """Errors by cause, at places, depths and wavelengths that no node holds.
+    """Relative L2 errors of an imager by cause, at places and depths between its nodes.
 
-    Those that count by the light of a place are over the whole frame's light: more of
-    an image that is dimmer than it.
+    PSFs of ``HELD_OUT`` random samples and four depths are computed directly and
+    compared. Errors relative to the light of a place are scaled by
+    :func:`image_dimming`, as an image can be dimmer than the whole frame.
+
+    Args:
+        optics: wave of the lens, layers and lens-sensor distance.
+        prepared: imager whose error is estimated.
+
+    Returns:
+        dict: error by name; see ``parts`` of :class:`Imager`.
     """
-    plan, draw = prepared.plan, np.random.default_rng(7)
+    plan = prepared.plan
+    draw = np.random.default_rng(7)
     pixels = np.floor(draw.random((HELD_OUT, 2)) * prepared.grid.frame).astype(int)
     rows, columns = (
         np.linspace(float(nodes[0]), float(nodes[-1]), n)
         for n, nodes in zip(prepared.grid.frame, (plan.y_um, plan.x_um), strict=True)
     )
     at = torch.from_numpy(np.stack([columns[pixels[:, 1]], rows[pixels[:, 0]]], -1))
-    near, far = 1 / plan.depths_um[[0, -1]]
-    depths = 1 / (near + (far - near) * torch.tensor([0, 0.13, 0.58, 1]).double())
+    nearest, farthest = 1 / plan.depths_um[[0, -1]]
+    unit = torch.tensor([0, 0.13, 0.58, 1]).double()
+    depths = 1 / (nearest + (farthest - nearest) * unit)
     true = sum_over_spectrum(optics, at, depths, plan.waves, plan.window).detach()
-    middle_wave = float(plan.waves.wavelengths_um.mean())
-    level = _cosine4(optics, at, depths, middle_wave)[..., None, None]
+    mean_wave = float(plan.waves.wavelengths_um.mean())
+    cosine4 = _cosine4(optics, at, depths, mean_wave)[..., None, None]
     used = psfs_used(prepared, torch.from_numpy(pixels), depths).cpu()
-    dimmer, light = image_dimming(prepared), true.sum((-1, -2))
+    dimmer = image_dimming(prepared)
+    light = true.sum((-1, -2))
     few = at[:FEW], depths[1:-1]
     # of the brightest of few places in the image
     share = float(light[:FEW].max() / (light**2).mean().sqrt()) * dimmer
@@ -258,7 +301,7 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     wave = float(plan.waves.wavelengths_um[0])
     pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
     parts = {
-        "psfs": scene_error(used, (true * level).to(used)) * dimmer,
+        "psfs": scene_error(used, (true * cosine4).to(used)) * dimmer,
         "planes": _plane_error(prepared),
         "spectrum": max(plan.waves.error, 0.0),
         "transform": left_out.transform_error(judged) * share,
@@ -268,38 +311,42 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
         "edge": sampling(optics, plan.window, wave).beyond / 2,
     }
     if optics.layers.stop is not None:
-        seen = true[:FEW, 1:-1], light[:FEW, 1:-1], light.amax(0)[1:-1]
-        ripples = _shadow_error(optics, wave, few, seen, plan.window.step_um)
-        parts["stop"] = ripples * dimmer
+        judged_psfs = true[:FEW, 1:-1], light[:FEW, 1:-1], light.amax(0)[1:-1]
+        shadow = _shadow_error(optics, wave, few, judged_psfs, plan.window.step_um)
+        parts["stop"] = shadow * dimmer
     return parts
 
 
 def _plane_error(prepared: Imager) -> float:
-    """Root mean square error of uniformly illuminated planes, at the worst depth.
+    """Relative RMS error of images of uniformly illuminated planes, the worst depth.
 
-    Compared with images by the PSFs of the nodes, at the depth nodes and half-way.
+    Images by the low-rank kernels are compared with images by the nodes' own PSFs, at
+    the depth nodes and half-way between them in 1/z.
     """
-    near, far = prepared.light.vergence
-    count = 2 * len(prepared.plan.depths_um) - 1
-    depths = 1 / torch.linspace(near, far, count, dtype=torch.float64)
+    nearest, farthest = prepared.light.vergence
+    nodes = len(prepared.plan.depths_um)
+    count = 2 * nodes - 1
+    depths = 1 / torch.linspace(nearest, farthest, count, dtype=torch.float64)
     field = prepared.field
-    deep = spline_matrix(torch.linspace(0, 1, count), len(prepared.plan.depths_um))
-    light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
+    to_depths = spline_matrix(torch.linspace(0, 1, count), nodes).to(field.psf)
+    light = torch.einsum("cz,abzhw->abchw", to_depths, field.light)
     maps = frame_maps(prepared.grid.frame, light.shape[:2], light)
-    wanted = prepared.grid.crop(plane_images(light, maps))
-    one = torch.ones(1, *prepared.grid.frame).to(field.psf)
-    found = [
-        prepared.grid.crop(prepared.light.blur(one, torch.full_like(one, depth))[0])
+    reference = prepared.grid.crop(plane_images(light, maps))
+    plane = torch.ones(1, *prepared.grid.frame).to(field.psf)
+    images = [
+        prepared.grid.crop(prepared.light.blur(plane, torch.full_like(plane, depth))[0])
         for depth in depths.tolist()
     ]
-    wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
-    level = wanted.square().mean((1, 2)).max().clamp_min(1e-30)
-    return float(torch.sqrt(wrong / level))
+    error = (torch.stack(images) - reference).square().mean((1, 2)).max()
+    level = reference.square().mean((1, 2)).max().clamp_min(1e-30)
+    return float(torch.sqrt(error / level))
 
 
 def image_dimming(prepared: Imager) -> float:
-    """By how much an image of even light is dimmer than the whole frame's, 1 at least:
-    margins may be in the light where an image lies in the shadow of a stop.
+    """RMS light of the whole frame over that of the image within it, 1 at least.
+
+    Both are of a uniformly illuminated plane at the middle depth. The ratio exceeds 1
+    where the image lies in the shadow of a stop and its margins do not.
 
     Args:
         prepared: imager with its nodes.
@@ -319,17 +366,23 @@ def _shadow_error(
     optics: Optics,
     wavelength_um: float,
     places: tuple[Tensor, Tensor],
-    seen: tuple[Tensor, ...],
+    judged: tuple[Tensor, ...],
     step_um: float,
 ) -> float:
-    """Error of the stop's shadow, the worst of some places and depths.
+    """Relative error of the stop's shadow, the worst of some places and depths.
+
+    Each error counts by the light of its place over that of the brightest place.
 
     Args:
-        places: field points and depths. seen: their PSFs, the share of the light on the
-            aperture that these hold, and that of the brightest place of each depth.
+        optics: layers with the stop, and lens-sensor distance.
+        wavelength_um: in vacuum, um.
+        places: (n, [x, y]) field points in um, and (depths,) in um.
+        judged: PSFs (n, depths, h, w), the share of the light on the aperture that each
+            contains, and that share of the brightest place of each depth.
+        step_um: of the PSFs' samples.
     """
     at, depths_um = places
-    psfs, contained, brightest = (part.cpu().numpy() for part in seen)
+    psfs, contained, brightest = (part.cpu().numpy() for part in judged)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     share = contained.clip(1e-6, 1)
     unit = psfs / contained.clip(1e-6)[..., None, None]
@@ -338,25 +391,26 @@ def _shadow_error(
     for i, (x, y) in enumerate((at / reduced).tolist()):
         for k, depth in enumerate(depths_um.tolist()):
             rad = float(rads[i, k]) / math.hypot(1, x, y)
-            about = (x, y), depth, wavelength_um, rad, float(share[i, k])
-            error = optics.layers.shadow_error(*about)
+            error = optics.layers.shadow_error(
+                (x, y), depth, wavelength_um, rad, float(share[i, k])
+            )
             errors.append(error * contained[i, k] / brightest[k])
     return float(max(errors))
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) light that the kernels give sources at (n, [row, column]).
+    """(n, depths, h, w) PSFs times illumination, as the imager's kernels have them.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        pixels: places of the samples.
+        optics: imager with its kernels.
+        pixels: (n, [row, column]) samples of the frame.
         depths_um: source depths from the lens, um.
     """
     high, wide = optics.grid.frame
-    where = (pixels[:, 0] * wide + pixels[:, 1]).to(optics.stack.device)
+    index = (pixels[:, 0] * wide + pixels[:, 1]).to(optics.stack.device)
     out = []
     for depth in depths_um.tolist():
-        deep = torch.full((high, wide), depth).to(optics.stack)
-        weights = optics.light.interpolate(deep, where)
+        depth_map = torch.full((high, wide), depth).to(optics.stack)
+        weights = optics.light.interpolate(depth_map, index)
         out.append(torch.einsum("rn,rhw->nhw", weights, optics.light.kernels))
     return torch.stack(out, 1)

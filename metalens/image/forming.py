@@ -24,7 +24,7 @@ from metalens.image.scene import Frames
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import Stray, add_stray
 
-FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
+FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near sheet
 # Kernels of coverage, of those of light and at least: it matters at the borders of
 # sheets alone.
 COVER_SHARE, COVER_FEWEST = 0.3, 12
@@ -34,8 +34,8 @@ COVER_SHARE, COVER_FEWEST = 0.3, 12
 class Imager:
     """A lens ready to image frames of one grid.
 
-    grid, plan: where the scene is sampled, and where the PSFs are known (one node on the
-        axis, and no wavelengths, where they were given for all of the field).
+    grid, plan: samples of the scene, and nodes of the PSFs. A uniform imager has one
+        node, on the axis, and no wavelengths.
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1.
     energy: (rows, columns, depths) relative illumination E of each; of a uniform imager
         the same at all depths.
@@ -51,7 +51,7 @@ class Imager:
         kernels (low rank) alone.
     stray: light of other diffraction orders, None where the lens has no pillars.
     asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are
-        wanted; None for all.
+        computed; None for all.
     """
 
     grid: Grid
@@ -78,9 +78,7 @@ class Imager:
         return PsfField(self.stack, self.energy, self.plan.depths_um)
 
     def above(self, tolerance: float) -> str:
-        """Words for an error above the tolerance, with the cause that weighs most;
-        empty where it is not.
-        """
+        """Words for an error above the tolerance, with its largest part; else empty."""
         if self.error <= tolerance:
             return ""
         cause = max(self.parts, key=lambda name: self.parts[name])
@@ -106,14 +104,18 @@ class Imager:
         return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
-        """Light over coverage through the same PSFs: constant radiance stays constant.
+        """(frames, y, x) image by uniform PSFs, which keep constant radiance constant.
 
-        The mean is not transformed, so that rounding grows with the contrast alone.
+        Blurred light is divided by blurred coverage. The mean radiance is subtracted
+        before and added after, so that rounding grows with the contrast alone.
+
+        Args:
+            light, cover, depth_um: (frames, sheets, y, x) radiance, coverage, depth.
         """
-        whole, covered = (
+        total, covered = (
             part.detach().sum((1, 2, 3), keepdim=True) for part in (light, cover)
         )
-        mean = whole / covered.clamp_min(1e-30)
+        mean = total / covered.clamp_min(1e-30)
         pair = torch.stack([light - mean * cover, cover], 1)
         blurred = self._returned(self.cover.blur(pair, depth_um[:, None]), light)
         image = occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
@@ -132,7 +134,7 @@ class Imager:
         return self._returned(self._blurred(light, depth_um, illuminated=True), light)
 
     def _continued(self, *parts: Tensor) -> list[Tensor]:
-        """Frames with the border samples repeated outward, so that no PSF ends there."""
+        """Frames with border samples repeated outward, so that no PSF ends at them."""
         size = tuple(n + 2 * self.grid.margin for n in self.grid.samples)
         if tuple(parts[0].shape[-2:]) != size:
             raise SceneError(
@@ -147,31 +149,39 @@ class Imager:
     def _blurred(
         self, content: Tensor, depth_um: Tensor, *, illuminated: bool
     ) -> Tensor:
-        """Light or coverage (frames, *sheets, y, x) through the PSFs."""
-        used = self.light if illuminated else self.cover
-        total = used.blur(content, depth_um.detach())
+        """Light or coverage (frames, *sheets, y, x) blurred by the PSFs.
+
+        Where PSFs or depths carry a gradient, the nodes' own PSFs give it.
+        """
+        psfs = self.light if illuminated else self.cover
+        total = psfs.blur(content, depth_um.detach())
         if self.light.uniform:
             return total
-        moves = self.stack.requires_grad or depth_um.requires_grad
-        if moves and torch.is_grad_enabled():
-            about = self.field, content.detach(), depth_um
-            total = total + by_nodes(*about, illuminated=illuminated, asked=self.asked)
+        varies = self.stack.requires_grad or depth_um.requires_grad
+        if varies and torch.is_grad_enabled():
+            total = total + by_nodes(
+                self.field,
+                content.detach(),
+                depth_um,
+                illuminated=illuminated,
+                asked=self.asked,
+            )
         return total
 
     def _returned(self, whole: Tensor, light: Tensor) -> Tensor:
-        """The samples that are asked for, with stray light."""
+        """(frames, y, x) image without margin and spare, plus stray light."""
         image = self.grid.crop(whole)
         if self.stray is None:
             return image
         return add_stray(image, light, self.stray, self.grid)
 
     def scaled(self, factor: float) -> "Imager":
-        """The same with so many times the light; stray light stays."""
+        """This imager with ``factor`` times the light, but the same stray light."""
         light = replace(self.light, table=self.light.table * factor)
         return replace(self, energy=self.energy * factor, light=light)
 
     def to(self, device: torch.device | str) -> "Imager":
-        """The same on a device, for frames there; grid and plan stay where they are."""
+        """This imager on a device, for frames on it; grid and plan are not moved."""
         return replace(
             self,
             stack=self.stack.to(device),
@@ -186,17 +196,19 @@ class Imager:
 def build_imager(
     grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float
 ) -> Imager:
-    """Factor the PSFs of a plan's nodes for frames of a grid.
+    """Imager of the PSFs at a plan's nodes, expanded in low-rank kernels.
 
     Args:
-        stack: PSFs over angle, depth and wavelength.
-        energy: light on each field node.
-        tolerance: of the whole image; kernels take their share of it.
+        grid: where the scene is sampled.
+        plan: nodes over the field and depths.
+        stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1.
+        energy: (rows, columns, depths) relative illumination of the nodes.
+        tolerance: of the whole image; kernels take the share ``KERNELS`` of it.
     """
-    found = PsfField(stack, energy, plan.depths_um)
-    most = tolerance * KERNELS
-    basis = principal_kernels(found, grid.frame, tolerance=most)
-    return _assembled(grid, plan, found, basis, {})
+    field = PsfField(stack, energy, plan.depths_um)
+    kernel_tolerance = tolerance * KERNELS
+    basis = principal_kernels(field, grid.frame, tolerance=kernel_tolerance)
+    return _assembled(grid, plan, field, basis, {})
 
 
 def uniform_imager(
@@ -228,14 +240,14 @@ def uniform_imager(
     unit = psf / psf.sum((-2, -1), keepdim=True)
     axis, window = torch.zeros(1), Window(grid.window, grid.step_um)
     plan = Plan(axis, axis, depths_um, None, window, False)  # type: ignore[arg-type]
-    one = torch.ones_like(unit[None, None, :, 0, 0]).detach()
-    found = PsfField(unit[None, None], one, depths_um)
-    basis = principal_kernels(found, grid.frame, tolerance=tolerance)
-    return _assembled(grid, plan, found, basis, {"kernels": basis.error})
+    illumination = torch.ones_like(unit[None, None, :, 0, 0]).detach()
+    field = PsfField(unit[None, None], illumination, depths_um)
+    basis = principal_kernels(field, grid.frame, tolerance=tolerance)
+    return _assembled(grid, plan, field, basis, {"kernels": basis.error})
 
 
 def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
-    """The same imager with other PSFs, its kernels mixed of them as of the first ones.
+    """This imager with other PSFs, its kernels the same mixtures of them.
 
     Changes that vary over field and depth in a way that the first stack does not show
     need an imager of their own. The gradient does not: it is that of the image through
@@ -243,33 +255,42 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     lack.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        energy: light on each field node.
+        optics: the first imager.
+        stack: (rows, columns, depths, h, w) PSFs of the same nodes, of sum 1.
+        energy: (rows, columns, depths) their relative illumination.
     """
-    found = PsfField(stack, energy, optics.plan.depths_um)
-    made = _assembled(optics.grid, optics.plan, found, optics.basis, optics.parts)
-    return replace(made, stray=optics.stray, asked=optics.asked)
+    field = PsfField(stack, energy, optics.plan.depths_um)
+    imager = _assembled(optics.grid, optics.plan, field, optics.basis, optics.parts)
+    return replace(imager, stray=optics.stray, asked=optics.asked)
 
 
 def _assembled(
     grid: Grid,
     plan: Plan,
-    found: PsfField,
+    field: PsfField,
     basis: KernelBasis,
     parts: Mapping[str, float],
 ) -> Imager:
+    """Imager with kernels and weights for light and, fewer of them, for coverage.
+
+    Args:
+        grid: where the scene is sampled.
+        plan: nodes over the field and depths.
+        field: PSFs and illumination at the nodes.
+        basis: kernels as mixtures of the nodes' PSFs.
+        parts: error by cause.
+    """
     few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)
-    light = low_rank_psfs(found, basis, grid.frame)
-    if found.uniform:
-        cover = replace(light, table=light.table / found.illumination.mean())
+    light = low_rank_psfs(field, basis, grid.frame)
+    if field.uniform:
+        cover = replace(light, table=light.table / field.illumination.mean())
     else:
-        cover = low_rank_psfs(found, basis, grid.frame, rank=few, illuminated=False)
-    given = found.psf, found.illumination, basis, light, cover, parts
-    return Imager(grid, plan, *given)
+        cover = low_rank_psfs(field, basis, grid.frame, rank=few, illuminated=False)
+    return Imager(grid, plan, field.psf, field.illumination, basis, light, cover, parts)
 
 
 def occlude(light: Tensor, cover: Tensor) -> Tensor:
-    """(frames, y, x) radiance of a near sheet over a far one that goes on behind it.
+    """(frames, y, x) radiance of a near sheet over a far sheet that extends behind it.
 
     (L_near + b L_far) / (C_near + b C_far) with b = (1 - C_near) / C_far, which fades
     where the far sheet covers less than :data:`FAINT`.
@@ -285,8 +306,9 @@ def occlude(light: Tensor, cover: Tensor) -> Tensor:
 
 
 def _far_alone(frames: Frames) -> bool:
-    """Whether the far sheet covers everything, so that nothing is hidden; never where
-    coverage has derivatives.
+    """Whether the far sheet covers all and the near sheet is empty.
+
+    False where coverage or radiance carries a gradient.
     """
     cover, light = frames.coverage, frames.radiance
     if not (has_no_gradient(cover) and has_no_gradient(light)):

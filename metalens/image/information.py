@@ -72,27 +72,32 @@ def optics_loss(
     floor: float = 1e-8,
     relative: bool = True,
 ) -> OpticsLoss:
-    """- sum log F_ii + orthogonality sum over i != j of F_ij² + compactness (1 - E)
-    (Eq. 6).
+    """Loss of the optics (paper Eq. 6): information, correlation and compactness.
+
+    -Σ log F_ii + orthogonality Σ_{i≠j} F_ij² + compactness (1 - E)
 
     Args:
-        fisher: (n, n).
-        encircled: encircled energy in [0, 1], any shape; its mean enters.
-        floor: least F_ii in the logarithm: below it the tangent of the logarithm at the
-            floor is used (value and
-            slope are continuous, the gradient still points to more information), and
-            ``floored`` tells.
-        relative: divide F_ij² by F_ii F_jj. The paper's plain form changes with the
-            units of the parameters and
-            with the brightness: it can be made small by dimming the image.
+        fisher: (n, n) Fisher matrix.
+        encircled: encircled energy E in [0, 1], of any shape; its mean enters.
+        orthogonality: weight of the second term.
+        compactness: weight of the third term.
+        floor: least F_ii of the logarithm. Below it the logarithm continues as its
+            tangent, so that the gradient still increases the information;
+            ``floored`` lists these parameters.
+        relative: divide F_ij² by F_ii F_jj. The paper's plain form depends on the units
+            of the parameters and on the brightness: dimming the image lowers it.
     """
     diagonal = torch.diagonal(fisher)
     below = diagonal < floor
     safe = torch.where(below, floor, diagonal)
     logs = torch.log(safe) + torch.where(below, (diagonal - floor) / floor, 0.0)
     scale = torch.outer(safe, safe) if relative else torch.ones_like(fisher)
-    off = (fisher**2 / scale).sum() - (torch.diagonal(fisher**2 / scale)).sum()
-    parts = -logs.sum(), orthogonality * off, compactness * (1 - encircled).mean()
+    correlation = (fisher**2 / scale).sum() - (torch.diagonal(fisher**2 / scale)).sum()
+    parts = (
+        -logs.sum(),
+        orthogonality * correlation,
+        compactness * (1 - encircled).mean(),
+    )
     return OpticsLoss(
         sum(parts, fisher.new_zeros(())),
         *parts,
@@ -103,15 +108,16 @@ def optics_loss(
 def encircled_energy(
     intensity: Tensor, sample_um: float, *, radius_um: float
 ) -> Tensor:
-    """Light within ``radius_um`` of the window's centre, in the units of ``intensity``
-    (..., y, x).
+    """(...) light within a circle about the window's centre, in units of ``intensity``.
 
-    Samples cut by the circle count in part. Give intensities as shares of the light
-    through the aperture to get
-    the absolute encircled energy; dividing by the window's own sum flatters a wide PSF.
+    Samples cut by the circle count in part. Intensities that are shares of the light
+    through the aperture give the absolute encircled energy. Dividing by the window's
+    sum instead overrates a wide PSF.
 
     Args:
+        intensity: (..., y, x) light per sample.
         sample_um: step of the samples, um.
+        radius_um: of the circle.
     """
     y, x = (
         torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in intensity.shape[-2:]
@@ -130,17 +136,19 @@ def pixel_information(
     normalisation: Normalisation,
     shift_um: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:
-    """I(z) of Eq. 11 for one position of the pixel grid: sum over pixels of ((P(z + dz)
-    - P(z)) / dz)², per mm².
+    """(...) axial information I(z) of Eq. 11 for one position of the pixels, per mm².
+
+    Σ over pixels of ((P(z + dz) - P(z)) / dz)², with P the normalised light per pixel.
 
     Args:
+        near: (..., y, x) intensities at z.
+        far: (..., y, x) intensities at z + ``step_um``.
+        step_um: dz between the two depths.
+        sample_um: step of the samples, um.
         pixel_um: pixel pitch, um.
-        shift_um: displacement along x and y, um.
-        near, far: (..., y, x) intensities at z and at z + ``step_um``, sampled every
-            ``sample_um``.
-        normalisation: of every depth's pixels: by their sum, by their Euclidean norm,
-            or as they are. It decides
-            which lens wins; always name it.
+        normalisation: of the pixels of each depth: by their sum, by their Euclidean
+            norm, or none. The ranking of lenses depends on it, so always name it.
+        shift_um: (y, x) of the pixel grid, um.
     """
     shape = tuple(whole_pixels(n, sample_um, pixel_um) for n in near.shape[-2:])
     grid = dict(pitch_um=pixel_um, shape=(shape[0], shape[1]), shift_um=shift_um)
@@ -164,22 +172,23 @@ def axial_information(
     normalisation: Normalisation = "l2",
     positions: int = 3,
 ) -> Tensor:
-    """I(z) of Eq. 11, averaged over ``positions``² sub-pixel positions of the image on
-    the pixels, per mm².
+    """(...) axial information I(z) of Eq. 11, mean over sub-pixel positions, per mm².
 
-    Read from one position, or from intensities sampled coarser than lambda d / 4R, the
-    value misranks lenses and an
-    optimiser exploits it. The window must hold the PSF: light outside it does not
-    count.
+    At a single position, or with samples coarser than lambda d / 4R, the value misranks
+    lenses and an optimiser exploits it. The window must contain the PSF: light outside
+    it does not count.
 
     Args:
+        near: (..., y, x) intensities at z, three samples a pixel or more.
+        far: the same at z + ``step_um``.
+        step_um: dz between the two depths.
         sample_um: step of the samples, um.
         pixel_um: pixel pitch, um.
-        near, far: (..., y, x) intensities at z and z + ``step_um``, sampled at least
-            three times a pixel.
+        normalisation: see :func:`pixel_information`.
+        positions: of the image on the pixels, along each axis.
 
     Raises:
-        SceneError: less than three samples a pixel, or no position asked for.
+        SceneError: less than three samples a pixel, or less than one position.
     """
     if sample_um > pixel_um / 3 * (1 + 1e-9):
         raise SceneError(
@@ -208,13 +217,11 @@ def axial_information(
 def texture_information(
     psf: Tensor, *, step_um: float, spectrum: Tensor, noise: float
 ) -> Tensor:
-    """Information on depth from the blur of an unknown texture: 1/2 sum over
-    frequencies of (d log S / dz)², per mm².
+    """Fisher information on depth from the blur of an unknown texture, per mm².
 
-    The image of a Gaussian texture of power ``spectrum`` in white noise has the power
-    S(f) = |H(f)|² spectrum + noise;
-    this is the Fisher information of its variance (Whittle). Phases, and so
-    displacements of the PSF, carry nothing.
+    ½ Σ_f (d log S / dz)² (Whittle), where S(f) = |H(f)|² spectrum + noise is the power
+    of the image of a Gaussian texture in white noise. Phases, and so displacements of
+    the PSF, carry no information.
 
     Args:
         psf: (depths, y, x) pixel PSFs at equal steps ``step_um``.
@@ -236,14 +243,14 @@ def texture_information(
 
 
 def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
-    """Information on the first ``wanted`` parameters when the others are unknown too:
-    the Schur complement.
+    """Information on the first parameters when the others are unknown: A - B C⁻¹ Bᵀ.
 
-    Nuisance directions that the image does not show at all are left out
-    (pseudo-inverse).
+    The Schur complement. Nuisance directions without any information are left out
+    (pseudo-inverse of C, scaled to a unit diagonal).
 
     Args:
-        fisher: (..., n, n) Fisher matrix.
+        fisher: (n, n) Fisher matrix [[A, B], [Bᵀ, C]].
+        wanted: number of the first parameters, the size of A.
     """
     a = fisher[:wanted, :wanted]
     b = fisher[:wanted, wanted:]
@@ -252,27 +259,28 @@ def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
     inverse = torch.linalg.pinv(
         c / torch.outer(scale, scale), hermitian=True, rtol=1e-12
     )
-    left: Tensor = a - (b / scale) @ inverse @ (b / scale).mT
-    return left
+    complement: Tensor = a - (b / scale) @ inverse @ (b / scale).mT
+    return complement
 
 
 def cramer_rao(fisher: Tensor) -> Tensor:
-    """(n,) least standard deviation of an unbiased estimate of each parameter: sqrt of
-    the diagonal of F^-1.
+    """(n,) Cramér-Rao bound: least standard deviation of each parameter, √(F⁻¹)_ii.
 
-    ``fisher`` must be noise-weighted. Infinite where a parameter cannot be told from
-    the others (colinear
-    sensitivities), found from the eigenvalues of the matrix scaled to a unit diagonal.
+    It is infinite where a parameter cannot be separated from others (colinear
+    sensitivities), by the eigenvalues of the matrix scaled to a unit diagonal.
+
+    Args:
+        fisher: (n, n) Fisher matrix, noise-weighted.
     """
     diagonal = torch.diagonal(fisher)
     scale = torch.sqrt(diagonal.clamp_min(torch.finfo(fisher.dtype).tiny))
     values, vectors = torch.linalg.eigh(fisher / torch.outer(scale, scale))
-    known = values > 1e-12 * len(fisher)
-    spread = (
-        vectors**2 * torch.where(known, 1 / torch.where(known, values, 1.0), 0.0)
+    nonzero = values > 1e-12 * len(fisher)
+    variance = (
+        vectors**2 * torch.where(nonzero, 1 / torch.where(nonzero, values, 1.0), 0.0)
     ).sum(1)
-    blind = ((vectors**2)[:, ~known].sum(1) > 1e-9) | (diagonal <= 0)
-    return torch.where(blind, math.inf, torch.sqrt(spread) / scale)
+    undetermined = ((vectors**2)[:, ~nonzero].sum(1) > 1e-9) | (diagonal <= 0)
+    return torch.where(undetermined, math.inf, torch.sqrt(variance) / scale)
 
 
 def _normalised(pixels: Tensor, normalisation: Normalisation) -> Tensor:

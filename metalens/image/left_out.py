@@ -1,5 +1,5 @@
-"""What PSFs of the field leave out: by the transform, by components of the field, by
-pillars taken together.
+"""Model errors of the field's PSFs: by the transform, by components of the field, and
+by pillars averaged over cells.
 
 Errors are of the image: those of PSFs count by their light, so that places in the
 shadow of a stop count little.
@@ -23,8 +23,9 @@ from metalens.psf import Polarisation, SpectralNodes, blur_um, psf_stack
 
 @dataclass(frozen=True, eq=False)
 class JudgedPsfs:
-    """PSFs by which errors are judged: of the first wavelength, at (field points,
-    depths).
+    """PSFs by which errors are judged, of the first wavelength.
+
+    at: (field points, [x, y]) in um, and (depths,) in um.
     """
 
     optics: Optics
@@ -34,65 +35,73 @@ class JudgedPsfs:
 
     @functools.cached_property
     def shown(self) -> Tensor:
-        """(field points, depths, h, w) as the window shows them, with their light;
-        computed once.
-        """
+        """(field points, depths, h, w) PSFs of the window, with their light; cached."""
         return self.compute_psfs()
 
     def compute_psfs(
         self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any
     ) -> Tensor:
-        """The same PSFs through a window with other settings."""
-        about: dict[str, Any] = {
-            "wavelength_um": float(self.waves.wavelengths_um[0]),
-            "shift_um": shift_um,
-        }
+        """(field points, depths, h, w) PSFs with changed settings of the window.
+
+        Args:
+            shift_um: (x, y) added to where the window's rays are traced.
+            other: fields of :class:`Window` to replace.
+        """
         with torch.no_grad():
             return psfs(
                 self.optics,
                 self.at[0],
                 depths_um=self.at[1],
+                wavelength_um=float(self.waves.wavelengths_um[0]),
                 window=replace(self.window, **other),
-                **about,
+                shift_um=shift_um,
             )
 
 
 def transform_error(judged: JudgedPsfs) -> float:
-    """Error of the second-order transform: PSFs with rays recomputed at their own width
-    from the field point, against themselves.
+    """Relative error of the second-order transform of rays over the window.
+
+    PSFs with rays traced to a place off the field point, by the root mean square radius
+    of the PSF, are compared with the PSFs themselves.
 
     Args:
         judged: PSFs by which the error is judged.
     """
-    shown, step_um = judged.shown, judged.window.step_um
-    light = shown.sum((-1, -2))
+    psf = judged.shown
+    step_um = judged.window.step_um
+    light = psf.sum((-1, -2))
     # root mean square distance of the light of a disc of this blur
-    wide = float(blur_um(shown.cpu().numpy(), step_um).mean()) / math.sqrt(2)
-    moved = judged.compute_psfs(shift_um=(wide * 0.6, wide * 0.8))
-    return weigh_by_light(texture_error(moved, shown), light)
+    rms_radius = float(blur_um(psf.cpu().numpy(), step_um).mean()) / math.sqrt(2)
+    moved = judged.compute_psfs(shift_um=(rms_radius * 0.6, rms_radius * 0.8))
+    return weigh_by_light(texture_error(moved, psf), light)
 
 
 def folding_error(judged: JudgedPsfs) -> float:
-    """What the transform folds back from beyond the period of the nodes: PSFs, with
-    their light, against those of twice
-    the period.
+    """Relative error of light aliased from beyond the period of the nodes.
+
+    PSFs, with their light, are compared with those of twice the period.
 
     Args:
         judged: PSFs by which the error is judged.
     """
-    want = judged.compute_psfs(period=2 * judged.window.period)
-    return weigh_by_light(texture_error(judged.shown, want), want.sum((-1, -2)))
+    reference = judged.compute_psfs(period=2 * judged.window.period)
+    return weigh_by_light(
+        texture_error(judged.shown, reference), reference.sum((-1, -2))
+    )
 
 
 def choose_polarisation(
     judged: JudgedPsfs, polarisation: Polarisation, *, within: tuple[float, float]
 ) -> Window:
-    """The window with one scalar where that images within the first tolerance
-    (``auto``), else with as few components
-    of the fields of both polarisations as image within the second.
+    """The window with the fewest field components that image within the tolerance.
+
+    ``auto`` is one scalar where its error is within the first tolerance. Else the
+    components of both polarisations are added until the error is within the second.
 
     Args:
         judged: PSFs by which the error is judged.
+        polarisation: ``"auto"``, ``"scalar"``, ``"flux"`` or ``"vector"``.
+        within: relative errors of a scalar, and of the components left out.
     """
     judged = replace(
         judged, window=replace(judged.window, flux=polarisation != "vector")
@@ -103,62 +112,66 @@ def choose_polarisation(
     ):
         return window
     whole = judged.compute_psfs(components=window.whole)
-    tried = (replace(window, components=count) for count in range(1, window.whole + 1))
+    windows = (
+        replace(window, components=count) for count in range(1, window.whole + 1)
+    )
     return next(
-        one
-        for one in tried
-        if polarisation_error(replace(judged, window=one), whole) <= within[1]
+        fewer
+        for fewer in windows
+        if polarisation_error(replace(judged, window=fewer), whole) <= within[1]
     )
 
 
 def polarisation_error(judged: JudgedPsfs, whole: Tensor | None = None) -> float:
-    """What the components of the field that a window leaves out change: PSFs of sum 1
-    against those of all components
-    (``whole``, where they are known).
+    """Relative error of the field components that a window leaves out.
+
+    PSFs of sum 1 are compared with those of all components.
 
     Args:
         judged: PSFs by which the error is judged.
+        whole: PSFs of all components; None to compute them.
     """
     window = judged.window
     if window.components == window.whole:
         return 0.0
-    whole = judged.compute_psfs(components=window.whole) if whole is None else whole
-    few, light = judged.shown, whole.sum((-1, -2))
-    return weigh_by_light(
-        texture_error(
-            few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]
-        ),
-        light,
+    if whole is None:
+        whole = judged.compute_psfs(components=window.whole)
+    few = judged.shown
+    light = whole.sum((-1, -2))
+    errors = texture_error(
+        few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]
     )
+    return weigh_by_light(errors, light)
 
 
 def gathering_error(
     optics: Optics, wavelength_um: float, window: Window, at: tuple[Tensor, Tensor]
 ) -> float:
-    """What gathering pillars over cells changes: PSFs of sum 1 at (field points,
-    depths) against those of every pillar,
-    to the same samples; 0 of a wave that is no lens of pillars. Light of other orders
-    in the window is in it.
+    """Relative error of averaging pillars over cells; 0 of a wave without pillars.
+
+    PSFs of sum 1 are compared with those of every pillar (:func:`psf_stack`), on the
+    same samples.
+    The error includes light of other orders in the window.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         wavelength_um: vacuum wavelength, um.
+        window: samples of the PSFs; of a wide window its middle is compared.
+        at: (field points, [x, y]) in um, and (depths,) in um.
     """
     wave = optics.wave
     if not isinstance(wave, PillarPlane):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
-    # points of a sample, half of Nyquist's step apart: triangles of a sample are then
-    # summed to 2e-3 of fine detail. At
-    # Nyquist's step it is 5e-3 too much; what scatters to the rim of a window is more,
-    # so that no window is cut for it.
+    # points per sample, at half of Nyquist's step: its triangle is then summed to
+    # 2e-3 of fine detail, at Nyquist's step to 5e-3
     finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
-    most = 256  # along an axis; of a wider window the middle is looked at
+    most = 256  # points along an axis
     finer *= 2 if (window.samples + 2) * 2 * finer <= most else 1
     count = min(window.samples, max(most // finer - 2, 3) | 1)
     share = _triangles(count, finer)
     edge = (window.samples - count) // 2
-    few = slice(edge, edge + count)
+    middle = slice(edge, edge + count)
     errors, lights = [], []
     with torch.no_grad():
         for place in at[0]:
@@ -169,31 +182,36 @@ def gathering_error(
                 (place, at[1]),
                 (window.step_um, count + 1, finer),
             )
-            want = share @ light @ share.T
-            got = psfs(
+            reference = share @ light @ share.T
+            psf = psfs(
                 optics,
                 place[None],
                 depths_um=at[1],
                 wavelength_um=wavelength_um,
                 window=window,
-            )[0, :, few, few]
+            )[0, :, middle, middle]
             errors.append(
                 texture_error(
-                    got / got.sum((-1, -2), keepdim=True),
-                    want / want.sum((-1, -2), keepdim=True),
+                    psf / psf.sum((-1, -2), keepdim=True),
+                    reference / reference.sum((-1, -2), keepdim=True),
                 )
             )
-            lights.append(got.sum((-1, -2)))
+            lights.append(psf.sum((-1, -2)))
     return weigh_by_light(torch.stack(errors), torch.stack(lights))
 
 
 def _triangles(count: int, finer: int) -> Tensor:
-    """(samples, points) share of the light at points of a window one sample wider: a
-    square source over a square.
+    """(samples, points) weights that average points over each sample: a unit triangle.
+
+    It is the convolution of the source's square with that of the sample.
+
+    Args:
+        count: samples; the points cover one more.
+        finer: points per sample.
     """
     points = (np.arange((count + 1) * finer) - ((count + 1) * finer - 1) / 2) / finer
-    away = np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None])
-    return torch.from_numpy(np.maximum(1 - away, 0))
+    distance = np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None])
+    return torch.from_numpy(np.maximum(1 - distance, 0))
 
 
 def _of_pillars(
@@ -203,32 +221,40 @@ def _of_pillars(
     at: tuple[Tensor, Tensor],
     sampled: tuple[float, int, int],
 ) -> Tensor:
-    """(depths, y, x) light of point sources, from every pillar; sampled: step of a
-    sample, samples, points of each.
+    """(depths, y, x) PSFs of point sources from every pillar, float64.
+
+    The window is centred on the field point.
+
+    Args:
+        optics: layers and lens-sensor distance.
+        wave: pillars of the lens.
+        wavelength_um: vacuum wavelength, um.
+        at: (x, y) field point in um, and (depths,) in um.
+        sampled: step of a sample in um, number of samples, points per sample.
     """
-    (place, depths_um), (step_um, count, finer) = at, sampled
-    tangents = (
-        place.cpu() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    )
-    angle = torch.atan(tangents).tolist()
-    t = wave.pillar_transmission(
-        wavelength_um, math.atan(math.hypot(*tangents.tolist()))
-    ).cpu()
-    about: dict[str, Any] = {
+    place, depths_um = at
+    step_um, count, finer = sampled
+    after = optics.layers.after(optics.distance_um, wavelength_um)
+    tangents = place.cpu() / after.reduced_um
+    tilt = math.atan(math.hypot(*tangents.tolist()))
+    t = wave.pillar_transmission(wavelength_um, tilt).cpu()
+    geometry: dict[str, Any] = {
         "pitch_um": wave.pitch_um,
         "wavelength_um": wavelength_um,
         "sensor_distance_um": optics.distance_um,
         "depths_um": depths_um.tolist(),
-        "angle_rad": angle,
+        "angle_rad": torch.atan(tangents).tolist(),
         "window_um": count * step_um,
         "samples": count * finer,
-        "layers": optics.layers,
     }
-    chief = propagate.make_case(
-        tuple(t.shape), **about | {"layers": optics.layers.open}
-    ).centre_um
-    offset = [float(a) - b for a, b in zip(place, chief, strict=True)]
-    made = psf_stack(
-        torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False
+    case = propagate.make_case(tuple(t.shape), **geometry, layers=optics.layers.open)
+    offset = [float(a) - b for a, b in zip(place, case.centre_um, strict=True)]
+    stack = psf_stack(
+        torch.angle(t),
+        t.abs(),
+        **geometry,
+        layers=optics.layers,
+        offset_um=offset,
+        integrate=False,
     )
-    return torch.as_tensor(made.intensity).double()
+    return torch.as_tensor(stack.intensity).double()

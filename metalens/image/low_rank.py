@@ -13,7 +13,7 @@ from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spl
 from metalens.image.texture import scene_spectrum, texture_spectrum
 
 CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
-SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
+SAMPLED = 1024  # node PSFs, drawn at random, of which the kernels are mixtures
 FEWEST = 24  # kernels: single points hold more fine detail than a textured scene
 FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
 
@@ -73,8 +73,9 @@ def principal_kernels(
     """Fewest principal components of PSFs that image a textured scene and planes.
 
     The metric is the image of a scene of mean 1 with a 1/f texture, and that of an
-    uniformly illuminated plane. Kernels are mixed of at most :data:`SAMPLED` of the
-    nodes' PSFs, since PSFs between nodes are mixtures of theirs.
+    uniformly illuminated plane. Kernels are mixtures of at most :data:`SAMPLED` of the
+    nodes' PSFs, since PSFs between nodes are mixtures of theirs. Components are
+    eigenvectors of the Gram matrix of PSFs, each times its illumination.
 
     Args:
         field: sampled field or PSFs.
@@ -93,31 +94,33 @@ def principal_kernels(
         return scene_spectrum(some.double(), max(tolerance / 0.01, 1.0), band)
 
     draw = torch.Generator().manual_seed(3)
-    order = torch.randperm(len(psf), generator=draw)[:SAMPLED].sort().values
-    sampled = order.to(psf.device)
+    drawn = torch.randperm(len(psf), generator=draw)[:SAMPLED].sort().values
+    sampled = drawn.to(psf.device)
     features = transform(psf[sampled]) * light[sampled, None]
     power, vectors = torch.linalg.eigh(features @ features.mT)
-    power, vectors = power.flip(0), vectors.flip(1)
+    power = power.flip(0)
+    vectors = vectors.flip(1)
     # below this is the rounding of single precision, in which the PSFs are given
     rank = max(int((power > 1e-13 * power[0]).sum()), 1)
     rank = min(rank, 320)
     scaled = vectors[:, :rank] / power[:rank].clamp_min(1e-300).sqrt()
     axes = scaled.mT @ features
-    weights, whole = [], []
+    weights, powers = [], []
     for some in torch.split(psf, SAMPLED):
         spectrum = transform(some)
         weights.append(spectrum @ axes.mT)
-        whole.append(spectrum.square().sum(1, keepdim=True))
-    weight, depths = torch.cat(weights), len(field.depths_um)
+        powers.append(spectrum.square().sum(1, keepdim=True))
+    weight = torch.cat(weights)
+    depths = len(field.depths_um)
     in_light = light[:, None] ** 2
-    kept = (weight**2 * in_light).reshape(-1, depths, rank).mean(0)
-    total = (torch.cat(whole) * in_light).reshape(-1, depths, 1).mean(0)
+    explained = (weight**2 * in_light).reshape(-1, depths, rank).mean(0)
+    total = (torch.cat(powers) * in_light).reshape(-1, depths, 1).mean(0)
     level = total if field.uniform else in_light.reshape(-1, depths).mean(0).max()
-    missing = torch.sqrt(((total - kept.cumsum(1)).clamp_min(0) / level).amax(0))
+    missing = torch.sqrt(((total - explained.cumsum(1)).clamp_min(0) / level).amax(0))
     fewest = FEWEST
     if field.uniform:
-        lost = _derivative_error(features, vectors[:, :rank])
-        fewest = int((lost > 0.02).sum()) if field.psf.requires_grad else 1
+        derivative_error = _derivative_error(features, vectors[:, :rank])
+        fewest = int((derivative_error > 0.02).sum()) if field.psf.requires_grad else 1
     rank = min(max(int((missing > tolerance).sum()) + 1, fewest), rank)
     mixture = scaled.mT[:rank] * light[sampled]
     error = float(missing[rank - 1])
@@ -125,13 +128,14 @@ def principal_kernels(
 
 
 def _derivative_error(features: Tensor, axes: Tensor) -> Tensor:
-    """(components,) relative L2 error of the image's derivative by depth without them.
+    """(components,) relative L2 error of the image's derivative by depth.
 
-    Changes of the PSFs vary with depth in ways that the PSFs themselves show weakly.
+    Element k is the error without component k and all later components. Components that
+    are weak in the PSFs can be strong in their change with depth.
 
     Args:
-        features: (depths, frequencies). axes: (depths, components) orthonormal mixtures
-            of them, of which component k and all later ones are left out.
+        features: (depths, frequencies) spectra of the PSFs.
+        axes: (depths, components) orthonormal mixtures of them.
     """
     if len(features) < 2:
         return features.new_zeros(axes.shape[1])
@@ -170,11 +174,14 @@ class LowRankPsfs:
         return self.table.ndim == 2
 
     def weigh(self, content: Tensor, depth_um: Tensor) -> Tensor:
-        """(rank, *batch, y, x) sources times their weights.
+        """(rank, *batch, y, x) sources times their weights w_r(x, z).
+
+        Dark samples are skipped where no gradient is needed.
 
         Args:
-            content: (*batch, y, x). depth_um: the same, or of sizes that broadcast;
-                depths beyond the nodes take the outermost.
+            content: (*batch, y, x) light or coverage of the sources.
+            depth_um: of the same shape, or one that broadcasts. Depths beyond the nodes
+                have the weights of the outermost.
         """
         if self.uniform:
             parts = content, depth_um, self.table
@@ -193,28 +200,31 @@ class LowRankPsfs:
         return out.reshape(-1, *content.shape)
 
     def interpolate(self, depth_um: Tensor, where: Tensor | None = None) -> Tensor:
-        """(rank, samples) weights at the depths of all samples or of some.
+        """(rank, samples) weights w_r(x, z) by cubic B-splines in 1/z.
+
+        A uniform table is read at the nearest of its equal steps of 1/z instead.
 
         Args:
-            depth_um: (*batch, y, x). where: (samples,) flat numbers into it.
+            depth_um: (*batch, y, x) depths of the sources.
+            where: (samples,) flat numbers into it; None for all.
         """
         number = torch.arange(depth_um.numel(), device=depth_um.device)
         depth = depth_um.flatten()
         if where is not None:
             number, depth = number[where], depth[where]
-        near, far = self.vergence
-        unit = ((near - 1 / depth) / max(near - far, 1e-30)).clamp(0, 1)
+        nearest, farthest = self.vergence
+        unit = ((nearest - 1 / depth) / max(nearest - farthest, 1e-30)).clamp(0, 1)
         if self.uniform:
             code = (unit * (len(self.table) - 1) + 0.5).long()
             return self.table.mT.index_select(1, code)
         high, wide, coefficients, rank = self.table.shape
-        nodes = 1 if near == far else coefficients - 2
+        nodes = 1 if nearest == farthest else coefficients - 2
         first, taps = spline_taps(unit, nodes)
         index = (number % (high * wide)) * coefficients + first
-        each = index[:, None] + torch.arange(TAPS, device=depth.device)
-        rows = self.table.reshape(-1, rank).to(taps)
-        found = embedding_bag(each, rows, per_sample_weights=taps, mode="sum")
-        return found.mT.contiguous()
+        indices = index[:, None] + torch.arange(TAPS, device=depth.device)
+        table = self.table.reshape(-1, rank).to(taps)
+        weights = embedding_bag(indices, table, per_sample_weights=taps, mode="sum")
+        return weights.mT.contiguous()
 
     def convolve(self, sources: Tensor) -> Tensor:
         """(*batch, y, x) Σ_r K_r * s_r of (rank, *batch, y, x).
@@ -232,7 +242,7 @@ class LowRankPsfs:
         """(frames, *sheets, y, x) blurred content, few frames at a time."""
         if content.device.type != "cpu":
             return self.convolve(self.weigh(content, depth_um))
-        # what of weighted sources a core's cache holds: 2 MB
+        # as many frames as fit in 2 MB of weighted sources, a core's cache
         count = max(1, 2**19 // (len(self.kernels) * content[0].numel()))
         parts = zip(
             torch.split(content, count), torch.split(depth_um, count), strict=True
@@ -248,11 +258,11 @@ def low_rank_psfs(
     rank: int | None = None,
     illuminated: bool = True,
 ) -> LowRankPsfs:
-    """PSFs of the samples of a frame, from those of a field's nodes.
+    """Low-rank PSFs of all samples of a frame, from the PSFs of a field's nodes.
 
-    Of a field, sum and centroid of every node's PSF are exact, before what kernels lack
-    of uniformly illuminated planes is spread over the relative illumination
-    (:func:`correct_planes`).
+    Weights at the nodes are corrected so that the sum and centroid of every PSF are
+    exact (:func:`match_moments`), then interpolated by splines. A flat-field factor
+    keeps uniformly illuminated planes uniform (:func:`correct_planes`).
 
     Args:
         field: differentiable in its illumination, and in its PSFs where it is uniform.
@@ -263,7 +273,8 @@ def low_rank_psfs(
     """
     psf = field.psf if field.uniform else field.psf.detach()
     rank = len(basis.mixture) if rank is None else min(rank, len(basis.mixture))
-    kernels, shape = basis.kernels(psf, rank), fast_shape(frame)
+    kernels = basis.kernels(psf, rank)
+    shape = fast_shape(frame)
     weights = basis.weights[:, :rank]
     vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
     transfer = transfer_functions(kernels, shape)
@@ -280,17 +291,17 @@ def low_rank_psfs(
     if illuminated:
         factor = correct_planes(field, maps, kernels, values.detach())
         values = values * factor[..., None]
-    deep = spline_coefficients(values.shape[2]).to(values)
-    table = torch.einsum("cz,yxzr->yxcr", deep, values).contiguous()
+    to_coefficients = spline_coefficients(values.shape[2]).to(values)
+    table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
     return LowRankPsfs(kernels, transfer, shape, table, vergence)
 
 
 def depth_table(depths_um: Tensor) -> Tensor:
-    """(:data:`CODES`, depths) linear interpolation at equal steps of 1/z."""
+    """(:data:`CODES`, depths) matrix of linear interpolation to equal steps of 1/z."""
     vergence = -1 / depths_um.double().cpu().numpy()
     at = np.linspace(vergence[0], vergence[-1], CODES)
-    each = [np.interp(at, vergence, row) for row in np.eye(len(vergence))]
-    return torch.from_numpy(np.stack(each, 1))
+    columns = [np.interp(at, vergence, row) for row in np.eye(len(vergence))]
+    return torch.from_numpy(np.stack(columns, 1))
 
 
 def fast_shape(frame: tuple[int, int]) -> tuple[int, int]:
@@ -302,10 +313,12 @@ def fast_shape(frame: tuple[int, int]) -> tuple[int, int]:
 def frame_maps(
     frame: tuple[int, int], nodes: tuple[int, ...], like: Tensor
 ) -> list[Tensor]:
-    """(y, node rows) and (x, node columns) spline interpolation to a frame's samples.
+    """(y, node rows) and (x, node columns) spline matrices from nodes to samples.
 
     Args:
-        nodes: wavelengths with their weights.
+        frame: (y, x) samples.
+        nodes: numbers of node rows and columns.
+        like: tensor of the dtype and device of the result.
     """
     return [
         spline_matrix(torch.linspace(0, 1, n, dtype=torch.float64), count).to(like)
@@ -319,30 +332,35 @@ def correct_planes(
     """(y, x, depths) flat-field factor by which uniformly illuminated planes stay
     uniform.
 
-    E ← E · (1 + h* · (wanted / found - 1)) at every depth node, where h is the mean PSF
-    of the depth: as Landweber's iteration it does not amplify frequencies whose
-    contrast defocus inverts, as van Cittert's would.
+    E ← E · (1 + h* · (target / image - 1)), twice at every depth node. The target is
+    the plane's image by the nodes' own PSFs, and h the mean PSF of the depth. As
+    Landweber's iteration it does not amplify frequencies whose contrast defocus
+    inverts, as van Cittert's would.
 
     Args:
+        field: PSFs at the nodes and their illumination.
+        maps: spline matrices to the samples (:func:`frame_maps`).
         kernels: (rank, h, w) low-rank kernels.
-        maps: :func:`frame_maps`. weights: (y, x, depths, rank), with their light.
+        weights: (y, x, depths, rank) weights times illumination.
     """
     factor = torch.ones_like(weights[..., 0])
     size = factor.shape[:2]
     h, w = kernels.shape[-2:]
     shape = fast_shape((size[0] + h - 1, size[1] + w - 1))
     transfer = transfer_functions(kernels, shape)
-    for z, plane in enumerate(plane_images(field.light.detach(), maps)):
-        faint = FAINT * plane.abs().max()
-        mean = weights[:, :, z].mean((0, 1)).to(transfer.dtype)
-        back = torch.einsum("r,ryx->yx", mean, transfer).conj()
-        back = back / back[0, 0].abs().clamp_min(1e-30)
-        for _ in range(2):  # each squares what the last left of it
+    for z, target in enumerate(plane_images(field.light.detach(), maps)):
+        faint = FAINT * target.abs().max()
+        mean_weights = weights[:, :, z].mean((0, 1)).to(transfer.dtype)
+        adjoint = torch.einsum("r,ryx->yx", mean_weights, transfer).conj()
+        adjoint = adjoint / adjoint[0, 0].abs().clamp_min(1e-30)
+        for _ in range(2):  # each step squares the relative error
             sources = (weights[:, :, z] * factor[:, :, z, None]).movedim(-1, 0)
             spectrum = (torch.fft.rfft2(sources, s=shape) * transfer).sum(0)
-            found = torch.fft.irfft2(spectrum, s=shape)[: size[0], : size[1]]
-            lack = found * (plane - found) / (found**2 + faint**2)
-            change = torch.fft.irfft2(torch.fft.rfft2(lack, s=shape) * back, s=shape)
+            image = torch.fft.irfft2(spectrum, s=shape)[: size[0], : size[1]]
+            residual = image * (target - image) / (image**2 + faint**2)
+            change = torch.fft.irfft2(
+                torch.fft.rfft2(residual, s=shape) * adjoint, s=shape
+            )
             factor[:, :, z] *= 1 + change[: size[0], : size[1]]
     return factor
 
@@ -369,10 +387,10 @@ def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:
 
 
 def moments(psf: Tensor) -> Tensor:
-    """(n, 3) sum and first moments of PSFs (n, h, w), lengths in half windows.
+    """(n, [sum, x, y]) sum and first moments of PSFs, lengths in half windows.
 
     Args:
-        psf: (..., h, w) PSFs.
+        psf: (n, h, w) PSFs.
     """
     sides = (torch.linspace(-1, 1, n, dtype=psf.dtype) for n in psf.shape[-2:])
     y, x = torch.meshgrid(*sides, indexing="ij")
@@ -381,28 +399,29 @@ def moments(psf: Tensor) -> Tensor:
 
 
 def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
-    """Least change of weights (n, rank) that gives PSFs (n, h, w) sum and centroid.
+    """(n, rank) weights with the least change that makes sum and centroid exact.
 
     A uniformly illuminated plane images as 1 - ∇·centroid + ½ ∇∇:(second moments) - …:
     its first two terms are then exact.
 
     Args:
+        weights: (n, rank) weights of the kernels.
         kernels: (rank, h, w) low-rank kernels.
-        psf: (..., h, w) PSFs.
+        psf: (n, h, w) PSFs whose moments are matched.
     """
-    own = moments(kernels.double())
-    lack = moments(psf.double()) - weights.double() @ own
-    least: Tensor = lack @ torch.linalg.pinv(own)
-    return weights.double() + least
+    kernel_moments = moments(kernels.double())
+    missing = moments(psf.double()) - weights.double() @ kernel_moments
+    change: Tensor = missing @ torch.linalg.pinv(kernel_moments)
+    return weights.double() + change
 
 
 def transfer_functions(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
     """(rank, Y, X // 2 + 1) transforms of kernels (rank, h, w) about their middle.
 
     Args:
-        shape: (y, x) samples.
+        shape: (Y, X) size of the transform, to which kernels are padded with 0.
     """
     h, w = kernels.shape[-2:]
-    whole = pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
-    found: Tensor = torch.fft.rfft2(whole.roll((-(h // 2), -(w // 2)), (-2, -1)))
-    return found
+    padded = pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
+    transfer: Tensor = torch.fft.rfft2(padded.roll((-(h // 2), -(w // 2)), (-2, -1)))
+    return transfer

@@ -27,11 +27,11 @@ from metalens.psf import Polarisation, Source, SpectralNodes
 from metalens.psf import spectrum as spectra
 
 MOST = 57  # nodes along an axis of the field or of 1/z
-# Largest errors of interpolation, and of light folded back, whatever the tolerance:
-# evenly lit planes are then even to half a percent between the nodes.
+# Largest errors of interpolation, and of aliased light, whatever the tolerance:
+# uniformly illuminated planes then vary by half a percent between the nodes.
 NODES_MOST, FOLDED_MOST = 0.005, 0.001
-# Places (x, y) in half fields, out to the rims, where a blur is widest and the more
-# light is folded back.
+# Places (x, y) in half fields, out to the rims, where a blur is widest and most light
+# is aliased.
 PLACES = (
     (-0.95, -0.3),
     (-0.7, 0.6),
@@ -93,7 +93,7 @@ class Grid:
         )
 
     def crop(self, whole: Tensor) -> Tensor:
-        """(…, y, x) samples of an image of the whole frame, without margin and spare."""
+        """(…, y, x) image without margin and spare, from one of the whole frame."""
         edge = self.margin + self.spare
         y, x = (slice(edge, edge + n) for n in self.samples)
         return whole[..., y, x]
@@ -145,13 +145,13 @@ def plan_nodes(
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
     Field nodes are tried on a line at 0.6 of the half height, depth nodes at two field
-    points; PSFs half-way between the nodes judge each number. The spectrum of these
-    trials is coarse. The window follows from what the transform folds back and neglects
-    (:mod:`metalens.image.left_out`), its components from
-    :func:`metalens.image.left_out.choose_polarisation`.
+    points. PSFs half-way between the nodes judge each number. These trials use two
+    wavelengths of the spectrum. The window's period and curvature follow from the light
+    that the transform aliases and neglects (:mod:`metalens.image.left_out`), its
+    components from :func:`metalens.image.left_out.choose_polarisation`.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         grid: samples, step, depths and margin of the image.
         source: spectrum of the source.
         middle_um: (x, y) field point in the middle, um on the sensor.
@@ -164,44 +164,47 @@ def plan_nodes(
     """
     if not 0 < tolerance < 1:
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
-    window, half = Window(grid.window, grid.step_um), grid.half_um
+    half = grid.half_um
     share = tolerance * OTHERS
     waves = waves_of(optics, grid, source, middle_um, half, share)
     coarse = waves if isinstance(source, SpectralNodes) else _coarse(optics, source, 2)
-    ends = depth_nodes(grid, 3)
+    three_depths = depth_nodes(grid, 3)
     window = _unfolded(
         optics,
         coarse,
-        window,
-        (_places(PLACES, middle_um, half), ends),
+        Window(grid.window, grid.step_um),
+        (_places(PLACES, middle_um, half), three_depths),
         min(share, FOLDED_MOST),
     )
 
-    def across(unit: Tensor) -> Tensor:
+    def along_field(unit: Tensor) -> Tensor:
         x = (2 * unit - 1) * half[1]
         at = torch.stack([x, torch.full_like(x, 0.6 * half[0])], -1)
         at = at + torch.tensor(middle_um, dtype=torch.float64)
-        return sum_over_spectrum(optics, at, ends, coarse, window)
+        return sum_over_spectrum(optics, at, three_depths, coarse, window)
 
-    def deep(unit: Tensor) -> Tensor:
+    def along_depth(unit: Tensor) -> Tensor:
         at = _places(((0.0, 0.0), (0.7, -0.4)), middle_um, half)
-        near, far = (1 / d for d in grid.depths_um)
-        depths = 1 / (near + (far - near) * unit)
+        nearest, farthest = (1 / d for d in grid.depths_um)
+        depths = 1 / (nearest + (farthest - nearest) * unit)
         return sum_over_spectrum(optics, at, depths, coarse, window).transpose(0, 1)
 
-    within = min(share, NODES_MOST)
-    count = _node_count(across, within, "field")
-    one = grid.depths_um[0] == grid.depths_um[1]
-    depths = 1 if one else _node_count(deep, within, "range of depths")
-    off_axis = _places(PLACES[1::4], middle_um, half), ends
+    node_tolerance = min(share, NODES_MOST)
+    columns = _node_count(along_field, node_tolerance, "field")
+    depths = 1
+    if grid.depths_um[0] != grid.depths_um[1]:
+        depths = _node_count(along_depth, node_tolerance, "range of depths")
+    off_axis = _places(PLACES[1::4], middle_um, half), three_depths
     if transform_error(JudgedPsfs(optics, coarse, window, off_axis)) > share:
         window = replace(window, curved=True)
-    some = _places((*PLACES[1::4], (0.0, 0.0)), middle_um, half), ends
-    judged = JudgedPsfs(optics, coarse, window, some)
+    with_middle = _places((*PLACES[1::4], (0.0, 0.0)), middle_um, half), three_depths
+    judged = JudgedPsfs(optics, coarse, window, with_middle)
     window = choose_polarisation(judged, polarisation, within=(tolerance, share))
     y, x = (
-        m + h * torch.linspace(-1, 1, _along(count, h / half[1]), dtype=torch.float64)
-        for m, h in zip(middle_um[::-1], half, strict=True)
+        centre
+        + length
+        * torch.linspace(-1, 1, _along(columns, length / half[1]), dtype=torch.float64)
+        for centre, length in zip(middle_um[::-1], half, strict=True)
     )
     return Plan(
         y, x, depth_nodes(grid, depths), waves, window, folds and half[0] == half[1]
@@ -225,42 +228,40 @@ def sum_over_spectrum(
     waves: SpectralNodes,
     window: Window,
 ) -> Tensor:
-    """(points, depths, h, w) PSFs summed over the spectrum; light of each wavelength
-    with its weight.
+    """(points, depths, h, w) PSFs summed over the spectrum, Σ weight · PSF(λ).
+
+    Field points run in parallel on the processor where no gradient is needed.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        at_um: (points, 2) field points on the sensor, um.
-        depths_um: source depths from the lens, um.
-        waves: plane waves behind the lens.
+        optics: wave of the lens, layers and lens-sensor distance.
+        at_um: (points, [x, y]) field points on the sensor, um.
+        depths_um: (depths,) source depths from the lens, um.
+        waves: wavelengths in um with their weights.
+        window: samples of a PSF.
     """
-    pairs = list(
-        zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True)
-    )
-    about = {
-        "depths_um": depths_um,
-        "window": window,
-        "finest_um": min(wave for wave, _ in pairs),
-    }
+    wavelengths = waves.wavelengths_um.tolist()
+    pairs = list(zip(wavelengths, waves.weights.tolist(), strict=True))
+    shared = {"depths_um": depths_um, "window": window, "finest_um": min(wavelengths)}
 
-    def of(place: Tensor) -> Tensor:  # all wavelengths of a point share its rays
+    # all wavelengths of a point share its rays
+    def at_place(place: Tensor) -> Tensor:
         total = torch.zeros(())
         for wave, weight in pairs:
-            total = total + weight * psfs(optics, place, wavelength_um=wave, **about)
+            total = total + weight * psfs(optics, place, wavelength_um=wave, **shared)
         return total
 
     first, *others = at_um.unsqueeze(1)
-    found = [of(first)] + [torch.empty(0)] * len(others)
+    images = [at_place(first)] + [torch.empty(0)] * len(others)
 
-    def some(start: int, stop: int) -> None:
+    def fill(start: int, stop: int) -> None:
         for i in range(start, stop):
-            found[i + 1] = of(others[i])
+            images[i + 1] = at_place(others[i])
 
-    if is_compilable(found[0]):
-        run_split_torch(len(others), torch.no_grad()(some))
+    if is_compilable(images[0]):
+        run_split_torch(len(others), torch.no_grad()(fill))
     else:  # derivatives, or another device
-        some(0, len(others))
-    return torch.cat(found)
+        fill(0, len(others))
+    return torch.cat(images)
 
 
 def _unfolded(
@@ -270,8 +271,16 @@ def _unfolded(
     at: tuple[Tensor, Tensor],
     tolerance: float,
 ) -> Window:
-    """The window with nodes of the least period that folds no more light back than is
-    tolerated, or of the longest.
+    """The window with the shortest period whose aliased light is within the tolerance.
+
+    The period grows by 2^(1/4) at a time, to four widths of the window at most.
+
+    Args:
+        optics: wave of the lens, layers and lens-sensor distance.
+        waves: wavelengths with their weights.
+        window: with the first period.
+        at: field points (n, [x, y]) in um and depths in um, at which it is judged.
+        tolerance: relative error.
     """
     while folding_error(JudgedPsfs(optics, waves, window, at)) > tolerance:
         if window.period >= 4:
@@ -285,7 +294,13 @@ def _places(
     middle_um: tuple[float, float],
     half_um: list[float],
 ) -> Tensor:
-    """(places, [x, y]) of a field, given in its half widths."""
+    """(places, [x, y]) field points, um on the sensor.
+
+    Args:
+        units: (x, y) in half widths of the field.
+        middle_um: (x, y) of its middle.
+        half_um: [y, x] half widths.
+    """
     middle, half = (
         torch.tensor(pair, dtype=torch.float64) for pair in (middle_um, half_um[::-1])
     )
@@ -300,34 +315,35 @@ def waves_of(
     half_um: list[float],
     tolerance: float,
 ) -> SpectralNodes:
-    """As few wavelengths of a source as image within the tolerance at three places; a
-    given rule is kept as it is.
+    """The fewest Gauss wavelengths that image within the tolerance at three places.
+
+    Rules of 1, 2, … 16 wavelengths are compared, each with the next. Wavelengths that
+    come with weights are returned as they are.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         grid: samples, step, depths and margin of the image.
+        source: spectrum of the source.
         middle_um: (x, y) field point in the middle, um on the sensor.
+        half_um: [y, x] half widths of the field.
+        tolerance: relative L2 error of the image.
     """
     if isinstance(source, SpectralNodes):
         return source
-    at = torch.tensor([[0.0, 0.0], [0.5, 0.3], [0.9, 0.8]], dtype=torch.float64)
-    at = at * torch.tensor(
-        [half_um[1], half_um[0]], dtype=torch.float64
-    ) + torch.tensor(middle_um, dtype=torch.float64)
-    ends = depth_nodes(grid, 2)
+    at = _places(((0.0, 0.0), (0.5, 0.3), (0.9, 0.8)), middle_um, half_um)
+    depths = depth_nodes(grid, 2)
     window = Window(grid.window, grid.step_um)
-    last = sum_over_spectrum(optics, at, ends, _coarse(optics, source, 1), window)
-    beside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
+    last = sum_over_spectrum(optics, at, depths, _coarse(optics, source, 1), window)
+    outside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):
         rule = _coarse(optics, source, count)
-        found = sum_over_spectrum(optics, at, ends, rule, window)
-        light = found.sum((-1, -2))
-        error = float(
-            (texture_error(last, found) * light / light.amax(0)).max()
-        )  # of the image, where that is dark too
-        if error + beside <= tolerance:  # of the rule before; this one is finer
-            return replace(_coarse(optics, source, count - 1), error=error + beside)
-        last = found
+        images = sum_over_spectrum(optics, at, depths, rule, window)
+        light = images.sum((-1, -2))
+        # of the image, where that is dark too
+        error = float((texture_error(last, images) * light / light.amax(0)).max())
+        if error + outside <= tolerance:  # of the rule before; this one is finer
+            return replace(_coarse(optics, source, count - 1), error=error + outside)
+        last = images
     raise SceneError(
         f"16 wavelengths leave {error:.2g} of the image, above {tolerance:.2g}: raise the tolerance"
     )
@@ -336,7 +352,7 @@ def waves_of(
 def _coarse(
     optics: Optics, source: Source | spectra.MeasuredSpectrum, count: int
 ) -> SpectralNodes:
-    """So many wavelengths of a spectrum, which the lens's pillars are known for."""
+    """Gauss rule of ``count`` wavelengths, within those of the pillars' library."""
     rule = SpectralNodes(
         *spectra.gauss_rule(*spectra.spectrum_points(source), count), np.nan
     )
@@ -348,7 +364,7 @@ def _coarse(
 
 
 def _along(count: int, length: float) -> int:
-    """Nodes of an axis so many times as long as one of ``count`` nodes."""
+    """Nodes of an axis ``length`` times as long as an axis of ``count`` nodes."""
     return max(TAPS, math.ceil((count - 1) * length) + 1)
 
 
@@ -358,29 +374,33 @@ DARK = (
 )
 
 
-def _node_count(at: Callable[[Tensor], Tensor], tolerance: float, cure: str) -> int:
-    """Number of nodes at equal steps that a line of PSFs needs.
+def _node_count(
+    psfs_at: Callable[[Tensor], Tensor], tolerance: float, cure: str
+) -> int:
+    """Number of nodes at equal steps from which splines interpolate a line of PSFs.
 
-    Half-way between them a textured scene is to err by no more than the tolerance.
+    The image of a textured scene, by PSFs half-way between the nodes, is within the
+    tolerance. Up to ``MOST`` nodes are tried.
 
     Args:
-        at: gives light (places, depths, h, w) at places 0 … 1 of the line.
-        tolerance: relative L2 error. cure: what lowers the number.
+        psfs_at: function from places 0 … 1 of the line to PSFs (places, depths, h, w).
+        tolerance: relative L2 error.
+        cure: words for what to narrow, in the error's text.
     """
     count = 5
     while count <= MOST:
         places = torch.linspace(0, 1, 2 * count - 1, dtype=torch.float64)
-        light = at(places)
+        light = psfs_at(places)
         if not bool((light.sum((-1, -2)) > 0).all()):
             raise SceneError(DARK)
         matrix = spline_matrix(places[1::2], count).to(light)
-        between = torch.tensordot(matrix, light[::2], 1)
-        error = scene_error(between, light[1::2])
+        interpolated = torch.tensordot(matrix, light[::2], 1)
+        error = scene_error(interpolated, light[1::2])
         if error <= tolerance:
             return count
         # errors fall as the distance of nodes to the power of 2.5 and more
-        most = min((error / tolerance) ** 0.4, 2.0) * (count - 1)
-        count = max(count + 2, 1 + 2 * math.ceil(0.45 * most))
+        estimate = min((error / tolerance) ** 0.4, 2.0) * (count - 1)
+        count = max(count + 2, 1 + 2 * math.ceil(0.45 * estimate))
     raise SceneError(
         f"{count - 2} nodes leave {error:.2g} of the image, above {tolerance:.2g}: "
         f"raise the tolerance or the sample, or narrow the {cure}"

@@ -35,12 +35,13 @@ class Window:
     ``step_um``.
 
     curved: with the flux of the second order as well, three times the work.
-    components: of the fields of both polarisations, so many of the strongest mixtures
+    components: number of the strongest mixtures of both polarisations' fields
         (:mod:`metalens.image.polarised`), each as much work as a scalar; 0 for one
         scalar.
-    flux: whether those give the flux through the sensor's plane, which a pixel counts, or |Ex|² + |Ey|² + |Ez|².
-    period: of the nodes, in widths of the window. Light from beyond half of it is seen
-    folded back.
+    flux: whether those give the flux through the sensor's plane, which a pixel counts,
+        or |Ex|² + |Ey|² + |Ez|².
+    period: of the nodes, in widths of the window. The transform folds light from beyond
+        half of it onto the window.
     """
 
     samples: int
@@ -97,7 +98,7 @@ class Samples:
     """Along one axis: (2 samples, points) light of the points of a transform on each
     sample, and below it the
     derivative of that by the sample's place in um; place_um: (samples,) from where the
-    rays are seen."""
+    rays are traced to."""
 
     both: Tensor
     place_um: Tensor
@@ -131,50 +132,44 @@ class Sampling:
 def sampling(
     optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf
 ) -> Sampling:
-    """Nodes that fill the aperture for a window on the axis, where it is widest in p;
-    of the shorter wave.
+    """Nodes of the pupil and size of its padded transform for one window.
+
+    Nodes are at equal steps of p = n sin θ. They fill the aperture as a window on the
+    axis sees it, where it is widest in p. Their step is the wavelength over the period.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
+        window: samples of the PSF and period of the nodes.
         wavelength_um: vacuum wavelength, um.
+        finest_um: shortest wavelength of a spectrum, um; it sets the step.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    edge = float(
-        media.ray_direction(
-            after, torch.tensor(optics.wave.radius_um, dtype=torch.float64)
-        )
-    )
-    if edge > LARGEST_P * after.layers[0][0]:
+    radius = torch.tensor(optics.wave.radius_um, dtype=torch.float64)
+    edge_p = float(media.ray_direction(after, radius))
+    if edge_p > LARGEST_P * after.layers[0][0]:
         raise PropagationError(
-            f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}"
+            f"aperture of NA {edge_p:.2f}: the image engine takes up to {LARGEST_P}"
         )
     step = min(wavelength_um, finest_um) / (
         window.samples * window.step_um * window.period
     )
     period = wavelength_um / step
-    nodes = 2 * math.ceil(edge / step) + 2
+    nodes = 2 * math.ceil(edge_p / step) + 2
     harmonics = math.floor(2 * period / window.step_um)
-    half = window.samples * window.step_um / 2 * window.period / SPARE
+    half_um = window.samples * window.step_um / 2 * window.period / SPARE
     stop = optics.layers.stop
-    open_edge = (
-        edge
-        if stop is None
-        else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
-    )
-    beyond = min(
-        4
-        * math.sqrt(2)
-        / (math.pi**2 * 2 * math.pi / wavelength_um * open_edge * half),
-        0.5,
-    )
+    open_edge_p = edge_p
+    if stop is not None:
+        open_edge_p *= min(1.0, stop.radius_um / optics.wave.radius_um)
+    denominator = math.pi**2 * 2 * math.pi / wavelength_um * open_edge_p * half_um
+    beyond = min(4 * math.sqrt(2) / denominator, 0.5)
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto
     # the last three tenths of them, below 3e-4 of the sharpest image
     size = max(nodes + math.ceil(0.7 * harmonics) + 1, 2 * harmonics + 2)
-    quick = 16 * scipy.fft.next_fast_len(
-        -(-size // 16)
-    )  # a third quicker than sizes that just factorise
+    # multiples of 16 are a third quicker than sizes that just factorise
+    padded_size = 16 * scipy.fft.next_fast_len(-(-size // 16))
     dimmed = beyond * math.pi**2 / (12 * SPARE * window.period)
-    return Sampling(period, nodes, step, quick, harmonics, beyond, dimmed, window)
+    return Sampling(period, nodes, step, padded_size, harmonics, beyond, dimmed, window)
 
 
 def psfs(
@@ -187,28 +182,24 @@ def psfs(
     shift_um: tuple[float, float] = (0.0, 0.0),
     finest_um: float = math.inf,
 ) -> Tensor:
-    """(points, depths, h, w) share of the light on the aperture that falls on each
-    sample from a source of that size.
+    """(points, depths, h, w) PSFs: share of the light on the aperture on each sample.
 
-    The aperture is the stop where the layers have one.
-
-    Source and sample are squares of one step: the light of a point, twice averaged over
-    a square (sinc² in frequency,
-    kept up to its second zero, 2 / step). Constant radiance is then kept to rounding,
-    and nothing rings.
+    The aperture is the stop where the layers have one. Source and sample are squares of
+    one step: the light of a point is averaged twice over a square (sinc² in frequency,
+    cut off at its second zero, 2 / step). Constant radiance then stays constant to
+    rounding, without ringing.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with
-            tangents at_um / reduced
-            distance through the middle of the lens comes from. Without films that is
-            the chief ray.
-        depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in
-            vacuum.
-        shift_um: the window's rays are seen from a place (x, y) beside
-            :func:`metalens.image.rays.landing_offset`;
-            the samples stay. A check of
-            what the transform neglects.
+        optics: wave of the lens, layers and lens-sensor distance.
+        at_um: (points, [x, y]) float64 on the sensor. The source lies on the ray with
+            tangents at_um / reduced distance through the middle of the lens. Without
+            films that is the chief ray.
+        depths_um: (depths,) of the sources, inf for collimated light.
+        wavelength_um: in vacuum.
+        window: samples of the PSFs and components of the field.
+        shift_um: (x, y) from :func:`metalens.image.rays.landing_offset` to where the
+            window's rays are traced; the samples stay. It checks the second-order
+            transform.
         finest_um: shortest wavelength of a spectrum, whose nodes are then those of all
             its wavelengths.
 
@@ -219,11 +210,11 @@ def psfs(
         PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
     grid = sampling(optics, window, wavelength_um, finest_um)
-    own = (grid, depths_um, wavelength_um, min(wavelength_um, finest_um), shift_um)
-    return torch.stack([_one(optics, place, *own) for place in at_um])
+    shared = (grid, depths_um, wavelength_um, min(wavelength_um, finest_um), shift_um)
+    return torch.stack([_point_psfs(optics, place, *shared) for place in at_um])
 
 
-def _one(
+def _point_psfs(
     optics: Optics,
     place: Tensor,
     grid: Sampling,
@@ -232,66 +223,70 @@ def _one(
     finest_um: float,
     shift_um: tuple[float, float],
 ) -> Tensor:
-    """(depths, h, w) PSFs of one field point, seen from where its light lands."""
+    """(depths, h, w) PSFs of one field point: light on each sample over that on the
+    aperture.
+
+    The field on the pupil's nodes is transformed to the sensor, where |U|² is summed
+    over each sample. The window's rays are traced to where the light lands.
+
+    Args:
+        optics: wave of the lens, layers and lens-sensor distance.
+        place: (x, y) field point on the sensor, um.
+        grid: nodes of the pupil and size of the padded transform.
+        depths_um: (depths,) source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
+        finest_um: shortest wavelength of the spectrum, um.
+        shift_um: (x, y) from the landing place to where the rays are traced, um.
+    """
+    finest_media = optics.layers.after(optics.distance_um, finest_um)
     landing = landing_offset(
         optics.layers,
         optics.wave.carrier_rad,
         optics.wave.radius_um,
-        (
-            (float(place[0]), float(place[1])),
-            optics.layers.after(optics.distance_um, finest_um),
-        ),
+        ((float(place[0]), float(place[1])), finest_media),
         depths_um,
         finest_um,
     )
-    ends = tuple(
+    to_samples = tuple(
         _to_samples(grid, offset, shift, place.device)
         for offset, shift in zip(landing, shift_um, strict=True)
     )
-    seen_from = landing[0] + shift_um[0], landing[1] + shift_um[1]
-    found, pupil = node_rays(optics, place, grid, wavelength_um, seen_from)
+    centre_um = landing[0] + shift_um[0], landing[1] + shift_um[1]
+    bundle, pupil = node_rays(optics, place, grid, wavelength_um, centre_um)
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place / after.reduced_um
-    paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
+    paths = source_paths(optics.layers, tangents, bundle, depths_um, wavelength_um)
     light = node_fields(pupil, paths, wavelength_um)
     tilt = math.atan(math.hypot(*tangents.tolist()))
-    factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
-    light = light if factor is None else light * factor.to(torch.complex64)
+    factor = optics.wave.factor(bundle.x_um, bundle.y_um, wavelength_um, tilt)
+    if factor is not None:
+        light = light * factor.to(torch.complex64)
     total: float | Tensor = pupil.given * grid.size**2 * (1 - grid.dimmed)
     if optics.layers.stop is not None:
         shade, taken = stop_amplitudes(
-            optics, tangents, found, depths_um, wavelength_um
+            optics, tangents, bundle, depths_um, wavelength_um
         )
-        light, total = light * shade, total * taken
+        light = light * shade
+        total = total * taken
     mixed = None
     if grid.window.components:
         fields = polarised.polarisation_factors(
-            found, tangents, after.order, flux=grid.window.flux
+            bundle, tangents, after.order, flux=grid.window.flux
         )
         mixed = dominant_components(fields, pupil.weight, grid.window.components)
-    few = (
-        1 if light.device.type == "cpu" else len(light)
-    )  # one depth at a time stays in a processor's cache
-    moves = [
-        _move(slope, ends)
-        for slope in (
-            found.slope,
-            *(found.curvature.unbind(1) if grid.window.curved else ()),
-        )
-    ]
-    second_order = (
-        (found.offset_p, found.offset_p[:, None]) if grid.window.curved else ()
-    )
-    parts = torch.split(light, few)
-    return (
-        torch.cat(
-            [
-                _shown(_fluxes(part, mixed, second_order, grid.size), ends, moves)
-                for part in parts
-            ]
-        )
-        / total
-    )
+    slopes: tuple[Tensor, ...] = (bundle.slope,)
+    second_order: tuple[Tensor, ...] = ()
+    if grid.window.curved:
+        slopes += bundle.curvature.unbind(1)
+        second_order = bundle.offset_p, bundle.offset_p[:, None]
+    moves = [_move(slope, to_samples) for slope in slopes]
+    # one depth at a time stays in a processor's cache
+    at_once = 1 if light.device.type == "cpu" else len(light)
+    images = []
+    for part in torch.split(light, at_once):
+        fluxes = _fluxes(part, mixed, second_order, grid.size)
+        images.append(_shown(fluxes, to_samples, moves))
+    return torch.cat(images) / total
 
 
 def stop_amplitudes(
@@ -301,37 +296,46 @@ def stop_amplitudes(
     depths_um: Tensor,
     wavelength_um: float,
 ) -> tuple[Tensor, Tensor]:
-    """Of each source, (depths, nodes, nodes) amplitude behind the stop over that
-    without, and (depths, 1, 1) light on
-    the stop over that on the whole lens, of sources on the axis.
+    """Amplitude transmission of the aperture stop, and the light that enters it.
+
+    Returns (depths, nodes, nodes) complex amplitude behind the stop over that without
+    it, and (depths, 1, 1) light on the stop over that on the whole lens. The second is
+    (footprint radius / lens radius)², of sources on the axis.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        tangents: tangents of the field angles along x and y.
-        found: what was computed.
+        optics: wave of the lens, layers and lens-sensor distance.
+        tangents: (2,) tangents of the field angles along x and y.
+        found: rays of the nodes.
         depths_um: source depths from the lens, um.
         wavelength_um: vacuum wavelength, um.
     """
-    depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
+    depths = tuple(depths_um.tolist())
+    radius = optics.wave.radius_um
     shade = through_stop(
         optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um
     )
-    each = [
+    taken = [
         (optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2
         for depth in depths
     ]
-    return shade, torch.tensor(each, device=shade.device)[:, None, None]
+    return shade, torch.tensor(taken, device=shade.device)[:, None, None]
 
 
 def _shown(
-    fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]
+    fluxes: list[Tensor], to_samples: tuple[Samples, ...], moves: list[Tensor]
 ) -> Tensor:
-    """(depths, h, w) light of the transforms, moved to second order, on the samples."""
-    plain, change = _moved(fluxes[0], ends, moves[0])
-    shown = plain + change
+    """(depths, h, w) light of the transforms, moved to second order, on the samples.
+
+    Args:
+        fluxes: (depths, size, size) |U|², then the flux along x and y if any.
+        to_samples: transform to the samples along x and along y.
+        moves: shift and divergence of each flux (:func:`_move`).
+    """
+    plain, change = _moved(fluxes[0], to_samples, moves[0])
+    image = plain + change
     for flux, move in zip(fluxes[1:], moves[1:], strict=True):
-        shown = shown + _moved(flux, ends, move)[1]
-    return shown
+        image = image + _moved(flux, to_samples, move)[1]
+    return image
 
 
 def _fluxes(
@@ -340,10 +344,17 @@ def _fluxes(
     second_order: tuple[Tensor, ...],
     size: int,
 ) -> list[Tensor]:
-    """(depths, size, size) |U|² of the transforms of the light on the nodes, and with
-    ``second_order`` the flux along x and y.
+    """(depths, size, size) |U|² of the pupil's transform; with ``second_order`` also
+    the flux Re(U* U_a) along x and y.
 
-    mixed: whose light adds up; None for the scalar.
+    U is the padded FFT of the light, U_a that of the light times offset a.
+
+    Args:
+        light: (depths, nodes, nodes) complex field on the pupil's nodes.
+        mixed: pupils of the polarisation components, whose light adds with their signs;
+            None for one scalar.
+        second_order: offsets of p along x and along y; empty for |U|² alone.
+        size: of the padded transform.
     """
     total: list[Tensor] = []
     pupils = (
@@ -352,58 +363,67 @@ def _fluxes(
         else zip(mixed.signs, mixed.pupils.to(torch.float32), strict=True)
     )
     for sign, pupil in pupils:
-        part = light if pupil is None else light * pupil
-        spectrum = torch.fft.fft2(part, s=(size, size))
-        found = [torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)]
-        for along in second_order:
-            other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
-            found.append(
-                torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)
-            )
-        total = (
-            found
-            if not total
-            else [a + sign * b for a, b in zip(total, found, strict=True)]
-        )
+        field = light if pupil is None else light * pupil
+        u = torch.fft.fft2(field, s=(size, size))
+        fluxes = [torch.addcmul(u.real.square(), u.imag, u.imag)]
+        for offset in second_order:
+            u_a = torch.fft.fft2(field * offset.to(field.real), s=(size, size))
+            fluxes.append(torch.addcmul(u.real * u_a.real, u.imag, u_a.imag))
+        if not total:
+            total = fluxes
+            continue
+        total = [a + sign * b for a, b in zip(total, fluxes, strict=True)]
     return total
 
 
 def _on_samples(
-    power: Tensor, ends: tuple[Samples, ...]
+    power: Tensor, to_samples: tuple[Samples, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(…, h, w) light on the samples, and its derivatives by their places along x and
-    y.
+    """(…, h, w) light on the samples, and its derivatives by x and by y, per um.
+
+    Args:
+        power: (…, size, size) light on the points of the padded transform.
+        to_samples: transform to the samples along x and along y.
     """
-    along_x, along_y = ends
+    along_x, along_y = to_samples
     height, width = len(along_y.place_um), len(along_x.place_um)
     rows = along_y.both @ power
-    plain, down = rows[..., :height, :], rows[..., height:, :]
-    shown = plain @ along_x.both.mT
-    return shown[..., :width], shown[..., width:], down @ along_x.both[:width].mT
+    plain, by_y = rows[..., :height, :], rows[..., height:, :]
+    light = plain @ along_x.both.mT
+    return light[..., :width], light[..., width:], by_y @ along_x.both[:width].mT
 
 
-def _around(ends: tuple[Samples, ...]) -> Tensor:
-    """([x, y], h, w) places of the samples from where the rays are seen, um."""
-    y, x = torch.meshgrid(ends[1].place_um, ends[0].place_um, indexing="ij")
+def _around(to_samples: tuple[Samples, ...]) -> Tensor:
+    """([x, y], h, w) places of the samples from where the rays are traced to, um."""
+    y, x = torch.meshgrid(to_samples[1].place_um, to_samples[0].place_um, indexing="ij")
     return torch.stack([x, y])
 
 
-def _move(slope: Tensor, ends: tuple[Samples, ...]) -> Tensor:
-    """([x, y, divergence], h, w) of the shift s(δ)_j = δᵀ slope_j δ / 2."""
-    at = _around(ends)
-    turned = torch.einsum("jab,byx->jayx", slope.to(at), at)
-    s = torch.einsum("jayx,ayx->jyx", turned, at) / 2
-    return torch.cat([s, (turned[0, 0] + turned[1, 1])[None]])
+def _move(slope: Tensor, to_samples: tuple[Samples, ...]) -> Tensor:
+    """([x, y, divergence], h, w) of the shift s(δ)_j = δᵀ slope_j δ / 2, in um.
+
+    Args:
+        slope: (2, 2, 2) symmetric matrices slope_j, 1/um.
+        to_samples: transform to the samples along x and along y; δ is their place.
+    """
+    delta = _around(to_samples)
+    gradient = torch.einsum("jab,byx->jayx", slope.to(delta), delta)
+    shift = torch.einsum("jayx,ayx->jyx", gradient, delta) / 2
+    return torch.cat([shift, (gradient[0, 0] + gradient[1, 1])[None]])
 
 
 def _moved(
-    power: Tensor, ends: tuple[Samples, ...], move: Tensor
+    power: Tensor, to_samples: tuple[Samples, ...], move: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and
-    ∇·(s P): how it changes where it is
-    moved by s (see :func:`_move`)."""
-    plain, across, down = _on_samples(power, ends)
-    return plain, plain * move[2] + move[0] * across + move[1] * down
+    """(depths, h, w) power P on the samples, and ∇·(s P), its change by the shift s.
+
+    Args:
+        power: (depths, size, size) |U|², or a component of the flux.
+        to_samples: transform to the samples along x and along y.
+        move: shift s along x and y, and its divergence (:func:`_move`).
+    """
+    plain, by_x, by_y = _on_samples(power, to_samples)
+    return plain, plain * move[2] + move[0] * by_x + move[1] * by_y
 
 
 def node_rays(
@@ -413,42 +433,49 @@ def node_rays(
     wavelength_um: float,
     beside_um: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Rays, Pupil]:
-    """The rays of the nodes to a place beside the field point, and the lens' carrier
-    with the path to there.
+    """Rays from the pupil's nodes to a place near the field point, with their weight
+    and phase.
+
+    The phase is the lens' carrier plus 2π/λ times the path to that place, rad.
 
     Args:
-        optics: lens, light and distances at the nodes.
-        grid: samples, step, depths and margin of the image.
+        optics: wave of the lens, layers and lens-sensor distance.
+        place: (x, y) field point on the sensor, um.
+        grid: number of nodes and their step of p.
         wavelength_um: vacuum wavelength, um.
+        beside_um: (x, y) from the field point to where the rays go, um.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    at = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
-    found = rays(
-        after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device
+    target_um = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
+    bundle = rays(
+        after, optics.wave.radius_um, target_um, (grid.nodes, grid.step), place.device
     )
     phase = (
-        optics.wave.carrier_rad(found.x_um, found.y_um)
-        + 2 * math.pi / wavelength_um * found.away_um
+        optics.wave.carrier_rad(bundle.x_um, bundle.y_um)
+        + 2 * math.pi / wavelength_um * bundle.away_um
     )
-    return found, Pupil(
-        found.whole * found.passed,
+    return bundle, Pupil(
+        bundle.whole * bundle.passed,
         phase,
-        float((found.whole * found.width_um).sum()) / grid.step,
+        float((bundle.whole * bundle.width_um).sum()) / grid.step,
     )
 
 
 def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
-    """(depths, *shape) complex64 light on the nodes, the factor of the wave left out;
-    compiled on the processor.
+    """(depths, *shape) complex64 field weight · exp(iφ) on the pupil's nodes.
+
+    φ is the phase of the pupil plus 2π/λ times the source's path. The wave's factor is
+    not in it. On the processor a compiled loop computes it.
 
     Args:
-        pupil: sampled pupil of the lens.
+        pupil: weight and phase of the rays of the nodes.
+        paths: optical paths from the sources of all depths to the lens.
         wavelength_um: vacuum wavelength, um.
     """
     turns = pupil.phase_rad / (2 * math.pi)
     if turns.device.type == "cpu":
-        given = pupil.weight, turns, paths.few_um / wavelength_um, paths.mix
-        return torch.from_numpy(compiled.phasors(*(part.numpy() for part in given)))
+        parts = pupil.weight, turns, paths.few_um / wavelength_um, paths.mix
+        return torch.from_numpy(compiled.phasors(*(part.numpy() for part in parts)))
     turns = turns + paths.um / wavelength_um
     angle = ((turns - torch.round(turns)) * (2 * math.pi)).to(torch.float32)
     return torch.polar(pupil.weight.to(torch.float32).expand_as(angle), angle)
@@ -458,33 +485,36 @@ def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 def _to_samples(
     grid: Sampling, view_um: float, shift_um: float, device: torch.device
 ) -> Samples:
-    """From the points of the padded transform to the samples along an axis: sinc² up to
-    its second zero.
+    """Matrix from the points of the padded transform to the samples along one axis.
 
-    Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics
-    to harmonics, by a transform.
-    Samples more than half a period from where the light lands are dark, since the
-    transform has other light there; 1e-6 keeps the shape of a PSF of next to nothing.
+    Its element of sample and point m is Σ_h sinc²(h step / period)
+    exp(2πi h (place / period + m / size)), h from -harmonics to harmonics: sinc² up to
+    its second zero, by a transform. Samples more than half a period from where the
+    light lands are dark, as the transform folds other light onto them. Their factor
+    1e-6 keeps the shape of a PSF that has next to no light.
+
+    Args:
+        grid: nodes of the pupil and size of the padded transform.
+        view_um: from the field point to where the light lands, um.
+        shift_um: from there to where the rays are traced, um.
+        device: of the matrices.
     """
-    window, harmonic = grid.window, np.arange(grid.harmonics + 1)
+    window = grid.window
+    harmonic = np.arange(grid.harmonics + 1)
     box = np.sinc(harmonic / grid.period_um * window.step_um) ** 2
-    place = (
-        np.arange(window.samples) - (window.samples - 1) / 2
-    ) * window.step_um - view_um
-    seen_as = np.where(np.abs(place) <= grid.period_um / 2, 1.0, 1e-6)
+    index = np.arange(window.samples) - (window.samples - 1) / 2
+    place = index * window.step_um - view_um
+    inside = np.where(np.abs(place) <= grid.period_um / 2, 1.0, 1e-6)
     place = place - shift_um
-    wave = (
-        seen_as[:, None]
-        * box
-        * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
-    )
+    turns = place[:, None] / grid.period_um * harmonic % 1
+    spectrum = inside[:, None] * box * np.exp(2j * np.pi * turns)
     scale = window.step_um / grid.period_um * grid.size
-    light = scale * np.fft.irfft(wave, grid.size)
+    light = scale * np.fft.irfft(spectrum, grid.size)
     slope = scale * np.fft.irfft(
-        wave * (2j * np.pi / grid.period_um * harmonic), grid.size
+        spectrum * (2j * np.pi / grid.period_um * harmonic), grid.size
     )
-    found = [
-        torch.from_numpy(a.astype(np.float32)).to(device)
-        for a in (np.concatenate([light, slope]), place)
-    ]
-    return Samples(found[0], found[1])
+    matrix = np.concatenate([light, slope]).astype(np.float32)
+    return Samples(
+        torch.from_numpy(matrix).to(device),
+        torch.from_numpy(place.astype(np.float32)).to(device),
+    )

@@ -67,8 +67,7 @@ class Field:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PupilView:
-    """The pupil as viewed from the window's centre, on (nodes, nodes) direction cosines;
-    float64.
+    """The pupil from the window's centre, on (nodes, nodes) direction cosines; float64.
 
     x_um, y_um: where the rays leave the lens. weight: share of each cell inside the
     aperture, and the solid angle.
@@ -147,15 +146,12 @@ def amplitude(pupil: Pupil) -> Tensor:
 
 
 def aperture_light(pupil: Pupil, window_um: float) -> float:
-    """What |U|² of all nodes is over, so that a window of this width holds the share
-    that a sharp round rim sends it.
+    """Σ |U|² of the light on the aperture, by which PSFs are divided, in nodes.
 
-    The area of the aperture in nodes: the squares of the weights sum to less, as a node
-    across the rim has the mean
-    field of its width. What such nodes send to X is dimmed by sinc²(X / period); so of
-    a rim at p, which sends
-    4√2 / (π² k p X) of the light beyond ±X, the window lacks ∫ (1 - sinc²) of that, to
-    second order.
+    It is the area of the aperture in nodes, less the part that a window lacks. A node
+    across the rim has the mean field of its width, which dims its light at X by
+    sinc²(X / period). A sharp rim at p sends 4√2 / (π² k p X) of the light beyond ±X.
+    The window thus lacks ∫ (1 - sinc²) of that, here to second order.
 
     Args:
         pupil: sampled pupil of the lens.
@@ -163,9 +159,9 @@ def aperture_light(pupil: Pupil, window_um: float) -> float:
     """
     step = 2 * pupil.edge / pupil.nodes
     k = 2 * math.pi / pupil.wavelength_um
-    given = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
+    nodes = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
     dimmed = 2 * math.sqrt(2) * window_um / (3 * k * pupil.edge * pupil.period_um**2)
-    return given * (1 - dimmed)
+    return nodes * (1 - dimmed)
 
 
 def psf(
@@ -203,16 +199,17 @@ def psf(
         )
     to_window = kernel(pupil, sample_um, samples)
     k = 2 * math.pi / pupil.wavelength_um
-    added = wrap_phase(phase_rad).float()
+    added_phase = wrap_phase(phase_rad).float()
     angles, weights = [], []
     for depth, field in zip(
         depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True
     ):
         view = view_pupil(pupil, field, float(focus_um))
         path = source_path(view.x_um, view.y_um, field.tangents, 1 / depth)
-        known = wrap_phase(view.lens_rad + k * path).float()
+        lens_phase = wrap_phase(view.lens_rad + k * path).float()
         angles.append(
-            known + (added if view.node is None else added.reshape(-1)[view.node])
+            lens_phase
+            + (added_phase if view.node is None else added_phase.reshape(-1)[view.node])
         )
         weights.append(view.weight.float())
     image = to_window @ (
@@ -226,12 +223,18 @@ def psf(
 
 @functools.lru_cache(maxsize=64)
 def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
-    """The pupil from the place where the chief ray of a field meets the sensor.
+    """The pupil as viewed from where the chief ray of a field meets the sensor.
+
+    Nodes are at equal steps of the direction cosines from that place, centred on those
+    that the aperture fills. On the axis they are the pupil's own nodes.
 
     Args:
-        focus_um: source distance in focus, um.
+        pupil: sampled aperture of the lens.
+        field: direction of the source.
+        focus_um: source distance that the lens images onto the sensor, um.
     """
-    d, k = pupil.sensor_distance_um, 2 * math.pi / pupil.wavelength_um
+    d = pupil.sensor_distance_um
+    k = 2 * math.pi / pupil.wavelength_um
     if not field.angle_rad:
         x, y = coordinates(pupil)
         return PupilView(
@@ -242,14 +245,14 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
     qy, qx = torch.meshgrid(
         node_cosines(pupil) + my, node_cosines(pupil) + mx, indexing="ij"
     )
-    rest = (1 - qx**2 - qy**2).clamp_min(1e-3)
-    x = cx + qx * d / torch.sqrt(rest)
-    y = cy + qy * d / torch.sqrt(rest)
-    r2, n = x**2 + y**2, pupil.nodes
-    step = (
-        2 * pupil.edge / n * d / torch.sqrt(rest)
-    )  # of the nodes, on the lens, across the line of sight
-    weight = ((pupil.radius_um - torch.sqrt(r2)) / step + 0.5).clamp(0, 1) / rest
+    cosine2 = (1 - qx**2 - qy**2).clamp_min(1e-3)
+    x = cx + qx * d / torch.sqrt(cosine2)
+    y = cy + qy * d / torch.sqrt(cosine2)
+    r2 = x**2 + y**2
+    n = pupil.nodes
+    # of the nodes, on the lens, across the line of sight
+    step = 2 * pupil.edge / n * d / torch.sqrt(cosine2)
+    weight = ((pupil.radius_um - torch.sqrt(r2)) / step + 0.5).clamp(0, 1) / cosine2
     path = torch.sqrt(r2 + d**2)
     row, column = (
         torch.round(a / path * n / (2 * pupil.edge) + (n - 1) / 2)
@@ -264,8 +267,7 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
 
 
 def wrap_phase(phase_rad: Tensor) -> Tensor:
-    """The phase less whole turns, so that single precision holds it; the gradient is
-    that of the phase.
+    """Phase less whole turns, -π to π rad, with the gradient of the phase.
 
     Args:
         phase_rad: phase, rad.
@@ -274,7 +276,7 @@ def wrap_phase(phase_rad: Tensor) -> Tensor:
 
 
 def _middle(radius_um: float, cx: float, cy: float, d: float) -> tuple[float, float]:
-    """Middle of the direction cosines that the aperture fills."""
+    """(x, y) middle of the direction cosines from (cx, cy) to the aperture's rim."""
     turn = torch.arange(256, dtype=torch.float64) * (2 * math.pi / 256)
     x = radius_um * torch.cos(turn) - cx
     y = radius_um * torch.sin(turn) - cy

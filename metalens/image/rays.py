@@ -19,15 +19,16 @@ VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rays:
-    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the
-    lens.
+    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64.
 
-    width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed:
-    root of the power that faces let
-    through; away_um: path to the window's centre less that along the normal. offset_p:
-    (nodes,) p - p0 along x and along
-    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`path_derivatives`
-    there.
+    x_um, y_um: where the rays leave the lens.
+    width_um: of a node on the lens.
+    whole: √spread of each ray, 0 beyond the rim.
+    passed: root of the power that passes the faces.
+    away_um: path to the window's centre less that along the normal.
+    offset_p: (nodes,) p - p0 along x and along y.
+    middle: (x, y) of p0, the middle of the pupil.
+    slope, curvature: :func:`path_derivatives` at p0.
     """
 
     x_um: Tensor
@@ -65,39 +66,45 @@ def rays(
     nodes: tuple[int, float],
     device: torch.device,
 ) -> Rays:
-    """Rays to a place (x, y) of the sensor from a lens of this radius; nodes: their
-    number and their step of p.
+    """Rays from a round lens to a place on the sensor, at equal steps of p = n sin θ.
+
+    The nodes are centred on the middle of the pupil. A node across the rim has the
+    share of its width that lies within the radius.
 
     Args:
         after: media behind the pillars.
-        at_um: (points, 2) field points on the sensor, um.
-        device: torch device.
+        radius: of the lens, um.
+        at_um: (x, y) place on the sensor, um.
+        nodes: number along each axis, and their step of p.
+        device: of the tensors.
     """
-    count, width = nodes
+    count, step = nodes
     centre = torch.tensor(at_um, dtype=torch.float64, device=device)
     axis = (
         torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2
-    ) * width
-    turn = torch.arange(256, dtype=torch.float64, device=device) * (2 * math.pi / 256)
-    rim = centre - radius * torch.stack([torch.cos(turn), torch.sin(turn)], -1)
-    far = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
-    edge = media.ray_direction(after, far)[:, None] * rim / far[:, None]
-    middle = (edge.amin(0) + edge.amax(0)) / 2
+    ) * step
+    azimuth = torch.arange(256, dtype=torch.float64, device=device) * (
+        2 * math.pi / 256
+    )
+    rim = centre - radius * torch.stack([torch.cos(azimuth), torch.sin(azimuth)], -1)
+    rim_reach = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
+    rim_p = media.ray_direction(after, rim_reach)[:, None] * rim / rim_reach[:, None]
+    middle = (rim_p.amin(0) + rim_p.amax(0)) / 2
     py, px = torch.meshgrid(axis + middle[1], axis + middle[0], indexing="ij")
     p = torch.hypot(px, py).clamp(1e-12, 0.98 * after.layers[0][0])
-    out = media.lateral_reach(after, p) / p
-    x, y = centre[0] - out * px, centre[1] - out * py
+    reach_per_p = media.lateral_reach(after, p) / p
+    x = centre[0] - reach_per_p * px
+    y = centre[1] - reach_per_p * py
     r = torch.hypot(x, y).clamp_min(1e-9)
-    wide = torch.sqrt(media.area_spreading(after, p))
-    inside = ((radius - r) / (wide * width) + 0.5).clamp(
-        0, 1
-    )  # of a node across the rim, as wide as r changes with p
+    root_spread = torch.sqrt(media.area_spreading(after, p))
+    # share of each node within the rim; r changes over a node by root_spread * step
+    inside = ((radius - r) / (root_spread * step) + 0.5).clamp(0, 1)
     passed = torch.sqrt(media.transmitted_power(after.order, p))
     return Rays(
         x,
         y,
-        wide * width,
-        inside * wide,
+        root_spread * step,
+        inside * root_spread,
         passed,
         media.relative_path(after, p),
         axis,
@@ -114,9 +121,9 @@ def through_stop(
     depths_um: tuple[float, ...],
     wavelength_um: float,
 ) -> Tensor:
-    """(depths, *shape) complex64 amplitude of each source's light behind the stop at
-    (x, y), over that without; 0
-    beyond the rim of the lens.
+    """(depths, *shape) complex64 amplitude behind the stop over that without it.
+
+    It is that of each source's light at the rays' places on the lens; 0 beyond the rim.
 
     Args:
         layers: films and stop of the lens.
@@ -130,10 +137,10 @@ def through_stop(
         part.cpu().numpy()[inside_rim]
         for part in (bundle.x_um, bundle.y_um, bundle.width_um)
     )
-    out = np.zeros((len(depths_um), *inside_rim.shape), np.complex64)
-    for one, depth in zip(out, depths_um, strict=True):
-        one[inside_rim] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
-    return torch.from_numpy(out).to(bundle.x_um.device)
+    shades = np.zeros((len(depths_um), *inside_rim.shape), np.complex64)
+    for shade, depth in zip(shades, depths_um, strict=True):
+        shade[inside_rim] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
+    return torch.from_numpy(shades).to(bundle.x_um.device)
 
 
 def landing_offset(
@@ -144,75 +151,77 @@ def landing_offset(
     depths_um: Tensor,
     wavelength_um: float,
 ) -> tuple[float, float]:
-    """(x, y) um beside a field point at which its light lands, mean over its rays and
-    depths; (0, 0) without a stop.
+    """(x, y) from a field point to the centroid of its light on the sensor, um.
 
-    A ray of direction p lands at -(1/k) ∂(phase)/∂p. A stop before a lens lets light
-    from the side through one part of
-    it alone, by which it lands beside the ray through the middle.
+    The mean over rays and depths; (0, 0) without a stop. A ray of direction p lands at
+    -(1/k) ∂(phase)/∂p. Oblique light through a stop crosses a part of the lens alone,
+    and so lands off the ray through the lens' middle.
 
     Args:
         layers: films and stop of the lens.
-        radius: radius of the aperture or circle, um.
-        depths_um: source depths from the lens, um.
+        carrier_rad: phase of the lens at places (x, y), rad.
+        radius: of the lens, um.
+        seen_from: (x, y) field point in um, and the media behind the lens.
+        depths_um: (depths,) source depths from the lens, um.
         wavelength_um: vacuum wavelength, um.
-        carrier_rad: phase of the lens at places (x, y). seen_from: the field point, and
-            the media behind the lens.
     """
     if layers.stop is None:
         return 0.0, 0.0
     place, after = seen_from
     rim, count = torch.tensor(radius, dtype=torch.float64), 24
     step = 2 * float(media.ray_direction(after, rim)) / count
-    found = rays(after, radius, place, (count, step), torch.device("cpu"))
+    bundle = rays(after, radius, place, (count, step), torch.device("cpu"))
     tangents = place[0] / after.reduced_um, place[1] / after.reduced_um
-    own = (
-        carrier_rad(found.x_um, found.y_um) * (wavelength_um / (2 * math.pi))
-        + found.away_um
+    lens_path = (
+        carrier_rad(bundle.x_um, bundle.y_um) * (wavelength_um / (2 * math.pi))
+        + bundle.away_um
     )
-    paths = (
-        own
-        + source_paths(
-            layers, torch.tensor(tangents), found, depths_um, wavelength_um
-        ).um
+    before = source_paths(
+        layers, torch.tensor(tangents), bundle, depths_um, wavelength_um
     )
+    paths = lens_path + before.um
     sums = torch.zeros(3, dtype=torch.float64)
     for depth, path in zip(depths_um.tolist(), paths, strict=True):
-        light = found.whole**2 * layers.stop_share(
-            tangents, depth, wavelength_um, (found.x_um, found.y_um), found.width_um
+        light = bundle.whole**2 * layers.stop_share(
+            tangents, depth, wavelength_um, (bundle.x_um, bundle.y_um), bundle.width_um
         )
-        y, x = torch.gradient(path, spacing=step)
-        sums += torch.stack([-(light * x).sum(), -(light * y).sum(), light.sum()])
-    x_um, y_um, given = sums.tolist()
-    return (x_um / given, y_um / given) if given > 0 else (0.0, 0.0)
+        by_y, by_x = torch.gradient(path, spacing=step)
+        sums += torch.stack([-(light * by_x).sum(), -(light * by_y).sum(), light.sum()])
+    x_um, y_um, total = sums.tolist()
+    return (x_um / total, y_um / total) if total > 0 else (0.0, 0.0)
 
 
 def path_derivatives(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
     """(j, a, b) ∂H/∂p_j and (i, j, a, b) ∂²H/∂p_i∂p_j at a direction, 1/um.
 
-    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of
-    1e-3, exact to 1e-5 of them.
+    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it. Central
+    differences with a step of 1e-3 are exact to 1e-5.
 
     Args:
         after: media behind the pillars.
+        middle: (x, y) direction p.
     """
     step = 1e-3
     unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
     ends = torch.stack([unit, -unit])  # (sign, axis, 2)
-    ahead, behind = _turning(after, middle + ends)
-    both = _turning(
+    forward, backward = _turning(after, middle + ends)
+    second = _turning(
         after, middle + ends[:, :, None, None] + ends
     )  # (sign, i, sign, j, a, b)
-    slopes = (both[:, :, 0] - both[:, :, 1]) / (2 * step)
-    return (ahead - behind) / (2 * step), (slopes[0] - slopes[1]) / (2 * step)
+    slopes = (second[:, :, 0] - second[:, :, 1]) / (2 * step)
+    return (forward - backward) / (2 * step), (slopes[0] - slopes[1]) / (2 * step)
 
 
 def _turning(after: Media, p: Tensor) -> Tensor:
-    """(…, 2, 2) H of directions (…, 2): how the direction towards a window turns as the
-    window moves.
+    """(…, 2, 2) H = ∂p/∂X: change of a ray's direction p by its place X, 1/um.
+
+    Args:
+        after: media behind the pillars.
+        p: (…, [x, y]) directions.
     """
     size = torch.hypot(p[..., 0], p[..., 1]).clamp_min(1e-9)
-    reach, unit = media.lateral_reach(after, size), p / size[..., None]
+    reach = media.lateral_reach(after, size)
+    unit = p / size[..., None]
     along, across = (
         part[..., None, None]
         for part in (reach / (size * media.area_spreading(after, size)), size / reach)
@@ -231,12 +240,10 @@ def source_paths(
     depths_um: Tensor,
     wavelength_um: float,
 ) -> Paths:
-    """Optical path from each source to the lens at (x, y), less the path to its middle.
+    """Optical path from each source to the lens at (x, y), less that to its middle, um.
 
     More depths than ``VERGENCES`` are interpolated between that many Chebyshev points
-    of 1/z: the path is smooth there
-    (singular only where a source touches the lens), and the points cost what the
-    sources would.
+    of 1/z. The path is smooth in 1/z but for a source that touches the lens.
 
     Args:
         layers: films and stop of the lens.
@@ -262,32 +269,41 @@ def _source_paths(
     wavelength_um: float | None,
 ) -> Paths:
     """As :func:`source_paths`; without films in front no wavelength is needed."""
-    given = layers, tangents, bundle
+    shared = layers, tangents, bundle
     if len(depths_um) <= VERGENCES:
-        few = _each(*given, depths_um, wavelength_um)
+        few = _paths_by_depth(*shared, depths_um, wavelength_um)
         return Paths(few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device))
     inverse = 1 / np.array(depths_um)
-    low, high = float(inverse.min()), float(inverse.max())
-    unit = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
-    nodes = (low + high) / 2 + (high - low) / 2 * unit
-    value = np.polynomial.chebyshev.chebvander(unit, VERGENCES - 1)
-    wanted = (2 * inverse - low - high) / (high - low)
-    mix = np.polynomial.chebyshev.chebvander(wanted, VERGENCES - 1) @ np.linalg.inv(
-        value
-    )
-    few = _each(*given, tuple((1 / nodes).tolist()), wavelength_um)
+    least, largest = float(inverse.min()), float(inverse.max())
+    unit_nodes = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
+    nodes = (least + largest) / 2 + (largest - least) / 2 * unit_nodes
+    basis = np.polynomial.chebyshev.chebvander(unit_nodes, VERGENCES - 1)
+    unit_depths = (2 * inverse - least - largest) / (largest - least)
+    mix = np.polynomial.chebyshev.chebvander(
+        unit_depths, VERGENCES - 1
+    ) @ np.linalg.inv(basis)
+    few = _paths_by_depth(*shared, tuple((1 / nodes).tolist()), wavelength_um)
     return Paths(few, torch.from_numpy(mix).to(few))
 
 
-def _each(
+def _paths_by_depth(
     layers: Layers,
     tangents: tuple[float, float],
     bundle: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
 ) -> Tensor:
-    """(depths, *shape) paths in um, one depth after the other; beyond the rim, behind
-    films, those of places at it.
+    """(depths, *shape) optical paths from each source, less that to the middle, um.
+
+    In a single medium, √(z² + ρ²) less the same at the middle. Through films, a
+    Chebyshev interpolant of the squared reach, which is clamped at the rim of the lens.
+
+    Args:
+        layers: films before the lens.
+        tangents: (x, y) slopes of the ray to the lens' middle.
+        bundle: rays of the nodes, with their places on the lens.
+        depths_um: source depths, inf for a plane wave.
+        wavelength_um: in vacuum; None where no film lies before the lens.
     """
     x, y = bundle.x_um, bundle.y_um
     slope = math.hypot(*tangents)
@@ -302,33 +318,28 @@ def _each(
             if wavelength_um is None
             else layers.before(depth, wavelength_um)
         )
-        back = (
-            float(media.lateral_reach(before, p)) / slope
-            if slope > 0
-            else before.reduced_um
-        )
-        sx, sy = -back * tangents[0], -back * tangents[1]
-        if (
-            len(before.layers) == 1
-        ):  # √(z² + ρ²) less the same at the middle, without cancellation
+        distance = before.reduced_um
+        if slope > 0:
+            distance = float(media.lateral_reach(before, p)) / slope
+        sx = -distance * tangents[0]
+        sy = -distance * tangents[1]
+        if len(before.layers) == 1:  # a difference of roots without cancellation
             extra = x * x + y * y - 2 * (x * sx + y * sy)
             chief = math.sqrt(depth**2 + sx**2 + sy**2)
             out.append(
                 before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief)
             )
-        else:
-            chief = float(media.path_of_reach(before, np.float64(math.hypot(sx, sy))))
-            away2 = (x - sx) ** 2 + (y - sy) ** 2
-            away2 = away2.clamp(max=float((away2 * (bundle.whole > 0)).max()))
-            out.append(
-                interpolant.chebyshev_interpolant(
-                    functools.partial(_chord, before), away2
-                )
-                - chief
-            )
+            continue
+        chief = float(media.path_of_reach(before, np.float64(math.hypot(sx, sy))))
+        reach2 = (x - sx) ** 2 + (y - sy) ** 2
+        reach2 = reach2.clamp(max=float((reach2 * (bundle.whole > 0)).max()))
+        path = interpolant.chebyshev_interpolant(
+            functools.partial(_chord, before), reach2
+        )
+        out.append(path - chief)
     return torch.stack(out)
 
 
-def _chord(before: Media, away2: Any) -> Any:
-    """:func:`metalens.optics.media.path_of_reach` of the squared reach; NumPy or torch."""
-    return media.path_of_reach(before, away2**0.5)
+def _chord(before: Media, reach2: Any) -> Any:
+    """:func:`metalens.optics.media.path_of_reach` of the squared reach, um."""
+    return media.path_of_reach(before, reach2**0.5)

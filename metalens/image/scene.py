@@ -31,11 +31,11 @@ class Frames:
             or self.coverage.shape != shape
             or self.depth_um.shape != shape
         ):
-            found = [
+            shapes = [
                 tuple(a.shape) for a in (self.radiance, self.coverage, self.depth_um)
             ]
             raise SceneError(
-                f"radiance, coverage, depth have shapes {found}, need the same (frames, 2, y, x)"
+                f"radiance, coverage, depth have shapes {shapes}, need the same (frames, 2, y, x)"
             )
 
     def to(self, device: torch.device | str) -> "Frames":
@@ -59,16 +59,17 @@ class Layers:
 
 
 def cut_layers(frames: Frames, depths_um: Tensor) -> Layers:
-    """Cut frames into layers at these depths (ascending), leaving out the empty ones.
+    """Layers of frames at fixed depths, without empty layers.
 
-    A source between two layers is shared by both, linearly in 1/z.
+    A source between two depths is split between both, linearly in 1/z.
 
     Args:
-        depths_um: source depths from the lens, um.
+        frames: sheets with their depths.
+        depths_um: (layers,) ascending, um.
     """
     vergence = 1 / depths_um.to(frames.depth_um)
     position = 1 / frames.depth_um.clamp(float(depths_um[0]), float(depths_um[-1]))
-    parts, cover, where, near = [], [], [], []
+    radiance, coverage, depths, near = [], [], [], []
     for sheet in (0, 1):
         for k, node in enumerate(vergence):
             below = vergence[max(k - 1, 0)] - node
@@ -81,13 +82,13 @@ def cut_layers(frames: Frames, depths_um: Tensor) -> Layers:
             )
             share = share.clamp(0, 1)
             if bool((share * frames.coverage[:, sheet] > 0).any()):
-                parts.append(share * frames.radiance[:, sheet])
-                cover.append(share * frames.coverage[:, sheet])
-                where.append(depths_um[k])
+                radiance.append(share * frames.radiance[:, sheet])
+                coverage.append(share * frames.coverage[:, sheet])
+                depths.append(depths_um[k])
                 near.append(sheet == 0)
     return Layers(
-        torch.stack(parts, 1),
-        torch.stack(cover, 1),
-        torch.stack(where),
+        torch.stack(radiance, 1),
+        torch.stack(coverage, 1),
+        torch.stack(depths),
         torch.tensor(near),
     )

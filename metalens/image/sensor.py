@@ -68,23 +68,22 @@ def mean_electrons(
     """Expected electrons of every pixel, before noise and saturation.
 
     Args:
-        sample_um: step of the samples, um.
         irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e``
             electrons.
+        sample_um: step of the samples, um.
+        sensor: pitch, exposure and ambient light.
         pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
         count: pixels along each axis.
-        grid_um: see :func:`metalens.psf.pixel_weights`; light and ambient are then those of a pixel
-            of this size.
+        grid_um: see :func:`metalens.psf.pixel_weights`; light and ambient are then
+            those of a pixel of this size.
 
     Returns:
         (..., rows, columns): kappa times (exposure times mean irradiance plus ambient),
         at least 0.
     """
-    pitch = (
-        torch.as_tensor(sensor.pitch_um, dtype=torch.float64)
-        if pitch_um is None
-        else pitch_um
-    )
+    pitch = pitch_um
+    if pitch is None:
+        pitch = torch.as_tensor(sensor.pitch_um, dtype=torch.float64)
     shape = None if count is None else (count, count)
     light = integrate_pixels(
         irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um
@@ -97,19 +96,18 @@ def mean_electrons(
 
 
 def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Poisson counts k of this mean m, with a gradient that has the right moments:
-    dk/dm = (1 + k / m) / 2.
+    """Poisson counts k of mean m, with the surrogate gradient dk/dm = (1 + k / m) / 2.
 
-    The expectation of the gradient of k is 1 and of k² is 2m + 1, those of the true
-    distribution for every m > 0;
-    for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong
-    skewness, and negative counts.
+    The expected gradient of k is 1 and that of k² is 2m + 1, as of the true
+    distribution for every m > 0. That of k³ is too high by 1/2, against 3m² + 6m + 1. A
+    Gaussian instead has a wrong skewness and negative counts.
 
     Args:
+        mean: expected counts m.
         generator: of the random draws; the global one without it.
     """
-    where = mean.device if generator is None else generator.device
-    count = torch.poisson(mean.detach().to(where), generator=generator).to(mean.device)
+    device = mean.device if generator is None else generator.device
+    count = torch.poisson(mean.detach().to(device), generator=generator).to(mean.device)
     safe = mean.detach().clamp_min(torch.finfo(mean.dtype).tiny)
     slope = torch.where(mean.detach() > 0, 0.5 * (1 + count / safe), 1.0)
     return count + slope * (mean - mean.detach())
@@ -122,12 +120,13 @@ def expose(
     generator: torch.Generator | None = None,
     reads: float | Tensor = 1.0,
 ) -> Tensor:
-    """Electrons read from pixels that expect ``mean``: photon noise, full well, read
-    noise of ``reads`` reads each.
+    """Electrons read from pixels: Poisson counts up to full well, plus read noise.
 
-    Saturated pixels have gradient 0.
+    The read noise is Gaussian, of √reads times that of one read. Saturated pixels have
+    gradient 0.
 
     Args:
+        mean: expected electrons of every pixel.
         sensor: pixels, gain and noise of the sensor.
         generator: of the random draws; the global one without it.
     """
@@ -143,24 +142,29 @@ def expose(
 def normal(
     shape: tuple[int, ...], like: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """Standard normal numbers of the kind of ``like``, where it lies: drawn where the
-    generator is, so that the same
-    seed gives the same noise on every device.
+    """Standard normal numbers, of the dtype and device of ``like``.
+
+    They are drawn on the generator's device, so that a seed gives the same noise on
+    every device.
 
     Args:
-        shape: (y, x) samples.
+        shape: of the result.
+        like: tensor whose dtype and device it has.
+        generator: of the random draws; None for the global generator.
     """
-    where = like.device if generator is None else generator.device
-    return torch.randn(shape, generator=generator, dtype=like.dtype, device=where).to(
+    device = like.device if generator is None else generator.device
+    return torch.randn(shape, generator=generator, dtype=like.dtype, device=device).to(
         like.device
     )
 
 
 def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
-    """Numbers 0 .. 2^bits - 1, full scale at the full well; the gradient is that of the
-    straight line.
+    """Digital numbers 0 … 2^bits - 1, full scale at the full well.
+
+    The gradient is that of the line without rounding (straight-through).
 
     Args:
+        electrons: read from the pixels.
         sensor: pixels, gain and noise of the sensor.
     """
     top = 2**sensor.bits - 1
@@ -171,10 +175,12 @@ def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
 
 
 def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
-    """Noise variance of a pixel that expects ``mean`` electrons: photon, read and
-    rounding noise, electrons².
+    """Noise variance of a pixel, electrons²: mean + read noise² + step² / 12.
+
+    The step is that of the digital numbers.
 
     Args:
+        mean: expected electrons.
         sensor: pixels, gain and noise of the sensor.
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
@@ -191,14 +197,17 @@ def low_snr(
     snr_db: float = 15.0,
     ambient_ratio: float = 4.0,
 ) -> Sensor:
-    """The sensor with dimmed light under strong ambient light, so that a pixel has this
-    signal-to-noise ratio.
+    """The sensor with exposure and ambient light that give a signal-to-noise ratio.
 
-    Signal-to-noise ratio: 20 log10(mean signal electrons / standard deviation), with
-    the ambient light's shot noise
-    and the read noise, at the sensor's own pitch. The ambient light is
-    ``ambient_ratio`` times the signal and, as
-    the paper's low-light test has it, enters before the photon noise.
+    It is 20 log10(S / √(S (1 + ambient_ratio) + read noise²)) dB, with S the mean
+    signal electrons at the sensor's own pitch. As in the paper's low-light test, the ambient
+    light enters before the photon noise.
+
+    Args:
+        sensor: pixels and read noise.
+        mean_irradiance: of the image, on the scale of :func:`mean_electrons`.
+        snr_db: signal-to-noise ratio.
+        ambient_ratio: ambient light over the signal.
     """
     _check("mean_irradiance", mean_irradiance, above=True)
     _check("ambient_ratio", ambient_ratio, above=False)

@@ -21,19 +21,21 @@ def by_nodes(
     illuminated: bool = True,
     asked: Set[int] | None = None,
 ) -> Tensor:
-    """Zeros (frames, *sheets, y, x) whose derivatives by PSFs and depths are those of
-    the image through all nodes.
+    """Zeros that carry the derivatives of the image through the PSFs of all nodes.
+
+    Added to an image by low-rank kernels, (frames, *sheets, y, x), they give it the
+    exact derivatives by PSFs and by depths.
 
     Args:
-        field: sampled field or PSFs.
+        field: PSFs of the nodes and their illumination.
         content, depth_um: (frames, *sheets, y, x) light or coverage, and depth.
         illuminated: whether the content is light, which the illumination weighs.
-        asked: numbers of the nodes whose derivatives are wanted, the others' being 0;
-            None for all.
+        asked: numbers of the nodes whose derivatives are computed, those of other nodes
+            being 0; None for all.
     """
     shares = depth_shares(depth_um, field.depths_um)
-    about = field.illumination.detach(), illuminated, asked
-    zeros: Tensor = _ByNodes.apply(field.psf, shares, content, about)  # type: ignore[no-untyped-call]
+    options = field.illumination.detach(), illuminated, asked
+    zeros: Tensor = _ByNodes.apply(field.psf, shares, content, options)  # type: ignore[no-untyped-call]
     return zeros
 
 
@@ -51,51 +53,61 @@ class _ByNodes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients by PSFs (rows, columns, depths, h, w) and by shares of depth.
+
+        The image is Σ_nodes PSF * (content · spline · share): each gradient is the
+        correlation of the image's gradient with the other factor, by FFT.
+        """
         psf, shares, content = tuple[Tensor, ...](ctx.saved_tensors)
         illumination, illuminated, asked = ctx.about
         of_psf, of_depth, *_ = ctx.needs_input_grad
         rows, columns, depths, h, w = psf.shape
         level = illumination[..., None, None] if illuminated else torch.ones(1)
-        deep = spline_coefficients(depths).to(content)
-        frame = content.shape[-2:]
-        maps = frame_maps((frame[0], frame[1]), psf.shape[:2], content)
-        shape = fast_shape((frame[0] + h - 1, frame[1] + w - 1))
+        to_coefficients = spline_coefficients(depths).to(content)
+        height, width = content.shape[-2:]
+        maps = frame_maps((height, width), psf.shape[:2], content)
+        shape = fast_shape((height + h - 1, width + w - 1))
         # image samples half a window beyond the frame are not part of it
-        seen = torch.nn.functional.pad(gradient, (w // 2, w // 2, h // 2, h // 2))
-        spectrum = torch.fft.rfft2(seen, s=shape)
-        out, back = torch.zeros_like(psf), torch.zeros_like(shares)
-        every = range(rows * columns) if of_depth or asked is None else asked
-        for node in every:
+        padded = torch.nn.functional.pad(gradient, (w // 2, w // 2, h // 2, h // 2))
+        spectrum = torch.fft.rfft2(padded, s=shape)
+        by_psf = torch.zeros_like(psf)
+        by_share = torch.zeros_like(shares)
+        nodes = range(rows * columns) if of_depth or asked is None else asked
+        for node in nodes:
             a, b = divmod(node, columns)
-            near = content * (maps[0][:, a, None] * maps[1][:, b])
+            sources = content * (maps[0][:, a, None] * maps[1][:, b])
             if of_psf and (asked is None or node in asked):
-                found = []
+                by_coefficient = []
                 for share in shares:
-                    part = torch.fft.rfft2(near * share, s=shape).conj() * spectrum
+                    part = torch.fft.rfft2(sources * share, s=shape).conj() * spectrum
                     whole = torch.fft.irfft2(part.flatten(0, -3).sum(0), s=shape)
-                    found.append(whole[:h, :w])
-                out[a, b] = torch.einsum("cz,cyx->zyx", deep, torch.stack(found))
-            if of_depth:
-                light = (psf[a, b] * level[a, b] if illuminated else psf[a, b]).to(
-                    content
+                    by_coefficient.append(whole[:h, :w])
+                by_psf[a, b] = torch.einsum(
+                    "cz,cyx->zyx", to_coefficients, torch.stack(by_coefficient)
                 )
-                for k, psf_k in enumerate(torch.einsum("cz,zyx->cyx", deep, light)):
-                    part = torch.fft.rfft2(psf_k, s=shape).conj() * spectrum
+            if of_depth:
+                light = psf[a, b] * level[a, b] if illuminated else psf[a, b]
+                coefficients = torch.einsum(
+                    "cz,zyx->cyx", to_coefficients, light.to(content)
+                )
+                for k, kernel in enumerate(coefficients):
+                    part = torch.fft.rfft2(kernel, s=shape).conj() * spectrum
                     whole = torch.fft.irfft2(part, s=shape)
-                    back[k] += near * whole[..., : frame[0], : frame[1]]
+                    by_share[k] += sources * whole[..., :height, :width]
         if illuminated:
-            out *= level.to(out)
-        return out if of_psf else None, back if of_depth else None, None, None
+            by_psf *= level.to(by_psf)
+        return by_psf if of_psf else None, by_share if of_depth else None, None, None
 
 
 def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
-    """(coefficients, …) B-spline of every depth coefficient at these depths.
+    """(coefficients, …) value of each B-spline in 1/z at these depths.
 
     Args:
-        depth_um: source depth from the lens, um.
-        depths_um: source depths from the lens, um.
+        depth_um: (…) depths of the sources.
+        depths_um: (depths,) nodes, at equal steps of 1/z, ascending.
     """
-    near, far = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
+    near = 1 / float(depths_um[0])
+    far = 1 / float(depths_um[-1])
     unit = ((near - 1 / depth_um) / max(near - far, 1e-30)).clamp(0, 1)
     nodes = len(depths_um)
     first, taps = spline_taps(unit, nodes)
@@ -108,11 +120,12 @@ def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
 
 
 def node_light(optics: Optics, plan: Plan) -> Tensor:
-    """(rows, columns, depths, h, w) light of all nodes, without a graph: a leaf that
-    gathers the gradient.
+    """(rows, columns, depths, h, w) light of all nodes, as a leaf tensor.
+
+    It has no graph of its own and receives the gradient of the loss.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         plan: field nodes, depths and wavelengths.
     """
     with torch.no_grad():
@@ -126,16 +139,16 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
 def surrogate_loss(
     optics: Optics, plan: Plan, gradient: Tensor, pairs: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """A scalar whose gradient to the phase is, in the mean over the draws, that of the
-    loss.
+    """A scalar whose expected gradient to the phase is that of the loss.
+
+    The mean of :func:`gradient_term` over random field points and wavelengths.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         plan: field nodes, depths and wavelengths.
         gradient: (rows, columns, depths, h, w) of the loss with respect to
-            :func:`node_light`, of the field points that
-            were drawn.
-        pairs: a field point and a wavelength each, of :func:`draw_nodes`.
+            :func:`node_light`, at least at the drawn field points.
+        pairs: (draws,) numbers of field points and of wavelengths (:func:`draw_nodes`).
     """
     return torch.stack(
         [
@@ -148,11 +161,11 @@ def surrogate_loss(
 def draw_nodes(
     plan: Plan, draws: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(draws,) numbers of field points, evenly, and of wavelengths, by their weights:
-    what :func:`surrogate_loss` takes.
+    """(draws,) random field points, uniform, and wavelengths, by their weights.
 
     Args:
         plan: field nodes, depths and wavelengths.
+        draws: number of pairs.
         generator: of the random draws; the global one without it.
     """
     points = torch.randint(
@@ -169,11 +182,14 @@ def draw_nodes(
 def gradient_term(
     optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int
 ) -> Tensor:
-    """What one draw adds: number of points · <G_point, light_point,wave>.
+    """The term of one draw: number of field points · <G_point, light_point,wave>.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         plan: field nodes, depths and wavelengths.
+        gradient: (rows, columns, depths, h, w) G, of the loss by the nodes' light.
+        point: number of the field point, row by row.
+        wave: number of the wavelength.
     """
     places = plan.places_um
     light = psfs(

@@ -63,11 +63,14 @@ class _Footprint(NamedTuple):
 def stray_of(
     optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]
 ) -> Stray | None:
-    """Discs of the orders beside the image; None for a smooth phase, which has one
-    order alone.
+    """Stray light of the diffraction orders that do not focus; None for a smooth phase.
+
+    Order m spreads over a disc on the sensor: the image of the aperture times
+    1 + d/z - m (1 + d/s), with d the sensor distance, z the source's depth and s the
+    design's.
 
     Args:
-        optics: lens, light and distances at the nodes.
+        optics: wave of the lens, layers and lens-sensor distance.
         grid: samples, step, depths and margin of the image.
         depth_um: source depth from the lens, um.
         middle_um: (x, y) field point in the middle, um on the sensor.
@@ -75,7 +78,8 @@ def stray_of(
     wave = optics.wave
     if not isinstance(wave, PillarWave):
         return None
-    focus, frame = wave.focus, grid.frame
+    focus = wave.focus
+    frame = grid.frame
     d = optics.layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     depth, source = (_reduced(optics, z) for z in (depth_um, focus.source_distance_um))
     shares = wave.orders(focus.wavelength_um, ORDERS)
@@ -84,26 +88,30 @@ def stray_of(
         scipy.fft.next_fast_len(2 * frame[1], real=True),
     )
     if optics.layers.stop is None:
-        part = _whole_lens(wave.radius_um, grid, d, middle_um)
+        footprint = _whole_lens(wave.radius_um, grid, d, middle_um)
     else:
-        part = _behind_stop(optics, grid, depth_um, middle_um)
+        footprint = _behind_stop(optics, grid, depth_um, middle_um)
     transfers, moves = [], []
     for m, share in shares.items():
-        lands = 1 + d / depth - m * (1 + d / source)
-        radius = max(part.radius_um * abs(lands), grid.step_um)
+        scale = 1 + d / depth - m * (1 + d / source)
+        radius = max(footprint.radius_um * abs(scale), grid.step_um)
         disc = torch.from_numpy(share * _disc(radius, grid.step_um, shape)).float()
         transfers.append(torch.fft.rfft2(disc))
-        if part.middle_um is not None:
-            down, across = (_moved(a * lands / grid.step_um) for a in part.middle_um)
-            moves.append((down, across))
-    every = torch.stack(transfers)
-    every = every if moves else every.sum(0, keepdim=True)
-    return Stray(shares, every, moves, shape, part.illumination)
+        if footprint.middle_um is not None:
+            rows, columns = (
+                _moved(a * scale / grid.step_um) for a in footprint.middle_um
+            )
+            moves.append((rows, columns))
+    discs = torch.stack(transfers)
+    if not moves:
+        discs = discs.sum(0, keepdim=True)
+    return Stray(shares, discs, moves, shape, footprint.illumination)
 
 
 def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
-    """(y, x) light of sum 1 (at radii above a step) on samples about the first, which
-    wraps.
+    """(y, x) uniform disc of sum 1 about the first sample, wrapped around.
+
+    The edge is a linear ramp of one step. The sum is 1 for radii above a step.
     """
     y, x = (np.fft.fftfreq(n) * n * step_um for n in shape)
     inside = np.clip((radius_um - np.hypot(y[:, None], x)) / step_um + 0.5, 0, 1)
@@ -111,19 +119,27 @@ def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
 
 
 def _moved(samples: Array) -> Tensor:
-    """(n, n) matrix that puts light of each sample so many samples on, shared by the
-    two next to there.
+    """(n, n) matrix that moves the light of each sample, by linear interpolation.
+
+    Args:
+        samples: (n,) distance of each move, in samples.
     """
     place = np.arange(len(samples))
-    return torch.from_numpy(
-        np.clip(1 - np.abs(place[:, None] - (place + samples)), 0, 1)
-    ).float()
+    distance = np.abs(place[:, None] - (place + samples))
+    return torch.from_numpy(np.clip(1 - distance, 0, 1)).float()
 
 
 def _whole_lens(
     radius_um: float, grid: Grid, reduced_um: float, middle_um: tuple[float, float]
 ) -> _Footprint:
-    """Of a lens without a stop."""
+    """Footprint of a lens without a stop: the whole aperture, and cos⁴ of the angle.
+
+    Args:
+        radius_um: of the lens.
+        grid: samples of the frame.
+        reduced_um: lens-sensor distance, Σ t/n.
+        middle_um: (x, y) field point in the middle.
+    """
     rows, columns = ((np.arange(n) - (n - 1) / 2) * grid.step_um for n in grid.frame)
     away2 = (rows[:, None] + middle_um[1]) ** 2 + (columns + middle_um[0]) ** 2
     cosine4 = torch.from_numpy(1 / (1 + away2 / reduced_um**2) ** 2).float()
@@ -133,51 +149,69 @@ def _whole_lens(
 def _behind_stop(
     optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]
 ) -> _Footprint:
-    """What rays of 17 x 17 directions illuminate of 64 x 64 places of the lens, and
-    between those directions by interpolation.
+    """Footprint on the lens of light through the stop, over the field.
+
+    Light through the stop is summed on 64 x 64 places of the lens for 17 x 17
+    directions, and interpolated to the samples of the frame.
+
+    Args:
+        optics: wave of the lens, layers and lens-sensor distance.
+        grid: samples of the frame.
+        depth_um: of the sources.
+        middle_um: (x, y) field point in the middle.
     """
-    layers, wave, count = optics.layers, optics.wave, 17
-    colour = wave.focus.wavelength_um  # type: ignore[attr-defined]
-    reduced = layers.after(optics.distance_um, colour).reduced_um
-    ends = [
+    layers = optics.layers
+    wave = optics.wave
+    count = 17
+    wavelength_um = wave.focus.wavelength_um  # type: ignore[attr-defined]
+    reduced = layers.after(optics.distance_um, wavelength_um).reduced_um
+    slopes = [
         (m + np.linspace(-h, h, count)) / reduced
         for m, h in zip(middle_um[::-1], grid.half_um, strict=True)
     ]
-    tangents = np.stack(np.meshgrid(*ends[::-1]), -1)
+    tangents = np.stack(np.meshgrid(*slopes[::-1]), -1)
     cell = wave.radius_um / 32
     place = (np.arange(64) - 31.5) * cell
     x, y = np.meshgrid(place, place)
-    there = np.hypot(x, y) <= wave.radius_um
-    shown = [
-        layers.stop_share((a, b), depth_um, colour, (x, y), cell) * there
+    inside = np.hypot(x, y) <= wave.radius_um
+    shares = [
+        layers.stop_share((a, b), depth_um, wavelength_um, (x, y), cell) * inside
         for a, b in tangents.reshape(-1, 2).tolist()
     ]
-    light = np.stack(shown).reshape(count, count, -1)
+    light = np.stack(shares).reshape(count, count, -1)
     area = light.sum(-1) * cell**2
     middles = (
         _middle(light[:, count // 2], y, grid.frame[0]),
         _middle(light[count // 2], x, grid.frame[1]),
     )
-    slope2 = (layers.through_middle(tangents, depth_um, colour) ** 2).sum(-1)
-    stop_area = math.pi * layers.footprint_um(depth_um, colour) ** 2
+    slope2 = (layers.through_middle(tangents, depth_um, wavelength_um) ** 2).sum(-1)
+    stop_area = math.pi * layers.footprint_um(depth_um, wavelength_um) ** 2
     taken = torch.from_numpy(area / stop_area / (1 + slope2) ** 2)[None, None]
-    whole = torch.nn.functional.interpolate(
+    illumination = torch.nn.functional.interpolate(
         taken, size=grid.frame, mode="bilinear", align_corners=True
     )
-    return _Footprint(math.sqrt(area.max() / math.pi), middles, whole[0, 0].float())
+    return _Footprint(
+        math.sqrt(area.max() / math.pi), middles, illumination[0, 0].float()
+    )
 
 
 def _middle(light: Array, place_um: Array, count: int) -> Array:
-    """(count,) middle of the light (n, places) of n directions at equal steps, between
-    those that are not dark.
+    """(count,) centroid of the light on the lens, um, over directions at equal steps.
+
+    Dark directions are interpolated from the others; 0 where all are dark.
+
+    Args:
+        light: (n, places) light of n directions.
+        place_um: coordinate of the places.
+        count: directions of the result.
     """
-    given = light.sum(-1)
-    bright = np.flatnonzero(given > 0)
+    total = light.sum(-1)
+    bright = np.flatnonzero(total > 0)
     if not len(bright):
         return np.zeros(count)
-    found = light[bright] @ place_um.ravel() / given[bright]
-    every = np.linspace(0, len(light) - 1, count)
-    return np.asarray(np.interp(every, bright, found))
+    centroids = light[bright] @ place_um.ravel() / total[bright]
+    directions = np.linspace(0, len(light) - 1, count)
+    return np.asarray(np.interp(directions, bright, centroids))
 
 
 def _reduced(optics: Optics, depth_um: float) -> float:
@@ -188,10 +222,12 @@ def _reduced(optics: Optics, depth_um: float) -> float:
 
 
 def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
-    """The image with the discs of all sources added; ``light`` (frames, y, x) of all
-    sheets.
+    """(frames, y, x) image plus the discs of stray light of all sources.
 
     Args:
+        image: (frames, y, x) on the samples of the grid.
+        light: (frames, y, x) radiance of all sheets, on the whole frame.
+        stray: discs of the orders.
         grid: samples, step, depths and margin of the image.
     """
     light = light * stray.illumination.to(light)

@@ -22,23 +22,27 @@ def texture_spectrum(psf: Tensor) -> Tensor:
 def scene_spectrum(psf: Tensor, plane: float, band: float) -> Tensor:
     """(…, features) of PSFs (…, h, w): their L2 norm is that of the image of a scene.
 
-    That is a 1/f texture of standard deviation :data:`CONTRAST` and an evenly lit
-    plane, whose errors have spatial frequencies of about ``band`` (cycles a sample) and
-    count ``plane`` times as much.
+    The scene is a 1/f texture of standard deviation :data:`CONTRAST` plus a uniformly
+    illuminated plane.
 
     Args:
         psf: (..., h, w) PSFs.
+        plane: weight of the plane's errors over those of the texture.
+        band: spatial frequency of the plane's errors, cycles a sample; 0 for no plane.
     """
     power, both, frequency2 = _powers(psf)
-    seen = CONTRAST**2 * power / (power * both).sum()
+    weight = CONTRAST**2 * power / (power * both).sum()
     if band > 0:
         low = torch.exp(-frequency2 / band**2)
-        seen = seen + plane**2 * low / (low * both).sum()
-    return _weighed(psf, seen * both)
+        weight = weight + plane**2 * low / (low * both).sum()
+    return _weighed(psf, weight * both)
 
 
 def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Power of the texture, times that each frequency stands for, and its square."""
+    """(2h, w + 1) texture power, multiplicity (1 or 2) and f² of rfft2 frequencies.
+
+    The power is 1 / (f² + f0²), with f0 one period in eight windows.
+    """
     h, w = psf.shape[-2:]
     fy = torch.fft.fftfreq(2 * h, dtype=psf.dtype, device=psf.device)
     fx = torch.fft.rfftfreq(2 * w, dtype=psf.dtype, device=psf.device)
@@ -48,6 +52,7 @@ def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _weighed(psf: Tensor, power: Tensor) -> Tensor:
+    """(…, features) real features: zero-padded rfft2 of PSFs times √power."""
     h, w = psf.shape[-2:]
     spectrum = torch.fft.rfft2(psf, s=(2 * h, 2 * w)) * power.sqrt()
     return torch.view_as_real(spectrum).flatten(-3)
@@ -73,9 +78,9 @@ def scene_error(psf: Tensor, reference: Tensor) -> float:
     Args:
         psf, reference: (places, depths, h, w), each times its relative illumination.
     """
-    wrong = scene_spectrum((psf - reference).double(), 0.0, 0.0).square().sum(-1)
+    error = scene_spectrum((psf - reference).double(), 0.0, 0.0).square().sum(-1)
     light = reference.double().sum((-1, -2)).square()
-    return float(torch.sqrt(wrong.mean(0).max() / light.mean(0).max().clamp_min(1e-30)))
+    return float(torch.sqrt(error.mean(0).max() / light.mean(0).max().clamp_min(1e-30)))
 
 
 def weigh_by_light(errors: Tensor, light: Tensor) -> float:

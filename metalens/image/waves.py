@@ -20,7 +20,7 @@ from metalens.lens import Lens, response
 from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import among
 
-# over which pillars are averaged at most: below a zone of the lens, far above the pitch
+# largest width over which pillars are averaged: below a zone of the lens, many pitches
 CELL_UM = 2.5
 
 
@@ -32,7 +32,7 @@ class Wave(Protocol):
         """Of the open aperture."""
 
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
-        """Phase in float64 that is known beforehand and carries no gradient."""
+        """Phase of the design, rad, float64, without a gradient."""
 
     def factor(
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
@@ -143,8 +143,17 @@ class PillarWave:
     def factor(
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
     ) -> Tensor | None:
-        """Cells interpolated to the rays; the pillars answer at the angle of the light
-        where the library has angles.
+        """Mean transmission of cells, less the carrier, interpolated to places (x, y).
+
+        Interpolation is bilinear. Cells are cached for the last 16 wavelengths and
+        angles. With a gradient, backward smooths over the width of a node, as nodes
+        read only some of the cells.
+
+        Args:
+            x_um: places on the lens, um.
+            y_um: places on the lens, um.
+            wavelength_um: vacuum wavelength, um.
+            angle_rad: of incidence, used where the library has angles.
         """
         tilt = angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
         key = (wavelength_um, tilt)
@@ -154,34 +163,29 @@ class PillarWave:
             if not cells.requires_grad:
                 self._cells = {**dict(list(self._cells.items())[-15:]), key: cells}
         pitch = self.lens.diameters.pitch_um
-        # nodes read some of the cells; how the light changes, their means over a node
-        # tell
-        if cells.requires_grad:
-            near = _over(
-                cells,
-                float(x_um.max() - x_um.min())
-                / (x_um.shape[-1] - 1)
-                / (self._block * pitch),
-            )
-            cells = near + (cells - near).detach()
+        cell_width = self._block * pitch
+        if cells.requires_grad:  # values of the cells, gradients of their means
+            node_width = float(x_um.max() - x_um.min()) / (x_um.shape[-1] - 1)
+            smooth = _over(cells, node_width / cell_width)
+            cells = smooth + (cells - smooth).detach()
         half = [n * self._block * pitch / 2 for n in cells.shape[-2:]]
-        # the cells are half a pitch past the lens's middle where one row or column more
-        # is added behind it
-        past = [
+        # where an odd number of rows or columns is added, the cells' centre lies half a
+        # pitch beyond that of the lens
+        shift = [
             (n - own) % 2 * pitch / 2
             for n, own in zip(self._padded, self.diameter_um.shape, strict=True)
         ]
         place = torch.stack(
-            [(x_um - past[1]) / half[1], (y_um - past[0]) / half[0]], -1
+            [(x_um - shift[1]) / half[1], (y_um - shift[0]) / half[0]], -1
         ).to(cells)
-        found = torch.nn.functional.grid_sample(
+        factor = torch.nn.functional.grid_sample(
             cells[None],
             place.reshape(1, 1, -1, 2),
             mode="bilinear",
             padding_mode="border",
             align_corners=False,
         )
-        return torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+        return torch.complex(*factor.reshape(2, *x_um.shape).unbind(0))
 
     @property
     def pitch_um(self) -> float:
@@ -195,21 +199,19 @@ class PillarWave:
         return y, x
 
     def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex transmission of every pillar, 0 where there is none, with the
-        factor of its neighbours.
+        """(y, x) complex transmission of every site, with the factor of its neighbours.
+
+        It is 0 at sites without a pillar.
 
         Args:
-            wavelength_um: vacuum wavelength, um. angle_rad: of incidence, used where
-                the library has angles.
+            wavelength_um: vacuum wavelength, um.
+            angle_rad: of incidence, used where the library has angles.
         """
-        return self._with_neighbours(
-            self._pillars(
-                wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
-            )[0]
-        )
+        tilt = angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
+        return self._with_neighbours(self._pillars(wavelength_um, tilt)[0])
 
     def _with_neighbours(self, t: Tensor) -> Tensor:
-        """With the factor of unlike neighbours where the lens holds their rows."""
+        """Transmission t times the mean coupling of neighbours, if there is any."""
         if self.lens.neighbours is None:
             return t
         return t * among.mean_coupling(
@@ -217,8 +219,13 @@ class PillarWave:
         )
 
     def orders(self, wavelength_um: float, orders: tuple[int, ...]) -> dict[int, float]:
-        """Share of the light on the aperture that leaves in each diffraction order of
-        the zones: 1 focuses.
+        """Share of the light on the aperture in each diffraction order m of the zones.
+
+        |Σ t exp(-i m φ) / N|², with φ the design's carrier; order 1 focuses.
+
+        Args:
+            wavelength_um: vacuum wavelength, um.
+            orders: numbers m.
         """
         t, ideal, open_ = self._pillars(wavelength_um, 0.0)
         return {
@@ -239,8 +246,13 @@ class PillarWave:
     def _pillars(
         self, wavelength_um: float, tilt: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(complex t, carrier, 1 where a pillar stands) of every pillar, in single
-        precision.
+        """(y, x) complex t, carrier in rad, and 1 where a pillar stands, float32.
+
+        The first is differentiable where the diameters are.
+
+        Args:
+            wavelength_um: vacuum wavelength, um.
+            tilt: angle of incidence, rad.
         """
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
@@ -264,17 +276,24 @@ class PillarWave:
         )
 
     def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
-        """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty
-        cells as their neighbours.
+        """(2, cells y, cells x) real and imaginary mean of t exp(-i carrier) per cell.
+
+        An empty cell has the mean of the 3 x 3 cells around it.
+
+        Args:
+            wavelength_um: vacuum wavelength, um.
+            tilt: angle of incidence, rad.
         """
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
         if self.lens.neighbours is None and is_plain_value(d):
-            sizes, at = d.detach().numpy(), (wavelength_um, tilt)
+            sizes = d.detach().numpy()
             block = self._block, spare[0] // 2, spare[1] // 2
-            known = response.response_polynomials(self.lens.proxy, sizes, at)
+            polynomials = response.response_polynomials(
+                self.lens.proxy, sizes, (wavelength_um, tilt)
+            )
             mean = torch.from_numpy(
-                compiled.cells(sizes, self._ideal.numpy(), known, block)
+                compiled.cells(sizes, self._ideal.numpy(), polynomials, block)
             )
         else:
             mean = self._means(wavelength_um, tilt, spare)
@@ -283,14 +302,21 @@ class PillarWave:
         return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
 
     def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
-        """As :func:`metalens.image.compiled.cells`, with derivatives and the factor of
+        """(3, cells y, cells x) means per cell: Re, Im of t exp(-i carrier), and fill.
+
+        As :func:`metalens.image.compiled.cells`, with derivatives and the factor of
         neighbours.
+
+        Args:
+            wavelength_um: vacuum wavelength, um.
+            tilt: angle of incidence, rad.
+            spare: (y, x) rows and columns that are added to fill the last cells.
         """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
-        rest = torch.view_as_real(
+        residual = torch.view_as_real(
             self._with_neighbours(t) * torch.polar(torch.ones_like(ideal), -ideal)
         ).permute(2, 0, 1)
-        layers = torch.cat([rest, open_[None]])
+        layers = torch.cat([residual, open_[None]])
         pad = (
             spare[1] // 2,
             spare[1] - spare[1] // 2,
@@ -303,20 +329,25 @@ class PillarWave:
 
 
 def _over(cells: Tensor, width: float) -> Tensor:
-    """(2, y, x) mean about each of the cells that hold pillars, of waves longer than
-    twice so many cells (Lanczos).
+    """(2, y, x) cells through a Lanczos low-pass of cutoff 1 / (2 ``width``) per cell.
+
+    Only cells that contain pillars count.
+
+    Args:
+        cells: (2, y, x) real and imaginary means.
+        width: of a node, in cells; 1 or less leaves the cells as they are.
     """
     if width <= 1:
         return cells
     lobes = 2.0  # in widths of a node
     reach = math.ceil(lobes * width) - 1
-    away = (
+    offset = (
         torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64)
         / width
     )
-    row = (torch.sinc(away) * torch.sinc(away / lobes) / width).to(cells)
-    there = (cells.detach() != 0).any(0, keepdim=True).to(cells)
-    both = torch.cat([cells, there])[:, None]
+    row = (torch.sinc(offset) * torch.sinc(offset / lobes) / width).to(cells)
+    filled = (cells.detach() != 0).any(0, keepdim=True).to(cells)
+    both = torch.cat([cells, filled])[:, None]
     for shape, pad in (((1, 1, -1, 1), (reach, 0)), ((1, 1, 1, -1), (0, reach))):
         both = torch.nn.functional.conv2d(both, row.reshape(shape), padding=pad)
     mean: Tensor = both[:2, 0] / both[2, 0].clamp_min(0.2)
@@ -351,20 +382,22 @@ def _longer(between: Media, r2: Tensor) -> Tensor:
             lambda u: media.path_difference(between.layers, 0.0, 0.0, u)[1], r2
         )
         return extra
-    n, d = between.layers[0]
-    return n * r2 / (torch.sqrt(r2 + d * d) + d)
+    n, thickness = between.layers[0]
+    return n * r2 / (torch.sqrt(r2 + thickness * thickness) + thickness)
 
 
 def cell_um(
     layers: Layers, wavelength_um: float, window_um: float, distance_um: float
 ) -> float:
-    """Width of the cells that leave a window of this width, so far behind the lens,
-    what pillars scatter into it.
+    """Largest width of cells, um, that keeps the light scattered into a window.
+
+    A third of a node's width λ d / window on the lens, and ``CELL_UM`` at most.
 
     Args:
         layers: films and stop of the lens.
         wavelength_um: vacuum wavelength, um.
         window_um: side of the window, um.
+        distance_um: from lens to window, um.
     """
     node_um = (
         wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
@@ -380,13 +413,13 @@ def wave_of(
     window_um: float,
     distance_um: float | None = None,
 ) -> Wave:
-    """The lens plane of a lens file, in cells that leave a window of this width what
-    pillars scatter into it; or the
-    one that was given.
+    """The lens plane of a lens file, in cells of :func:`cell_um`; a wave unchanged.
 
     Args:
+        lens: content of a lens file, or a wave.
         layers: films and stop of the lens.
-        window_um: side of the window, um.
+        window_um: side of the PSFs' window, um.
+        distance_um: from lens to sensor; None for the design's.
     """
     if isinstance(lens, Lens):
         distance = lens.sensor_distance_um if distance_um is None else distance_um

@@ -20,12 +20,12 @@ BENT, INNER = 0.005, 0.055  # of PSFs of 60 lenses against plane waves through t
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A round hole, about the axis or beside it.
+    """A round hole in an opaque plane, on the axis or off it.
 
-    radius_um: of the hole. distance_um: from its plane to that of the pillars, through
-    the films in front of them that
-    lie there, the last one at the pillars, and air where they are thinner. centre_um:
-    (x, y) of its middle.
+    radius_um: of the hole.
+    distance_um: from its plane to that of the pillars, through the films between them,
+        the last film at the pillars, and through air where the films are thinner.
+    centre_um: (x, y) of its middle.
 
     Raises:
         ConfigError: a radius that is not above 0, a distance below 0, a centre that is
@@ -66,49 +66,57 @@ def stop_crossing(
     x: Any,
     y: Any,
 ) -> tuple[Any, Any]:
-    """(x, y) in um where the rays that reach the pillars at (x, y) cross the stop;
-    numpy or torch.
+    """(x, y) where the rays to places of the pillars cross the stop, um.
 
     Args:
-        before: media from source to pillars, None for collimated light. between: those
-            from stop to pillars, None
-            where the stop lies on them. tangents: (x, y) of the ray to the middle of
-            the lens, in air.
+        before: media from source to pillars; None for collimated light.
+        between: media from stop to pillars; None where the stop lies on them.
+        tangents: (x, y) in air of the ray to the middle of the lens.
+        x: places on the pillars, um; numpy or torch.
+        y: places on the pillars, um; numpy or torch.
     """
     if between is None:
         return x, y
     slope = math.hypot(*tangents)
     p = slope / math.hypot(1, slope)
     if before is None:
-        way = float(media.reach_per_direction(between.layers, p * p)) / math.hypot(
-            1, slope
-        )
-        return x - way * tangents[0], y - way * tangents[1]
-    back = float(media.reach_per_direction(before.layers, p * p)) / math.hypot(1, slope)
-    dx, dy = x + back * tangents[0], y + back * tangents[1]
+        between_um = float(media.reach_per_direction(between.layers, p * p))
+        between_um /= math.hypot(1, slope)
+        return x - between_um * tangents[0], y - between_um * tangents[1]
+    source_um = float(media.reach_per_direction(before.layers, p * p))
+    source_um /= math.hypot(1, slope)
+    dx = x + source_um * tangents[0]
+    dy = y + source_um * tangents[1]
     share = _share(before, between, dx * dx + dy * dy)
     return x - share * dx, y - share * dy
 
 
 def _share(before: Media, between: Media, away2: Any) -> Any:
-    """f of the heading, of the squared lateral way from source to pillars."""
+    """Lateral distance from stop to pillars over that from source to pillars.
+
+    f of the module's heading, a Chebyshev interpolant.
+
+    Args:
+        before: media from source to pillars.
+        between: media from stop to pillars.
+        away2: squared lateral distance from source to pillars, um².
+    """
 
     def exact(u: Any) -> Any:
         w = media.solve_direction_square(before.layers, u)
-        return media.reach_per_direction(between.layers, w) / media.reach_per_direction(
-            before.layers, w
-        )
+        reach = media.reach_per_direction
+        return reach(between.layers, w) / reach(before.layers, w)
 
     return interpolant.chebyshev_interpolant(exact, away2)
 
 
 def stop_transmission(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
-    """Share of light that passes where rays cross the stop at (x, y): 1 inside, 0
-    outside, over the edge as much of a
-    patch of ``width_um`` as lies inside; numpy or torch.
+    """Share of light that passes the stop: 1 inside, 0 outside, a ramp at the edge.
 
     Args:
-        at_um: (x, y) where rays cross the stop.
+        stop: the aperture stop.
+        at_um: (x, y) where rays cross the stop; numpy or torch.
+        width_um: of a ray's patch, over which the ramp extends.
     """
     x, y = (at - middle for at, middle in zip(at_um, stop.centre_um, strict=True))
     radius = (x * x + y * y) ** 0.5
@@ -124,18 +132,19 @@ def stop_shadow(
     at_um: tuple[Any, Any],
     width_um: Any,
 ) -> Array:
-    """Complex amplitude behind the stop over that without it, mean over ``width_um`` of
-    a place; numpy arrays.
+    """Complex amplitude at the pillars behind the stop over that without it.
 
     Args:
+        stop: the aperture stop.
+        media_um: media from source and from stop to the pillars; each may be None, as
+            in :func:`stop_crossing`.
+        tangents: (x, y) in air of the ray to the middle of the lens.
         wavelength_um: in vacuum.
-        media_um: before and between, tangents: as in :func:`stop_crossing`. at_um: (x,
-            y) of
-            the pillars, broadcast.
+        at_um: (x, y) of the pillars, numpy arrays that broadcast.
+        width_um: of a place, over which the amplitude is averaged.
 
-    Accuracy: of a PSF of sum 1, by :func:`stop_model_error`; energies are 0.18 / N
-    short, N the
-    Fresnel number there.
+    Accuracy: :func:`stop_model_error` of a PSF of sum 1. Energies are too low by
+    0.18 / N, N the Fresnel number of the shadow.
     """
     x, y = stop_crossing(*media_um, tangents, *at_um)
     if media_um[1] is None:
@@ -152,8 +161,10 @@ def stop_shadow(
 def fresnel_um(
     before: Media | None, between: Media, tangents: tuple[float, float]
 ) -> tuple[float, float]:
-    """Fresnel lengths in the plane of the ray and across it: of 1/L = 1/(stop to
-    pillars) + 1/(source to stop).
+    """Fresnel lengths in the plane of incidence and across it, um.
+
+    1/L = 1/(stop to pillars) + 1/(source to stop), or L = a (1 - a/b) with a the length
+    from stop to pillars and b that from source to pillars.
 
     Args:
         before: media from source to pillars; None for collimated light.
@@ -167,9 +178,8 @@ def fresnel_um(
     if before is None:
         return along, across
     whole = float(media.reach_per_direction(before.layers, w))
-    return along * (
-        1 - along * whole / float(media.area_spreading_of_square(before.layers, w))
-    ), across * (1 - across / whole)
+    area = float(media.area_spreading_of_square(before.layers, w))
+    return along * (1 - along * whole / area), across * (1 - across / whole)
 
 
 def stop_model_error(
@@ -179,21 +189,20 @@ def stop_model_error(
     wavelength_um: float,
     zones: float = 0.0,
 ) -> float:
-    """Relative L2 error of a PSF by what :func:`stop_shadow` leaves out: (``BENT`` +
-    ``INNER`` zones) / N.
+    """Relative L2 error of a PSF by the approximations of :func:`stop_shadow`.
 
-    N = R² / (λ L) is the Fresnel number of the shadow. Of the edge's bend the next term
-    is ½ <(y² / 2R)²> d²E/ds², 0.04
-    |w| / N at the edge. Inside, waves from the whole edge gather about the axis (a
-    point of it has the amplitude of the
-    light), which a lens out of focus shows: zones, of a blur of radius b on the sensor,
-    are R b / (λ d).
+    (``BENT`` + ``INNER`` zones) / N, with N = R² / (λ L) the Fresnel number. The next
+    term of the edge's curvature is ½ <(y² / 2R)²> d²E/ds², 0.04 |w| / N at the edge.
+    Waves from the whole edge also meet near the axis, with the amplitude of the light
+    at the axis itself. A defocused lens shows them: a blur of radius b on the sensor
+    spans R b / (λ d) zones.
 
     Args:
         stop: the aperture stop.
-        media_um: media before and after the stop.
+        media_um: media from source and from stop to the pillars.
         tangents: (x, y) of the field angle, in air.
         wavelength_um: in vacuum.
+        zones: Fresnel zones over the blur.
     """
     if media_um[1] is None:
         return 0.0
@@ -206,7 +215,7 @@ def stop_model_error(
 def illuminated_radius_um(
     stop: Stop, before: Media | None, between: Media | None
 ) -> float:
-    """Radius of what a source on the axis lights on the pillars (paraxial).
+    """Radius of the illuminated disc on the pillars, um, paraxial, of a source on axis.
 
     Args:
         stop: the aperture stop.
@@ -222,15 +231,17 @@ LONGEST, STEPS = 5, 32  # of the table, and in a unit of w
 
 
 def _table() -> Array:
-    """(w, 4) A and A' / STEPS, real and imaginary, by Gauss's rule."""
+    """(w, 4) table of A and A' / STEPS, each real and imaginary, for E(w).
+
+    A(w) = -e^(iπ/4) ∫ exp(-π t²/2 + iπ e^(iπ/4) w t) dt from 0, by Gauss's rule over t
+    up to 5, and A' = 1 - iπ w A.
+    """
     node, weight = np.polynomial.legendre.leggauss(80)
-    t, turn = 2.5 * (node + 1), np.exp(0.25j * np.pi)
+    t = 2.5 * (node + 1)
+    rotation = np.exp(0.25j * np.pi)
     w = np.arange(LONGEST * STEPS + 2) / STEPS
-    value = (
-        -turn
-        * np.exp(-np.pi / 2 * t * t + 1j * np.pi * turn * np.outer(w, t))
-        @ (2.5 * weight)
-    )
+    exponent = -np.pi / 2 * t * t + 1j * np.pi * rotation * np.outer(w, t)
+    value = -rotation * np.exp(exponent) @ (2.5 * weight)
     slope = (1 - 1j * np.pi * w * value) / STEPS
     return np.stack([value.real, value.imag, slope.real, slope.imag], -1)
 
@@ -240,7 +251,12 @@ TABLE = _table()
 
 @numba.njit(cache=True, inline="always")
 def _wave(w, table):  # type: ignore[no-untyped-def]
-    """E(w) and its integral w E(w) + i/π e^(-iπ/4)/√2 e^(iπw²/2)."""
+    """Fresnel edge field E(w), and its integral w E(w) + i/π e^(-iπ/4)/√2 e^(iπw²/2).
+
+    E is the complex Fresnel integral from -∞ to w, of limit 1: ±A(|w|) times the edge
+    wave e^(iπw²/2) e^(-iπ/4)/√2, plus 1 for w >= 0. A is a cubic Hermite interpolant of
+    ``table``, and beyond ``LONGEST`` its asymptotic series.
+    """
     a = abs(w)
     turns = a * a / 4 - 0.125
     angle = 2 * np.pi * (turns - np.rint(turns))
@@ -258,26 +274,40 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
     else:
         part = complex(0.0, -1 / (np.pi * a * a))  # 1 / (iπw²)
         bent = a * part * (1 + part * (1 + 3 * part * (1 + 5 * part)))
-    found = 1 + wave * bent if w >= 0 else -wave * bent
-    return found, w * found + complex(0.0, 1 / np.pi) * wave
+    field = 1 + wave * bent if w >= 0 else -wave * bent
+    return field, w * field + complex(0.0, 1 / np.pi) * wave
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyped-def]
+    """Write S of :func:`edge_diffraction_factor` at places (x, y) into ``out``.
+
+    The edge at the nearest point of the rim is straight, with its curvature to first
+    order.
+
+    Args:
+        x, y, width: (n,) places and widths, um.
+        ray: unit vector of the plane of incidence.
+        lengths: Fresnel lengths in that plane and across it, um.
+        hole: radius of the stop and wavelength, um.
+        table: of :func:`_table`.
+        out: (n,) complex.
+    """
     along, across = lengths
     radius, wavelength = hole
     for i in range(len(out)):
-        far = max(np.hypot(x[i], y[i]), 1e-12)
-        cosine = (x[i] * ray[0] + y[i] * ray[1]) / far
+        r = max(np.hypot(x[i], y[i]), 1e-12)
+        cosine = (x[i] * ray[0] + y[i] * ray[1]) / r
         normal = across + (along - across) * cosine * cosine
         scale = np.sqrt(2 / (wavelength * normal))
-        middle, half = (radius - far) * scale, width[i] * scale / 2
-        one = _wave(middle + half, table)
-        other = _wave(middle - half, table)
+        middle = (radius - r) * scale
+        half = width[i] * scale / 2
+        upper = _wave(middle + half, table)
+        lower = _wave(middle - half, table)
         bent = complex(
             0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i])
         )
-        out[i] = (one[1] - other[1]) / (2 * half) - bent * (one[0] - other[0])
+        out[i] = (upper[1] - lower[1]) / (2 * half) - bent * (upper[0] - lower[0])
 
 
 def edge_diffraction_factor(
@@ -288,15 +318,18 @@ def edge_diffraction_factor(
     radius_um: float,
     wavelength_um: float,
 ) -> Array:
-    """Complex amplitude S of :mod:`metalens.optics.aperture_stop` where rays cross the stop at (x,
-    y), mean over a width.
+    """Complex amplitude S of light diffracted by the stop's edge, mean over a width.
+
+    S is derived in :mod:`metalens.optics.aperture_stop`: Fresnel's straight edge, with
+    the curvature of the rim to first order.
 
     Args:
-        width_um: width over which the mean is taken.
+        at_um: (x, y) where rays cross the stop, from its centre, arrays of one shape.
+        width_um: over which the mean is taken.
+        ray: unit vector of the plane of incidence.
+        lengths_um: Fresnel lengths in that plane and across it.
         radius_um: of the stop.
         wavelength_um: in vacuum.
-        at_um: of one shape. ray: unit vector of the plane of incidence. lengths_um:
-            Fresnel lengths in it, across it.
     """
     shape = np.shape(at_um[0])
     x, y, width = (

@@ -17,18 +17,26 @@ FEW = 1000  # places below which the function itself is quicker
 
 
 def chebyshev_interpolant(function: Callable[[Any], Any], u: Any) -> Any:
-    """function(u), elementwise, of a float64 array or tensor; to 1e-14 of its largest
-    value.
+    """function(u), elementwise, by a Chebyshev interpolant.
+
+    The error is 1e-14 of the largest value. Degrees 8, 16 and 24 are tried over the
+    range of u. The function itself is called for few places, or where the coefficients
+    do not fall to rounding.
+
+    Args:
+        function: smooth, of an array or tensor.
+        u: float64 array or tensor.
     """
     count = u.size if isinstance(u, np.ndarray) else u.numel()
     low, high = (float(u.min()), float(u.max())) if count >= FEW else (0.0, 0.0)
-    middle, reach = (low + high) / 2, (high - low) / 2
+    middle = (low + high) / 2
+    reach = (high - low) / 2
     for degree in DEGREES if reach > 0 else ():
-        found = chebyshev.chebinterpolate(
+        series = chebyshev.chebinterpolate(
             lambda unit: function(middle + reach * unit), degree
         )
-        if np.abs(found[-2:]).max() <= LEFT * np.abs(found).max():
-            return horner(chebyshev.cheb2poly(found), (u - middle) / reach)
+        if np.abs(series[-2:]).max() <= LEFT * np.abs(series).max():
+            return horner(chebyshev.cheb2poly(series), (u - middle) / reach)
     return function(u)
 
 

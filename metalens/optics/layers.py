@@ -95,26 +95,33 @@ class Layers:
         return _media(self.front, "air", depth_um, wavelength_um, "source to lens")
 
     def from_stop(self, wavelength_um: float) -> Media | None:
-        """Media from the stop to the pillars, the last film first; None where there is
-        no way between them.
+        """Media from the stop to the pillars, the last film first.
+
+        None where the stop lies on the pillars.
         """
         left = 0.0 if self.stop is None else self.stop.distance_um
-        found: list[Film] = []
+        films: list[Film] = []
         for film in reversed(self.front):
-            found.append(replace(film, thickness_um=min(film.thickness_um, left)))
-            left -= found[-1].thickness_um
-        thick = sum(film.thickness_um for film in found)
+            films.append(replace(film, thickness_um=min(film.thickness_um, left)))
+            left -= films[-1].thickness_um
+        thick = sum(film.thickness_um for film in films)
         if thick + left == 0:
             return None
-        return _media(tuple(found), "air", thick + left, wavelength_um, "stop to lens")
+        return _media(tuple(films), "air", thick + left, wavelength_um, "stop to lens")
 
     def through_middle(
         self, tangents: Array, depth_um: float, wavelength_um: float
     ) -> Array:
-        """(…, 2) slopes in air of the rays through the middle of the stop from sources
-        at this depth, whose rays to the
-        middle of the lens have these slopes; the same without a stop, and of collimated
-        light."""
+        """(…, [x, y]) slopes in air of the rays through the middle of the stop.
+
+        They come from the same sources as rays to the middle of the lens. Without a
+        stop, and for collimated light, the slopes are those of ``tangents``.
+
+        Args:
+            tangents: (…, [x, y]) slopes in air of the rays to the middle of the lens.
+            depth_um: of the sources.
+            wavelength_um: in vacuum.
+        """
         if self.stop is None or math.isinf(depth_um):
             return tangents
         before, between = self._around_stop(depth_um, wavelength_um)
@@ -123,13 +130,12 @@ class Layers:
         inner = {} if between is None else dict(between.layers)
         outer = [(n, t - inner.get(n, 0.0)) for n, t in before.layers]
         outer = [(n, t) for n, t in outer if t > 1e-9 * depth_um]
-        sine2 = (tangents**2).sum(-1, keepdims=True)
-        come = tangents / np.sqrt(1 + sine2)
-        away = media.reach_per_direction(
-            before.layers, sine2 / (1 + sine2)
-        ) * come + np.array(self.stop.centre_um)
-        w = media.solve_direction_square(outer, (away**2).sum(-1, keepdims=True))
-        return np.asarray(away / media.reach_per_direction(outer, w) / np.sqrt(1 - w))
+        slope2 = (tangents**2).sum(-1, keepdims=True)
+        p = tangents / np.sqrt(1 + slope2)
+        reach = media.reach_per_direction(before.layers, slope2 / (1 + slope2)) * p
+        reach = reach + np.array(self.stop.centre_um)
+        w = media.solve_direction_square(outer, (reach**2).sum(-1, keepdims=True))
+        return np.asarray(reach / media.reach_per_direction(outer, w) / np.sqrt(1 - w))
 
     def stop_share(
         self,
@@ -139,14 +145,16 @@ class Layers:
         at_um: tuple[Any, Any],
         width_um: Any,
     ) -> Any:
-        """Share of a source's rays that pass the stop on their way to places (x, y) of
-        the pillars, 0 to 1.
+        """Share of a source's light that passes the stop to places of the pillars.
+
+        From 0 to 1, geometric; 1 without a stop.
 
         Args:
-            tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of
-                the source, inf for collimated
-                light. at_um: x and y, broadcast. width_um: of a place, over which the
-                edge is shared out.
+            tangents: (x, y) in air of the source's ray to the middle of the lens.
+            depth_um: of the source, inf for collimated light.
+            wavelength_um: in vacuum.
+            at_um: (x, y) places on the pillars, which broadcast.
+            width_um: of a place, over which the edge is a linear ramp.
 
         Raises:
             PropagationError: the source lies behind the stop.
@@ -166,10 +174,10 @@ class Layers:
         at_um: tuple[Any, Any],
         width_um: Any,
     ) -> Array:
-        """Complex amplitude of a source's light behind the stop over that without it,
-        at places of the pillars: as
-        :meth:`stop_share` with the ripples of the edge (:mod:`metalens.optics.aperture_stop`); numpy
-        arrays.
+        """Complex amplitude at places of the pillars over that without the stop.
+
+        As :meth:`stop_share`, with diffraction by the edge
+        (:mod:`metalens.optics.aperture_stop`); numpy arrays.
         """
         if self.stop is None:
             return np.ones(np.broadcast_shapes(np.shape(at_um[0]), np.shape(at_um[1])))
@@ -184,14 +192,17 @@ class Layers:
         blur_rad: float = 0.0,
         held: float = 1.0,
     ) -> float:
-        """Relative L2 error of a PSF by what :meth:`shadow` leaves out; 0 without a
-        stop.
+        """Relative L2 error of a PSF by the approximations of :meth:`shadow`.
 
-        blur_rad: radius of the PSF over its distance from the lens. held: share of its
-            light in the window that is
-            looked at. Waves that gather about the middle of a blur fall as 1 / √r, so
-            that their share of the light
-            grows as held^-½, and the error as held^-¼.
+        0 without a stop. Waves that meet near the middle of a blur fall off as 1 / √r.
+        Their share of the light grows as held^-½, and the error as held^-¼.
+
+        Args:
+            tangents: (x, y) in air of the source's ray to the middle of the lens.
+            depth_um: of the source, inf for collimated light.
+            wavelength_um: in vacuum.
+            blur_rad: radius of the PSF over its distance from the lens.
+            held: share of the PSF's light that lies in the window.
         """
         if self.stop is None:
             return 0.0
@@ -205,20 +216,25 @@ class Layers:
         )
 
     def footprint_um(self, depth_um: float, wavelength_um: float) -> float:
-        """Radius of what a source on the axis lights of the pillars' plane; inf without
-        a stop.
+        """Radius of the illuminated disc on the pillars' plane of a source on the axis.
+
+        It is inf without a stop.
         """
-        return (
-            math.inf
-            if self.stop is None
-            else illuminated_radius_um(
-                self.stop, *self._around_stop(depth_um, wavelength_um)
-            )
-        )
+        if self.stop is None:
+            return math.inf
+        around = self._around_stop(depth_um, wavelength_um)
+        return illuminated_radius_um(self.stop, *around)
 
     def _around_stop(
         self, depth_um: float, wavelength_um: float
     ) -> tuple[Media | None, Media | None]:
+        """Media from the source and from the stop to the pillars.
+
+        The first is None for collimated light, the second for a stop on the pillars.
+
+        Raises:
+            PropagationError: the source lies behind the stop.
+        """
         if self.stop is not None and depth_um <= self.stop.distance_um:
             raise PropagationError(
                 f"layers: a source {depth_um:g} um before the pillars lies behind the stop, {self.stop.distance_um:g} "
@@ -228,8 +244,10 @@ class Layers:
         return before, self.from_stop(wavelength_um)
 
     def ghost(self, wavelength_um: float) -> float:
-        """Share of the light that goes twice between the two faces that reflect most:
-        the largest ghost image.
+        """Share of the light in the largest ghost image.
+
+        It is reflected once by each of the two faces of highest reflectance on one side
+        of the lens, ((a - b) / (a + b))² at normal incidence.
         """
         worst = 0.0
         for films, first in ((self.front, "air"), (self.behind, self.filling)):
@@ -248,7 +266,7 @@ class Layers:
 def check_gaps(
     layers: Layers, sensor_distance_um: float, source_distance_um: float = math.inf
 ) -> None:
-    """Refuse films that do not fit between source, pillars and sensor.
+    """Raise for films that do not fit between source, pillars and sensor.
 
     Args:
         layers: films to check.
@@ -273,18 +291,31 @@ def _too_thick(thick_um: float, gap_um: float, where: str) -> str:
 
 def _media(
     films: tuple[Film, ...],
-    rest: Material,
+    filling: Material,
     distance_um: float,
     wavelength_um: float,
     where: str,
 ) -> Media:
+    """Films and the medium that fills the gap, as indices and thicknesses.
+
+    Args:
+        films: in order of the light; the filling comes first.
+        filling: material that fills the gap.
+        distance_um: length of the gap.
+        wavelength_um: in vacuum.
+        where: words for the gap, in the error's text.
+
+    Raises:
+        PropagationError: films thicker than the gap, or a medium that absorbs more than
+            ``MOST_ABSORBED``.
+    """
     thick = sum(film.thickness_um for film in films)
     if thick > distance_um:
         raise PropagationError(_too_thick(thick, distance_um, where))
     thicknesses = (distance_um - thick, *(film.thickness_um for film in films))
     indices = [
         index(name, wavelength_um)
-        for name in (rest, *(film.material for film in films))
+        for name in (filling, *(film.material for film in films))
     ]
     for n, t in zip(indices, thicknesses, strict=True):
         absorption = 4 * math.pi * n.imag / wavelength_um  # per um

@@ -70,7 +70,7 @@ class Media:
 
     @property
     def reduced_um(self) -> float:
-        """Σ t / n: the distance in air that bends paraxial light as much."""
+        """Σ t / n, um: the distance in air of equal paraxial refraction."""
         return sum(t / n for n, t in self.layers)
 
 
@@ -93,32 +93,39 @@ def relative_path(media: Media, p: Any) -> Any:
     """
     return sum(
         (
-            n * t * p * p / (rest * (n + rest))
-            for n, t, rest in _with_normals(media.layers, p * p)
+            n * t * p * p / (normal * (n + normal))
+            for n, t, normal in _with_normals(media.layers, p * p)
         ),
         p * 0,
     )
 
 
 def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
-    """Optical path from a source to (x, y), less its path to the lens centre, um; for a
-    source at infinity too.
+    """Optical path from a source to (x, y), less its path to the lens centre, um.
+
+    It holds for a source at infinity too. All operands broadcast.
 
     Args:
-        front: films that the light goes through, air apart. tangents: (x, y) of the ray
-            to the lens centre, in air.
-            inverse: 1 / depth, 1/um; operands broadcast.
+        front: (index, thickness) of the films before the lens, without the air.
+        x: place on the lens, um.
+        y: place on the lens, um.
+        tangents: (x, y) slopes in air of the ray to the lens centre.
+        inverse: 1 / depth of the source, 1/um.
     """
     if not front:
         return paths.source_path(x, y, tangents, inverse)
     tx, ty = tangents
     sine2 = (tx * tx + ty * ty) / (1 + tx * tx + ty * ty)
     cosine = (1 - sine2) ** 0.5
-    thick = sum(t for _, t in front)
-    pairs = [(1.0, 1 - thick * inverse), *((n, t * inverse) for n, t in front)]
-    g = reach_per_direction(pairs, sine2)
-    more = (x * x + y * y) * inverse + 2 * g * cosine * (x * tx + y * ty)
-    return path_difference(pairs, sine2, sine2 * g * g, more, inverse)[1]
+    films_um = sum(t for _, t in front)
+    pairs = [(1.0, 1 - films_um * inverse), *((n, t * inverse) for n, t in front)]
+    reach_per_p = reach_per_direction(pairs, sine2)
+    extra_reach2 = (x * x + y * y) * inverse + 2 * reach_per_p * cosine * (
+        x * tx + y * ty
+    )
+    return path_difference(
+        pairs, sine2, sine2 * reach_per_p * reach_per_p, extra_reach2, inverse
+    )[1]
 
 
 def area_spreading(media: Media, p: Any) -> Any:
@@ -131,7 +138,7 @@ def area_spreading(media: Media, p: Any) -> Any:
 
 
 def ray_direction(media: Media, reach_um: Any) -> Any:
-    """p of the ray that reaches so far: the inverse of :func:`lateral_reach`, to rounding.
+    """p of the ray of this reach: the inverse of :func:`lateral_reach`, to rounding.
 
     Args:
         media: plane-parallel media.
@@ -179,7 +186,7 @@ def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
     Args:
         order: indices that the faces lie between.
     """
-    return _fresnel(order, w, lambda rest: (rest * (rest.real > 0)) ** 0.5)
+    return _fresnel(order, w, lambda cosine2: (cosine2 * (cosine2.real > 0)) ** 0.5)
 
 
 def passed_on(order: Sequence[float], w: Any) -> tuple[Any, Any]:
@@ -189,15 +196,24 @@ def passed_on(order: Sequence[float], w: Any) -> tuple[Any, Any]:
     Args:
         order: indices that the faces lie between.
     """
-    return _fresnel(order, w, lambda rest: rest**0.5)
+    return _fresnel(order, w, lambda cosine2: cosine2**0.5)
 
 
 def _fresnel(
     order: Sequence[float], w: Any, cosine: Callable[[Any], Any]
 ) -> tuple[Any, Any]:
-    s_power, p_power = w * 0 + 1, w * 0 + 1
+    """Fresnel transmittances of s and of p power, multiplied over all faces.
+
+    Args:
+        order: indices of the media in the order that the light meets them.
+        w: p², where p = n sin θ.
+        cosine: square root that turns cos² θ into cos θ.
+    """
+    s_power = w * 0 + 1
+    p_power = w * 0 + 1
     for a, b in itertools.pairwise(order):
-        ca, cb = cosine(1 - w / a**2), cosine(1 - w / b**2)
+        ca = cosine(1 - w / a**2)
+        cb = cosine(1 - w / b**2)
         s_power = s_power * (1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2)
         p_power = p_power * (1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2)
     return s_power, p_power
@@ -221,59 +237,70 @@ def reach_per_direction(layers: Pairs, w: Any) -> Any:
     Args:
         layers: (index, thickness) of each medium.
     """
-    return _sum([t / rest for _, t, rest in _with_normals(layers, w)])
+    return _sum([t / normal for _, t, normal in _with_normals(layers, w)])
 
 
 def area_spreading_of_square(layers: Pairs, w: Any) -> Any:
-    """Area on the plane per area of p, as :func:`area_spreading`, of w = p².
+    """Area on the plane per area of p, um²: :func:`area_spreading` as of w = p².
+
+    (Σ t / s) (Σ t n² / s³) with s = √(n² - w).
 
     Args:
         layers: (index, thickness) of each medium.
     """
-    along = _sum(
-        [t * n * n / (rest * rest * rest) for n, t, rest in _with_normals(layers, w)]
+    reach_slope = _sum(
+        [
+            t * n * n / (normal * normal * normal)
+            for n, t, normal in _with_normals(layers, w)
+        ]
     )
-    return reach_per_direction(layers, w) * along
+    return reach_per_direction(layers, w) * reach_slope
 
 
 def whole_path(layers: Pairs, w: Any) -> Any:
-    """Optical path Σ n² t / √(n² - w).
+    """Optical path Σ n² t / √(n² - w), um, of the ray of w = p².
 
     Args:
         layers: (index, thickness) of each medium.
     """
-    return _sum([n * n * t / rest for n, t, rest in _with_normals(layers, w)])
+    return _sum([n * n * t / normal for n, t, normal in _with_normals(layers, w)])
 
 
 def solve_direction_square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
     """w = p² of the ray with (w - along2) (reach / p)² = reach2, to rounding.
 
-    Without ``along2`` that is the ray of this reach. With it, p² = along2 + q²: along2
-    is known, and how far q reaches.
+    Without ``along2`` that is the ray of this reach. With it, p² = along2 + q², and
+    reach2 is the squared reach along q alone.
 
-    Newton's method in S = tan² inside the rarest medium, where a single medium is
-    linear.
+    Newton's method solves for S = tan² θ in the rarest medium, in which a single medium
+    is linear. A single medium has the closed form.
 
     Args:
-        layers: (index, thickness) of each medium.
+        layers: (index, thickness) of each medium, um.
+        reach2: squared lateral distance, um².
+        along2: squared component of p that is fixed.
     """
     if len(layers) == 1:
         ((n, t),) = layers
         return (along2 * t * t + reach2 * n * n) / (t * t + reach2)
     low2 = min(n for n, _ in layers) ** 2
     reach2 = reach2 + along2 * 0
-    s = along2 / (low2 - along2) + reach2 * 0
+    tan2 = along2 / (low2 - along2) + reach2 * 0
     for _ in range(NEWTON):
-        w = low2 * s / (1 + s)
-        near = [(t, 1 / (n * n - w) ** 0.5) for n, t in layers]
-        g = _sum([t * v for t, v in near])
-        slope = _sum([t * (v * v * v) for t, v in near])
-        rate = (g * g + (w - along2) * g * slope) * low2 / (1 + s) ** 2
-        step = (reach2 - (w - along2) * g * g) / rate
-        s = s + step
-        if _largest(step) <= 2e-15 * _largest(s):
+        w = low2 * tan2 / (1 + tan2)
+        inverse_normals = [(t, 1 / (n * n - w) ** 0.5) for n, t in layers]
+        reach_per_p = _sum([t * v for t, v in inverse_normals])
+        slope = _sum([t * (v * v * v) for t, v in inverse_normals])
+        rate = (
+            (reach_per_p * reach_per_p + (w - along2) * reach_per_p * slope)
+            * low2
+            / (1 + tan2) ** 2
+        )
+        step = (reach2 - (w - along2) * reach_per_p * reach_per_p) / rate
+        tan2 = tan2 + step
+        if _largest(step) <= 2e-15 * _largest(tan2):
             break
-    return low2 * s / (1 + s)
+    return low2 * tan2 / (1 + tan2)
 
 
 def _largest(values: Any) -> float:
@@ -284,41 +311,40 @@ def _largest(values: Any) -> float:
 def path_difference(
     layers: Pairs, w0: Any, reach2: Any, more: Any, scale: Any = 1.0
 ) -> tuple[Any, Any]:
-    """(w, path) of the ray whose reach² is ``reach2 + scale·more``: the path less that
-    of the ray w0 of reach²
-    ``reach2``, without cancellation.
+    """(w, path) of the ray of reach² = ``reach2 + scale·more``, without cancellation.
 
-    With thicknesses and reach scaled by v = 1/z, ``reach2`` by v², ``more`` by v and
-    ``scale`` = v the path is that of
-    the media themselves, for a source at infinity too.
+    The path, in um, is less that of the ray w0, whose reach² is ``reach2``:
 
-    (w - w0)/v = more / (g² + w0 (g + g0) Σ t/(s s0 (s + s0))),  path = (w - w0)/v Σ t
-    n²/(s s0 (s + s0)),
-    g = Σ t/s, s = √(n² - w): difference of reach² = w g² over that of w.
+        path = δ Σ t n² / (s s0 (s + s0))
+        δ = (w - w0) / scale = more / (g² + w0 (g + g0) Σ t / (s s0 (s + s0)))
+
+    with s = √(n² - w) and g = Σ t/s = reach / p; s0 and g0 are those of w0.
+
+    A source at z, or at infinity, has ``scale`` = v = 1/z. Thicknesses are then times
+    v, ``reach2`` times v², and ``more`` times v.
 
     Args:
         layers: (index, thickness) of each medium.
+        w0: p² of the reference ray.
+        reach2: squared reach of the reference ray.
+        more: difference of the squared reaches over ``scale``.
+        scale: 1 for plain thicknesses in um.
     """
     w = solve_direction_square(layers, reach2 + scale * more)
     pairs = [(n, t, (n * n - w) ** 0.5, (n * n - w0) ** 0.5) for n, t in layers]
     g = _sum([t / s for _, t, s, _ in pairs])
     g0 = _sum([t / s0 for _, t, _, s0 in pairs])
     slope = _sum([t / (s * s0 * (s + s0)) for _, t, s, s0 in pairs])
-    extra = more / (g * g + w0 * (g + g0) * slope)
-    return w, extra * _sum([t * n * n / (s * s0 * (s + s0)) for n, t, s, s0 in pairs])
+    w_change = more / (g * g + w0 * (g + g0) * slope)
+    return w, w_change * _sum(
+        [t * n * n / (s * s0 * (s + s0)) for n, t, s, s0 in pairs]
+    )
 
 
 Light = Literal["s", "p", "mean"]
-WAVES = (
-    6,
-    8,
-    12,
-    16,
-    20,
-    24,
-    28,
-)  # nodes along u and along v; each ray takes those whose difference from fewer is least
-DEGREES = 24  # of the series in s before what is below rounding goes
+# nodes along u and along v; each ray takes the number that differs least from fewer
+WAVES = (6, 8, 12, 16, 20, 24, 28)
+DEGREES = 24  # of the series in s, before terms below rounding are cut off
 ROUNDING = 1e-14  # of the amplitude
 STEEPEST = 0.9999  # of a ray, in units of the rarest index that the light meets
 
@@ -328,9 +354,9 @@ class SaddleCorrection:
     """C as a power series in (s - middle) / half: real and imaginary coefficients,
     lowest first.
 
-    rarest: index of which s is the normal part. normal, left: (n,) values of s,
-    ascending, and the relative error of
-    the amplitude there, from fewer waves.
+    rarest: index n in s = √(n² - p²).
+    normal, left: (n,) values of s, ascending, and the relative error of the amplitude
+        at each, estimated with fewer plane waves.
     """
 
     rarest: float
@@ -361,87 +387,100 @@ class SaddleCorrection:
 def saddle_correction(
     behind: Media, wavenumber: float, reach_um: float, light: Light = "mean"
 ) -> SaddleCorrection:
-    """C of all rays up to this reach; ``wavenumber`` in vacuum, rad/um. light: whose
-    power passes the faces, of s, of p
-    or the mean of both.
+    """Correction C of the stationary-phase amplitude, for all rays up to this reach.
+
+    The amplitude of a ray is that of geometric optics times 1 + iC/(kL), where L is its
+    optical path.
 
     Args:
         behind: media from lens to sensor.
-        reach_um: lateral distance, um.
+        wavenumber: in vacuum, rad/um.
+        reach_um: largest lateral distance, um.
+        light: polarisation whose power passes the faces: s, p or the mean of both.
     """
     layers = behind.layers
     rarest = layers[0][0]
     w = float(solve_direction_square(layers, reach_um * reach_um))
-    steep = max(w / max(rarest * rarest - w, 1e-300), 2.0**-6)
-    steep = 2.0 ** (
-        math.ceil(4 * math.log2(steep)) / 4
-    )  # alike for windows of much the same rays
-    most = min(
-        rarest * rarest * steep / (1 + steep), (STEEPEST * min(behind.order)) ** 2
-    )
-    return _saddle(behind, wavenumber, most, light)
+    tan2 = max(w / max(rarest * rarest - w, 1e-300), 2.0**-6)
+    # rounded up, so that windows of similar rays share a cached series
+    tan2 = 2.0 ** (math.ceil(4 * math.log2(tan2)) / 4)
+    grazing = (STEEPEST * min(behind.order)) ** 2
+    largest_w = min(rarest * rarest * tan2 / (1 + tan2), grazing)
+    return _saddle(behind, wavenumber, largest_w, light)
 
 
 @functools.lru_cache(maxsize=64)
 def _saddle(
     behind: Media, wavenumber: float, most: float, light: Light
 ) -> SaddleCorrection:
-    """C of rays of w = p² up to ``most``."""
+    """Power series of C in the normal component s, for rays of w = p² up to ``most``.
+
+    A Chebyshev fit to (mean - 1) k L / i at ``2 DEGREES`` nodes of s = √(n² - w), its
+    coefficients below rounding cut off. One medium needs no correction: C = 0.
+
+    Args:
+        behind: media from lens to sensor.
+        wavenumber: in vacuum, rad/um.
+        most: largest p² of the rays.
+        light: s, p or their mean.
+    """
     rarest = behind.layers[0][0]
     ends = math.sqrt(rarest * rarest - most), rarest
-    middle, half = sum(ends) / 2, (ends[1] - ends[0]) / 2
+    middle = sum(ends) / 2
+    half = (ends[1] - ends[0]) / 2
     if len(set(behind.order)) == 1:
+        one = np.ones(1)
+        zero = np.zeros(1)
         return SaddleCorrection(
-            rarest,
-            middle,
-            half,
-            np.ones(1),
-            np.zeros(1),
-            np.array([rarest]),
-            np.zeros(1),
+            rarest, middle, half, one, zero, np.array([rarest]), zero
         )
     u = np.cos(np.pi * (np.arange(2 * DEGREES) + 0.5) / (2 * DEGREES))
     w = rarest * rarest - (middle + half * u) ** 2
-    turns = wavenumber * np.asarray(whole_path(behind.layers, w))
-    mean, apart = _settled(behind, wavenumber, w, light)
-    want = (mean - 1) * turns / 1j
-    # grazing rays are known poorly: they bend the series where they are alone, and not
-    # at all beyond rounding (full)
+    path_rad = wavenumber * np.asarray(whole_path(behind.layers, w))
+    mean, difference = _best_corrections(behind, wavenumber, w, light)
+    samples = (mean - 1) * path_rad / 1j
+    # the weights keep uncertain grazing rays from bending the series; full=True
+    # silences the warning about its rank
     series, _ = np.polynomial.chebyshev.chebfit(
-        u, want, DEGREES - 1, w=1 / (turns * (apart + ROUNDING)), full=True
+        u, samples, DEGREES - 1, w=1 / (path_rad * (difference + ROUNDING)), full=True
     )
-    kept = np.abs(series) > ROUNDING * turns.min()
-    power = np.polynomial.chebyshev.cheb2poly(
-        series[: int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 1]
-    )
-    real, imaginary = (np.ascontiguousarray(part) for part in (power.real, power.imag))
-    missed = np.abs(horner(power, u) - want) / turns
+    above = np.flatnonzero(np.abs(series) > ROUNDING * path_rad.min())
+    count = int(above[-1]) + 1 if len(above) else 1
+    power = np.polynomial.chebyshev.cheb2poly(series[:count])
+    misfit = np.abs(horner(power, u) - samples) / path_rad
     return SaddleCorrection(
         rarest,
         middle,
         half,
-        real,
-        imaginary,
+        np.ascontiguousarray(power.real),
+        np.ascontiguousarray(power.imag),
         (middle + half * u)[::-1],
-        np.maximum(apart, missed)[::-1],
+        np.maximum(difference, misfit)[::-1],
     )
 
 
-def _settled(
+def _best_corrections(
     behind: Media, wavenumber: float, w: Array, light: Light
 ) -> tuple[Array, Array]:
-    """(n,) :func:`plane_wave_correction` with as many as suit each ray, and by how much
-    fewer differ:
-    steep rays through thin films
-    settle at first, and part again where nodes lie beyond what the ray alone governs.
+    """(n,) corrections 1 + iC/(kL) of each ray, and (n,) estimates of their error.
+
+    :func:`plane_wave_correction` is computed with every number of nodes in ``WAVES``.
+    Each ray takes the number whose difference from the next smaller number is least.
+    Steep rays through thin films converge at first, then diverge again.
+
+    Args:
+        behind: media from lens to sensor.
+        wavenumber: in vacuum, rad/um.
+        w: (n,) p² of the rays.
+        light: s, p or their mean.
     """
-    every = np.stack(
+    corrections = np.stack(
         [plane_wave_correction(behind, wavenumber, w, count, light) for count in WAVES]
     )
-    apart = np.abs(np.diff(every, axis=0))
-    best = np.argmin(apart, axis=0)
-    at = np.arange(len(w))
-    return every[best + 1, at], apart[best, at]
+    differences = np.abs(np.diff(corrections, axis=0))
+    best = np.argmin(differences, axis=0)
+    ray = np.arange(len(w))
+    return corrections[best + 1, ray], differences[best, ray]
 
 
 def plane_wave_correction(
@@ -451,37 +490,46 @@ def plane_wave_correction(
     count: int = WAVES[-1],
     light: Light = "mean",
 ) -> Array:
-    """(n,) 1 + iC/(kL) of rays of w (n,) = p²: the mean of the heading over ``count`` x
-    ``count`` plane waves.
+    """(n,) amplitude factor 1 + iC/(kL) of rays by Gauss-Hermite quadrature.
+
+    The plane waves near each ray's stationary point are summed with the exact phase and
+    Fresnel amplitude, over the same sum with the quadratic phase and the ray's own
+    amplitude. The nodes lie on the path of steepest descent.
 
     Args:
         behind: media from lens to sensor.
-        wavenumber: in vacuum, rad/um.
+        wavenumber: k in vacuum, rad/um.
+        w: (n,) p² of the rays, p = n sin θ.
+        count: plane waves along each of two axes.
         light: s, p or their mean.
     """
-    layers, k = behind.layers, wavenumber
+    layers = behind.layers
+    k = wavenumber
     w = np.asarray(w, float)[:, None, None]
-    node, share = np.polynomial.hermite_e.hermegauss(count)
-    p, g = np.sqrt(w), np.asarray(reach_per_direction(layers, w))
-    along = np.asarray(area_spreading_of_square(layers, w)) / g
-    turned = np.exp(-0.25j * np.pi)
-    u = turned * node[:, None] / np.sqrt(k * along)
-    v = turned * node / np.sqrt(k * g)
-    more = 2 * p * u + u * u + v * v
+    node, node_weight = np.polynomial.hermite_e.hermegauss(count)
+    p = np.sqrt(w)
+    g = np.asarray(reach_per_direction(layers, w))
+    reach_slope = np.asarray(area_spreading_of_square(layers, w)) / g
+    rotation = np.exp(-0.25j * np.pi)
+    u = rotation * node[:, None] / np.sqrt(k * reach_slope)
+    v = rotation * node / np.sqrt(k * g)
+    w_change = 2 * p * u + u * u + v * v
     # p·ρ + Φ - L, its part linear in u taken off in every medium by itself
     path = p * u * g - sum(
-        t * more / ((n * n - w) ** 0.5 + (n * n - w - more) ** 0.5) for n, t in layers
+        t * w_change / ((n * n - w) ** 0.5 + (n * n - w - w_change) ** 0.5)
+        for n, t in layers
     )
     level = np.sqrt(
-        _passed_of(behind.order, w + more, light) / _passed_of(behind.order, w, light)
+        _passed_of(behind.order, w + w_change, light)
+        / _passed_of(behind.order, w, light)
     )
-    wave = level * np.exp(1j * k * (path + (along * u * u + g * v * v) / 2))
+    wave = level * np.exp(1j * k * (path + (reach_slope * u * u + g * v * v) / 2))
     return np.asarray(
-        np.einsum("nij,ij->n", wave, np.outer(share, share) / (2 * math.pi))
+        np.einsum("nij,ij->n", wave, np.outer(node_weight, node_weight) / (2 * math.pi))
     )
 
 
 def _passed_of(order: tuple[float, ...], w: Any, light: Light) -> Any:
-    """Power of this light that the faces let through."""
+    """Share of the power of this polarisation that passes the faces, of w = p²."""
     s_power, p_power = passed_on(order, w)
     return {"s": s_power, "p": p_power, "mean": (s_power + p_power) / 2}[light]

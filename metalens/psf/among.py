@@ -26,13 +26,13 @@ class NeighbourJonesFactors(NamedTuple):
 
 
 def phase_slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
-    """(…, y, x) slopes along x and y of the phase of complex t, rad/um, from the pairs
-    of pillars around each.
+    """(…, y, x) slopes along x and along y of the phase of complex t, rad/um.
 
-    Slopes up to π / pitch. 0 where no pair stands. Differentiable.
+    The angle of Σ t_{i+1} t_i* over pairs of neighbours around each pillar, over the
+    pitch: slopes up to π / pitch, 0 where there is no pair. Differentiable.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (…, y, x) complex transmission t of every pillar.
         pitch_um: lattice constant, um.
     """
     slopes = []
@@ -52,8 +52,11 @@ def phase_slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 
 def _around(pairs: Tensor, *, along: int) -> Tensor:
-    """Sum of the pairs around each pillar; there is one more pillar than pairs on the
-    axis ``along``.
+    """(…, y, x) sum of the pairs within ``REACH`` pillars of each pillar.
+
+    Args:
+        pairs: (…, y, x) products of neighbours, one fewer than pillars on one axis.
+        along: that axis, -1 or -2.
     """
     for axis in (-1, -2):
         wide = 2 * REACH + (axis != along)
@@ -68,28 +71,28 @@ def _around(pairs: Tensor, *, along: int) -> Tensor:
 
 
 def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> Tensor:
-    """(…, y, x) complex: mean of C over both polarisations at every pillar of complex
-    t.
+    """(…, y, x) complex coupling C of every pillar, the mean over both polarisations.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (…, y, x) complex transmission t.
         neighbours: solved rows of non-identical pillars.
         pitch_um: lattice constant, um.
     """
     parts = []
-    for inner, some in _shares(light):
-        s, aside, _ = _turned(*phase_slopes(some, pitch_um), neighbours)
-        parts.append(neighbours.of_both(s, aside)[..., inner, :])
+    for inner, rows in _shares(light):
+        s, sine2, _ = _turned(*phase_slopes(rows, pitch_um), neighbours)
+        parts.append(neighbours.of_both(s, sine2)[..., inner, :])
     return torch.cat(parts, -2)
 
 
 def apply_scalar_coupling(
     phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
 ) -> tuple[Tensor, Tensor]:
-    """(phase, transmission) of (…, y, x) maps times that mean.
+    """(…, y, x) phase and transmission of maps times :func:`mean_coupling`.
 
     Args:
-        level: transmission amplitude.
+        phase: (…, y, x) phase, rad.
+        level: (…, y, x) transmission amplitude.
         neighbours: solved rows of non-identical pillars.
         pitch_um: lattice constant, um.
     """
@@ -100,53 +103,63 @@ def apply_scalar_coupling(
 def apply_jones_coupling(
     phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
 ) -> NeighbourJonesFactors:
-    """J of (…, y, x) maps, complex.
+    """(…, y, x) complex Jones factors of the coupling of neighbours.
+
+    With C_a along the slope, C_b across it, and α its azimuth: xx = C_b + (C_a - C_b)
+    cos² α, yy = C_a - (C_a - C_b) cos² α, xy = (C_a - C_b) cos α sin α.
 
     Args:
-        phase: function of x and y, um, to phase, rad.
-        level: transmission amplitude.
+        phase: (…, y, x) phase, rad.
+        level: (…, y, x) transmission amplitude.
         neighbours: solved rows of non-identical pillars.
         pitch_um: lattice constant, um.
     """
     parts = []
-    for inner, some in _shares(torch.polar(level, phase)):
-        s, aside, (cosine2, both) = _turned(*phase_slopes(some, pitch_um), neighbours)
-        along, across = (neighbours.of_field(field, s, aside) for field in (0, 1))
-        apart = along - across
-        found = across + apart * cosine2, along - apart * cosine2, apart * both
-        parts.append([one[..., inner, :] for one in found])
+    for inner, rows in _shares(torch.polar(level, phase)):
+        s, sine2, (cosine2, both) = _turned(*phase_slopes(rows, pitch_um), neighbours)
+        along, across = (neighbours.of_field(field, s, sine2) for field in (0, 1))
+        change = along - across
+        factors = across + change * cosine2, along - change * cosine2, change * both
+        parts.append([factor[..., inner, :] for factor in factors])
     return NeighbourJonesFactors(
-        *(torch.cat(one, -2) for one in zip(*parts, strict=True))
+        *(torch.cat(factor, -2) for factor in zip(*parts, strict=True))
     )
 
 
 def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
-    """Rows of the map with those around them, and which of these count."""
-    rows, shares = light.shape[-2], []
+    """Blocks of rows with the rows around them, each with the slice of its own rows.
+
+    Args:
+        light: (…, y, x) map that is cut into blocks of ``ROWS``.
+    """
+    rows = light.shape[-2]
+    shares = []
     for start in range(0, rows, ROWS):
         first = max(start - REACH - 1, 0)
         last = min(start + ROWS + REACH + 1, rows)
-        shares.append(
-            (
-                slice(start - first, min(start + ROWS, rows) - first),
-                light[..., first:last, :],
-            )
-        )
+        inner = slice(start - first, min(start + ROWS, rows) - first)
+        shares.append((inner, light[..., first:last, :]))
     return shares
 
 
 def _turned(
-    across: Tensor, down: Tensor, neighbours: NeighbourRows
+    slope_x: Tensor, slope_y: Tensor, neighbours: NeighbourRows
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-    """Sine by which light is turned, sin² 2α, and (cos² α, cos α sin α)."""
-    square = across * across + down * down
-    steep = square > _FLAT
-    safe = torch.where(steep, square, torch.ones_like(square))
+    """Sine of the deflection, sin² 2α, and (cos² α, cos α sin α), α its azimuth.
+
+    Args:
+        slope_x: (…, y, x) slope of the phase along x, rad/um.
+        slope_y: the same along y.
+        neighbours: with the wavelength.
+    """
+    slope2 = slope_x * slope_x + slope_y * slope_y
+    steep = slope2 > _FLAT
+    safe = torch.where(steep, slope2, torch.ones_like(slope2))
     s = torch.where(
         steep,
         torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)),
-        torch.zeros_like(square),
+        torch.zeros_like(slope2),
     )
-    cosine2 = torch.where(steep, across * across / safe, 0.5)
-    both = torch.where(steep, across * down / safe, 0.0)
+    cosine2 = torch.where(steep, slope_x * slope_x / safe, 0.5)
+    both = torch.where(steep, slope_x * slope_y / safe, 0.0)
     return s, 4 * both * both, (cosine2, both)

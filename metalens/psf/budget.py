@@ -1,4 +1,4 @@
-"""What the error of a PSF is made of: what was computed, and what the model leaves out."""
+"""Error budget of a PSF: errors of the computation, and of the model."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -13,18 +13,15 @@ from metalens.optics import media
 from metalens.psf.spectrum import SpectralNodes
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
-# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
-# amplitude 0.986, -0.066 rad at sine
-# 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is
-# metalens.design.neighbours.estimate_neighbour_coupling
+# coupling of unequal neighbours in solved rows of 12 and 8 pillars of the default cell:
+# amplitude 0.986, -0.066 rad at sine 0.236, and 0.959, -0.100 rad at 0.354; that of
+# another cell is metalens.design.neighbours.estimate_neighbour_coupling
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst
 # pillar off resonance
 ANGLE = 2.5
-RINGS, SPOKES = (
-    8,
-    24,
-)  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
+# of an aperture over which obliquity is averaged: to rounding at NA 0.6, 25 degrees
+RINGS, SPOKES = 8, 24
 HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
@@ -38,15 +35,15 @@ CURES = {  # of an error above the tolerance, by its largest part
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """What is known of pillars that the model of a lens leaves out; by default rough,
-    of another cell.
+    """Sizes of the pillar effects that the model of a lens leaves out.
 
-    neighbours: rows of the lens's own pillars, whose factor its PSFs hold (at the rows'
-    wavelength and at normal
-        incidence; what other light changes is counted); or (a, b) of the factor 1 + a s
-        + b s² on
-        light that unlike neighbours turn by the sine s, which they lack.
-    angle: relative change of t over sin² of the incidence. of: whose numbers they are.
+    By default they are rough, those of another cell.
+
+    neighbours: solved rows of the lens's own pillars. Its PSFs include their coupling at
+        the rows' wavelength and at normal incidence. Or (a, b) of the coupling
+        1 + a s + b s² of light that is deflected by the sine s, which its PSFs lack.
+    angle: relative change of t over sin² of the incidence.
+    of: name of the cell that the numbers are of.
     """
 
     neighbours: NeighbourRows | tuple[complex, complex] = NEIGHBOURS
@@ -65,29 +62,25 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is
-    not known.
+    """Relative L2 errors of the PSFs by cause, the worst over angles; nan if unknown.
 
-    numerical: of the propagation, measured on the result. sampling: of the integration
-    over the cells of the window.
-    spectrum: of the quadrature over wavelengths. source: of a source of finite size,
-    whose points are taken as alike.
-    polarisation: of one scalar in place of both polarisations (of plain maps only that
-    of films, which let s and p
-        through unlike, measured on the light); of both, of rays whose fields are those
-        on their way to the window's
-        middle. neighbours: of pillars taken as if each stood among its like, or of the
-        factor of solved rows where the
-        lens holds them. angle: of pillars that answer as at normal incidence. glass: of
-        light that goes twice between
-        two faces. proxy: of pillars that answer by a curve, which follows those of
-        their library to some error, and of
-        what their solver knows of them; of two sizes that alone. posterior: of a lens
-        that
-    was fitted to captures, what its parameters leave open.
-    outside: share of the light that falls beside the window, worst over angles and
-    depths; a PSF of sum 1 does not
-        show it, so it is in no total.
+    numerical: of the propagation, measured on the result.
+    sampling: of the integration over the cells of the window.
+    spectrum: of the quadrature over wavelengths.
+    source: of one PSF for all points of a finite source.
+    polarisation: of one scalar for both polarisations. Of plain maps only that of
+        films, which transmit s and p differently, measured on the light. Of both
+        polarisations, that of rays to the window's middle for the whole window.
+    neighbours: of pillars computed in a lattice of equal pillars; or of the coupling of
+        solved rows where the lens has them.
+    angle: of pillars that respond as at normal incidence.
+    glass: of light reflected twice between two faces.
+    stop: of the shadow of the aperture stop.
+    proxy: of the response curve against the library, and of the library's solver; of
+        pillars of two sizes the second alone.
+    posterior: of a lens that was fitted to captures, by the spread of its parameters.
+    outside: share of the light outside the window, worst over angles and depths. A PSF
+        of sum 1 does not show it, so it is in no total.
     """
 
     numerical: float
@@ -165,8 +158,8 @@ def worst_of_budgets(budgets: list[Budget]) -> Budget:
 
 
 def _largest(values: list[float]) -> float:
-    known = [v for v in values if not math.isnan(v)]
-    return max(known) if known else math.nan
+    finite = [v for v in values if not math.isnan(v)]
+    return max(finite) if finite else math.nan
 
 
 def with_model(
@@ -177,20 +170,20 @@ def with_model(
     polarisation: Polarisation,
     left_out: LeftOut,
 ) -> Budget:
-    """The budget of one direction with the spectrum, and what the model of a lens
-    leaves out: terms of a perfect lens of the same aperture.
+    """The budget of one direction with the errors of spectrum and lens model added.
 
-    The term of the response curve is that of pillars off by at most this much of t, a
-    function of the diameter and so of the phase: its mean only dims the focus; the rest
-    leaves for other orders, which cross the focus as broad as the lens.
+    Model errors are those of a perfect lens of the same aperture. ``proxy`` is the
+    error of the response table, as a change of t with the diameter, and so with the
+    phase. Its mean only dims the focus. The remainder leaves in other orders, which
+    cross the focus as wide as the lens.
 
     Args:
-        budget: of what was computed.
+        budget: errors of the computation.
         lens: aperture, response table, films.
         angle_rad: (x, y) field angle.
         nodes: wavelengths with weights, and the error of their quadrature.
         polarisation: that was computed.
-        left_out: what is known of neighbours and angles.
+        left_out: solved rows or constants of neighbours, and the constant of angles.
     """
     aperture = sine_aperture(lens, angle_rad)
     wavelength_um = lens.wavelength_um
@@ -198,14 +191,14 @@ def with_model(
     area = lens.diameters.pillars * lens.diameters.site_um2 / wavelength_um**2
     pairs = lens.pairs
     curve = pairs.entry_error if pairs else lens.proxy.error(wavelength_um)
-    rays = budget.polarisation
+    mixing = budget.polarisation
     if polarisation == "scalar":
-        uneven = obliquity_variation(lens, angle_rad)
-        rays = _together(scalar_error(aperture, uneven), rays)
+        variation = obliquity_variation(lens, angle_rad)
+        mixing = _together(scalar_error(aperture, variation), mixing)
     return replace(
         budget,
         spectrum=nodes.error,
-        polarisation=rays,
+        polarisation=mixing,
         neighbours=_neighbours(
             aperture, left_out.neighbours, polarisation, nodes, slanted, area
         ),
@@ -226,34 +219,37 @@ def incidence_sine(angle_rad: tuple[float, float]) -> float:
 
 
 def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Half the spread in sin θ of the rays from the lens to the chief ray's place on
-    the sensor.
+    """Numerical aperture on the sensor: half the range of sin θ of the rays to a point.
+
+    The point is where the chief ray meets the sensor.
 
     Args:
+        lens: aperture, distance and films.
         angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
-    edges = centre + np.array([-1.0, 1.0]) * (
-        lens.diameters.radius_um + lens.diameters.pitch_um / 2
-    )
+    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    edges = centre + np.array([-1.0, 1.0]) * radius
     p = np.sign(edges) * media.ray_direction(after, np.abs(edges))
     return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
 def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the
-    chief ray's place on the sensor.
+    """Relative standard deviation over the aperture of 1/cos θ of the rays to a point.
+
+    The point is where the chief ray meets the sensor. The aperture is integrated by
+    Gauss's rule in r² and equal steps of azimuth.
 
     Args:
+        lens: aperture, distance and films.
         angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
     node, share = np.polynomial.legendre.leggauss(RINGS)
-    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt(
-        (node + 1) / 2
-    )[:, None]
+    edge = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    radius = edge * np.sqrt((node + 1) / 2)[:, None]
     turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
     p = media.ray_direction(
         after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn))
@@ -264,92 +260,110 @@ def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
 
 
 def scalar_error(aperture: float, uneven: float = 0.0) -> float:
-    """Relative L2 difference between the scalar PSF and the flux of both polarisations,
-    which a pixel counts.
+    """Relative L2 difference between the scalar PSF and the flux of both polarisations.
 
-    That of a perfect lens of this aperture in focus (7e-5 at NA 0.24, 4e-3 at 0.6), and
-    of light from the side: two
-    rays b, b' of it add up as (b_z + b'_z) / 2√(b_z b'_z), which is 1 but for squares
-    of how uneven 1/cos θ is. Of 36
-    lenses drawn (NA 0.1 to 0.6, up to 25 degrees, in focus, out of it, aberrated) 36
-    lie below, at 0.29 to 0.86 of it.
+    A pixel counts the flux. Two terms add in quadrature: that of a perfect lens of this
+    aperture in focus (7e-5 at NA 0.24, 4e-3 at 0.6), and that of oblique light. Two
+    rays b, b' add up as (b_z + b'_z) / 2√(b_z b'_z), which differs from 1 by the
+    squared variation of 1/cos θ. Of 36 random lenses (NA 0.1 to 0.6, up to 25 degrees,
+    in focus, defocused, aberrated), all had 0.29 to 0.86 of this error.
 
     Args:
-        uneven: standard deviation of 1/cos θ over the aperture, over its mean
-            (:func:`metalens.psf.of_lens.uneven`).
+        aperture: numerical aperture on the sensor.
+        uneven: relative standard deviation of 1/cos θ over the aperture
+            (:func:`obliquity_variation`).
     """
     return math.hypot(_difference(_scalar(aperture), _flux(aperture)), uneven**2 / 2)
 
 
 def _neighbours(
     aperture: float,
-    known: NeighbourRows | tuple[complex, complex],
+    model: NeighbourRows | tuple[complex, complex],
     polarisation: Polarisation,
     nodes: SpectralNodes,
     slanted: float,
     area: float,
 ) -> float:
-    """Of pillars taken one by one; or of the factor of rows: another truncation, any
-    row left out, zones that get shorter from one to the next, other light than the
-    rows', and for the scalar one mean of fields along and across the slope. And of the
-    light that they scatter.
+    """Relative L2 error of a PSF by the coupling of unequal neighbours.
 
-    slanted: share of the change that light from the side may change, as t of a pillar
-    does. area: of the lens in squared wavelengths.
+    Two constants stand for a lens without solved rows: the error is then that of no
+    coupling. With solved rows the errors are those of their truncation, of any row left
+    out, of the change of zones, of other wavelengths, and of one scalar mean for both
+    polarisations. Light that neighbours scatter is added in both cases.
+
+    Args:
+        aperture: numerical aperture on the sensor.
+        model: solved rows, or constants (a, b) of the factor 1 + a p + b p².
+        polarisation: that was computed.
+        nodes: wavelengths with weights.
+        slanted: relative change of the coupling by oblique light.
+        area: of the lens in squared wavelengths.
     """
     p, _, _ = _nodes(aperture)
-    if isinstance(known, tuple):
-        factor = 1 + known[0] * p + known[1] * p * p
-        used = _scalar(aperture, factor)
-        changed = _difference(used, _scalar(aperture))
-        return math.hypot(changed, _scattered(aperture, factor, used, area))
-    factor = known.mean(p)
-    used = _scalar(aperture, factor)
+    uncoupled = _scalar(aperture)
+    if isinstance(model, tuple):
+        factor = 1 + model[0] * p + model[1] * p * p
+        psf = _scalar(aperture, factor)
+        scattered = _scattered(aperture, factor, psf, area)
+        return math.hypot(_difference(psf, uncoupled), scattered)
+    factor = model.mean(p)
+    psf = _scalar(aperture, factor)
 
     def change(other: Array) -> float:
-        return _difference(_scalar(aperture, other), used)
+        return _difference(_scalar(aperture, other), psf)
 
-    left = change(known.coarser.mean(p))
-    left += max((change(other.mean(p)) for other in known.others), default=0.0)
-    left += math.hypot(CURVED, slanted) * _difference(_scalar(aperture), used)
+    error = change(model.coarser.mean(p))
+    error += max((change(other.mean(p)) for other in model.others), default=0.0)
+    error += math.hypot(CURVED, slanted) * _difference(uncoupled, psf)
     for wave, weight in zip(nodes.wavelengths_um, nodes.weights, strict=True):
-        away = change(known.mean(p * (wave / known.wavelength_um)))
-        left = math.hypot(left, math.sqrt(weight) * away)
-    left = math.hypot(left, _scattered(aperture, factor, used, area))
+        dispersion = change(model.mean(p * (wave / model.wavelength_um)))
+        error = math.hypot(error, math.sqrt(weight) * dispersion)
+    error = math.hypot(error, _scattered(aperture, factor, psf, area))
     if polarisation != "scalar":
-        return left
-    along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
-    turned = _scalar(aperture, (along - across) / 2, order=2)
-    return math.hypot(left, _difference(used + turned, used))
+        return error
+    along, across = (model.at(p) + model.at(p, math.pi / 4)) / 2
+    crossed = _scalar(aperture, (along - across) / 2, order=2)
+    return math.hypot(error, _difference(psf + crossed, psf))
 
 
-def _scattered(aperture: float, factor: Array, used: Array, area: float) -> float:
-    """Of the light that neighbours take from the focus (1 - |C|²) and that meets it
-    again with any phase, spread over
-    the shadow of the lens, as the order that goes straight on:
+def _scattered(aperture: float, factor: Array, psf: Array, area: float) -> float:
+    """Relative L2 error of a PSF by light n that neighbours scatter, of any phase.
 
-        |U + n|² - |U|² ≈ 2 Re U* n,   ‖2 Re U* n‖² = 2 <|n|²> ∫|U|²,   <|n|²> = P / area
+    It is the light 1 - |C|² that coupling takes from the focus. It crosses the focus as
+    wide as the lens, like the order that goes straight on:
 
-    A lens of few wavelengths has few places for it: 0.09 on a square of 7 um at NA 0.4,
-    5e-4 for 1 mm.
+        |U + n|² - |U|² ≈ 2 Re U* n
+        ‖2 Re U* n‖² = 2 <|n|²> ∫|U|²,  <|n|²> = P / area
+
+    It is large for a lens of few wavelengths: 0.09 on a square of 7 um at NA 0.4, 5e-4
+    for 1 mm.
+
+    Args:
+        aperture: numerical aperture on the sensor.
+        factor: (p,) coupling C at the nodes.
+        psf: (ρ,) |U|².
+        area: of the lens in squared wavelengths.
     """
     p, weight, _ = _nodes(aperture)
     power = weight / (1 - p * p) ** 2
-    kept = float(power @ np.abs(factor) ** 2 / power.sum())
-    return math.sqrt(max(1 - kept, 0.0) / kept) * _crossed(aperture, used, area)
+    focused = float(power @ np.abs(factor) ** 2 / power.sum())
+    scattered = max(1 - focused, 0.0) / focused
+    return math.sqrt(scattered) * _crossed(aperture, psf, area)
 
 
-def _crossed(aperture: float, used: Array, area: float) -> float:
-    """√(2 (∫|U|²)² / ∫|U|⁴ / area): what light of the same power, as broad as the lens, does to a PSF |U|²."""
+def _crossed(aperture: float, psf: Array, area: float) -> float:
+    """Relative L2 change of a PSF |U|² by light of equal power, as wide as the lens.
+
+    √(2 (∫|U|²)² / ∫|U|⁴ / area), with areas in squared wavelengths.
+    """
     _, _, radius = _nodes(aperture)
-    ring = np.arange(len(used)) * (
-        2 * np.pi * (radius[1] / (2 * np.pi)) ** 2
-    )  # in squared wavelengths
-    return math.sqrt(2 * float(used @ ring) ** 2 / float(used**2 @ ring) / area)
+    step = radius[1] / (2 * np.pi)
+    ring = np.arange(len(psf)) * (2 * np.pi * step**2)
+    return math.sqrt(2 * float(psf @ ring) ** 2 / float(psf**2 @ ring) / area)
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:
-    """(p,) nodes, (p,) weights p dp, (ρ,) k ρ up to some ten rings."""
+    """(p,) Gauss nodes of sin θ, (p,) weights p dp, (ρ,) k ρ over some ten rings."""
     t, w = np.polynomial.legendre.leggauss(64)
     edge = min(aperture, 0.999)
     p = edge * (t + 1) / 2
@@ -357,27 +371,33 @@ def _nodes(aperture: float) -> tuple[Array, Array, Array]:
 
 
 def _scalar(aperture: float, factor: Array | float = 1.0, *, order: int = 0) -> Array:
-    """(ρ,) |U|² through a factor at the nodes, of light that turns ``order`` times
-    about the axis.
+    """(ρ,) |U|² of a perfect lens: U = ∫ factor J_m(k ρ p) p dp / (1 - p²).
+
+    Args:
+        aperture: numerical aperture on the sensor.
+        factor: (p,) at the nodes.
+        order: m, turns of the light's phase about the axis.
     """
-    p, weight, at = _nodes(aperture)
+    p, weight, radius = _nodes(aperture)
     level = weight / (1 - p * p) * factor
-    return np.asarray(np.abs(level @ jv(order, np.outer(p, at))) ** 2)
+    return np.asarray(np.abs(level @ jv(order, np.outer(p, radius))) ** 2)
 
 
 def _flux(aperture: float) -> Array:
     """(ρ,) I0² - I2² of Richards and Wolf: power through the plane, unpolarised."""
-    p, weight, at = _nodes(aperture)
+    p, weight, radius = _nodes(aperture)
     cosine = np.sqrt(1 - p * p)
-    level, x = weight / (1 - p * p) / np.sqrt(cosine), np.outer(p, at)
+    level = weight / (1 - p * p) / np.sqrt(cosine)
+    x = np.outer(p, radius)
     return np.asarray(
         ((level * (1 + cosine)) @ jv(0, x)) ** 2
         - ((level * (1 - cosine)) @ jv(2, x)) ** 2
     )
 
 
-def _difference(one: Array, other: Array) -> float:
-    """Relative L2 distance over the plane of two radial PSFs of sum 1."""
-    ring = np.arange(len(one))
-    one, other = one / (one @ ring), other / (other @ ring)
-    return float(np.sqrt((one - other) ** 2 @ ring / (other**2 @ ring)))
+def _difference(psf: Array, reference: Array) -> float:
+    """Relative L2 distance over the plane of two radial PSFs (ρ,), each of sum 1."""
+    ring = np.arange(len(psf))
+    psf = psf / (psf @ ring)
+    reference = reference / (reference @ ring)
+    return float(np.sqrt((psf - reference) ** 2 @ ring / (reference**2 @ ring)))

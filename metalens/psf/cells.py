@@ -30,25 +30,31 @@ class PixelCells:
 
 
 def nyquist_um(case: PropagationCase) -> float:
-    """Largest step at which samples of |U|² on the window fold nothing.
+    """Largest step, um, at which samples of |U|² on the window have no aliases.
+
+    λ / (2 (p1 - p0)), with p0 and p1 the direction cosines of the rays from both edges
+    of the lens along an axis; the smaller of both axes.
 
     Args:
-        case: maps, geometry and window of the propagation.
+        case: geometry and window of the propagation.
     """
-    (hy, hx), (cx, cy) = case.half_size_um, case.centre_um
+    hy, hx = case.half_size_um
+    cx, cy = case.centre_um
     band = 0.0
-    for half, centre, beside, away in ((hx, cx, hy, cy), (hy, cy, hx, cx)):
-        far = max(abs(away) - beside, 0.0)
-        p = ray_cosines(case, np.array([-half, half]) - centre, np.array([far, far]))
+    for half, centre, other_half, other in ((hx, cx, hy, cy), (hy, cy, hx, cx)):
+        offset = max(abs(other) - other_half, 0.0)
+        edges = np.array([-half, half]) - centre
+        p = ray_cosines(case, edges, np.array([offset, offset]))
         band = max(band, float(p[1] - p[0]) / case.wavelength_um)
     return 1 / (2 * band)
 
 
 def plan_pixel_cells(case: PropagationCase, finer: int = FINER[0]) -> PixelCells:
-    """How a window is sampled: as it is, or ``finer`` points in Nyquist's step.
+    """Sampling of a window: its own, or ``finer`` points within Nyquist's step.
 
     Args:
-        case: maps, geometry and window of the propagation.
+        case: geometry and window of the propagation.
+        finer: points within Nyquist's step.
 
     Raises:
         PropagationError: a step so coarse that its cells would take more than ``MOST``
@@ -70,8 +76,10 @@ def plan_pixel_cells(case: PropagationCase, finer: int = FINER[0]) -> PixelCells
 
 
 def _left(s: float) -> tuple[float, float]:
-    """Of a wave that turns by 2 asin(s) from point to point, whose mean over the step
-    between them is s / asin(s).
+    """Error of the corrections of a cell's mean for a wave, as ``PixelCells.left``.
+
+    The wave advances by 2 asin(s) rad from point to point. Its mean over that step is
+    s / asin(s), and the corrections are s²/6 and 17 s⁴/360.
     """
     second, fourth = s**2 / 6, 17 / 360 * s**4
     return (1 - second - fourth - s / math.asin(s)) / fourth, fourth / second
@@ -80,34 +88,34 @@ def _left(s: float) -> tuple[float, float]:
 def integrate_cells(
     light: torch.Tensor, fine: PixelCells
 ) -> tuple[torch.Tensor, float]:
-    """(…, y, x) means over the cells of fine samples with a border of two, and the
-    error of the integration.
+    """(…, y, x) means over cells of fine samples, and their relative L2 error.
 
-    Within cells the differences add up to those of slopes at their borders, which may
-    meet at 0 in the fourth order
-    and not in the sixth: the second vouches for it.
+    The mean over a sample's area is its value plus corrections by second and fourth
+    differences. The error is estimated from both. Within a cell, differences add up to
+    those of slopes at its borders; these may cancel in the fourth order alone, so the
+    second order bounds the error as well.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (…, y, x) irradiance on the fine samples, with a border of two.
+        fine: points of a cell, and the errors of the corrections.
     """
-    points, whole = fine.points, slice(BORDER, -BORDER)
-    across, down = _second(light, -1), _second(light, -2)
-    bent = (across[..., whole, 1:-1] + down[..., 1:-1, whole]) / 24
-    fourth = (
-        -17
-        / 5760
-        * (_second(across, -1)[..., whole, :] + _second(down, -2)[..., whole])
+    points = fine.points
+    whole = slice(BORDER, -BORDER)
+    by_x = _second(light, -1)
+    by_y = _second(light, -2)
+    second_order = (by_x[..., whole, 1:-1] + by_y[..., 1:-1, whole]) / 24
+    fourth_order = (
+        -17 / 5760 * (_second(by_x, -1)[..., whole, :] + _second(by_y, -2)[..., whole])
     )
-    fourth = fourth + _second(across, -2)[..., 1:-1, 1:-1] / 576
+    fourth_order = fourth_order + _second(by_x, -2)[..., 1:-1, 1:-1] / 576
     first, second, last = (
-        _means(part, points) for part in (light[..., whole, whole], bent, fourth)
+        _means(part, points)
+        for part in (light[..., whole, whole], second_order, fourth_order)
     )
     size, *sizes = (float(part.detach().norm()) for part in (first, second, last))
-    error = (
-        fine.left[0] * math.hypot(sizes[1], fine.left[1] * sizes[0]) / size
-        if size
-        else 0.0
-    )
+    error = 0.0
+    if size:
+        error = fine.left[0] * math.hypot(sizes[1], fine.left[1] * sizes[0]) / size
     return first + second + last, error
 
 

@@ -1,4 +1,4 @@
-"""Light far behind a lens, over direction cosines: beam deflectors, holograms, axicons."""
+"""Far field of a lens over direction cosines: beam deflectors, holograms, axicons."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ MOST_SITES = 25_000_000  # 5000 x 5000: 1.5 GB
 # an Airy pattern
 BEAM = 10.0
 WIDEST_BEAM = 0.05  # of that radius, direction cosine: small apertures
-BEAMS, LEAST = 12, 0.01  # that are looked for; share of the light below which none is
+BEAMS, LEAST = 12, 0.01  # largest number of beams, and least share of the light of each
 SPOT = 0.75  # of the light of a beam, within half the radius
 DRAWN = 24  # directions of the check by a plain sum
 _ROWS = 256
@@ -92,21 +92,23 @@ def far_field(
     wavelength_um: float | None = None,
     samples: int = 401,
 ) -> FarField:
-    """Directions of the light of a source at ``source_um`` (inf: a plane wave) in a
-    field angle, as for a PSF.
+    """Far field of a lens: shares of the light over direction cosines, and its beams.
+
+    |FFT of the field behind the pillars|² is summed over squares of direction cosines,
+    over rings about the axis, and over a circle about each beam.
 
     Args:
-        lens: the lens.
-        wavelength_um: vacuum wavelength, um.
+        lens: pillars, response and films.
         angle_rad: (x, y) arctangents of the light's slope; a plane wave at +x leaves
             flat pillars at +x.
-        samples: odd number of squares across all directions that the lattice tells, at
-            most sines of -1 to 1.
+        source_um: depth of the source, um; inf for a plane wave.
+        wavelength_um: vacuum wavelength, um; None for the design's.
+        samples: odd number of squares across all directions that the lattice resolves,
+            at most sines of -1 to 1.
 
-    Accuracy: ``error``, 1e-5 or better in single precision; of the model: pillars
-    answer as in their library, alike for
-        all directions that light leaves in, without neighbours; no reflections of
-        films.
+    Accuracy: ``error``, 1e-5 or better in single precision. The model: pillars respond
+        as in their library, equally for all directions that light leaves in, without
+        neighbours; no reflections of films.
 
     Raises:
         PropagationError: more than 25 million sites, or fewer than 3 squares.
@@ -123,62 +125,82 @@ def far_field(
         raise PropagationError("no light passes the pillars")
     steps = lens.diameters.steps_um
     edge = min(1.0, max(wave / (2 * step) for step in steps))
-    square = 2 * edge / (samples // 2 * 2 + 1)
+    count = samples // 2 * 2 + 1
+    square = 2 * edge / count
     p, power = _spectrum(light, steps, wave, square)
     orders = [(wave * u, wave * v) for u, v in _orders(lens)]
-    held, beyond = _radiated(power, p, orders if lens.diameters.lattice.centred else [])
-    radius, wide = _beam_sine(lens, wave)
-    sines = square * (np.arange(samples // 2 * 2 + 1) - samples // 2)
-    plain = _Sum(light, steps, wave)
-    share, rings = _squares(power, p, square, len(sines))
+    total, beyond = _radiated(
+        power, p, orders if lens.diameters.lattice.centred else []
+    )
+    radius, airy = _beam_sine(lens, wave)
+    exact = _Sum(light, steps, wave)
+    share, rings = _squares(power, p, square, count)
     return FarField(
-        share / held,
-        sines,
-        rings / held,
-        _beams(plain, power, p, radius, held),
+        share / total,
+        square * (np.arange(count) - samples // 2),
+        rings / total,
+        _beams(exact, power, p, radius, total),
         radius,
         1
-        - special.j0(math.pi * radius / wide) ** 2
-        - special.j1(math.pi * radius / wide) ** 2,
-        beyond / held,
+        - special.j0(math.pi * radius / airy) ** 2
+        - special.j1(math.pi * radius / airy) ** 2,
+        beyond / total,
         passed / np.count_nonzero(lens.diameters.diameter_um),
         min(1.0, *(math.hypot(*order) / 2 for order in orders)),
-        _error(plain, p, power),
+        _error(exact, p, power),
     )
 
 
 def _behind(
     lens: Lens, angle_rad: tuple[float, float], source_um: float, wavelength_um: float
 ) -> Array:
-    """(y, x) complex64 light behind every pillar; phases in float64 before the cast."""
+    """(y, x) complex64 field behind every pillar: |t| S exp(i (φ + k path)).
+
+    S is the shadow of a stop, and path that from the source. Phases are float64 before
+    the cast.
+
+    Args:
+        lens: pillars, response and films.
+        angle_rad: (x, y) field angle.
+        source_um: depth of the source, inf for a plane wave.
+        wavelength_um: in vacuum.
+    """
     if lens.layers.front and math.isfinite(source_um):
         raise PropagationError(
             "films in front of the lens: its far field is of plane waves; give sources_mm = inf"
         )
-    seen = 0.0 if lens.pairs is not None else library_incidence(lens, angle_rad)
-    d, k = lens.diameters, 2 * math.pi / wavelength_um
-    tangents = tuple(math.tan(a) for a in angle_rad)
-    level = lens.transmission(wavelength_um, seen)
-    found = np.empty(level.shape, np.complex64)
+    tilt = 0.0 if lens.pairs is not None else library_incidence(lens, angle_rad)
+    d = lens.diameters
+    k = 2 * math.pi / wavelength_um
+    tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
+    level = lens.transmission(wavelength_um, tilt)
+    field = np.empty(level.shape, np.complex64)
     for start in range(0, len(level), _ROWS):
         rows = slice(start, start + _ROWS)
-        path = source_path(d.x_um, d.y_um[rows][:, None], tangents, 1 / source_um)
-        phase = np.remainder(
-            lens.rows_phase_rad(rows, wavelength_um, seen) + k * path, 2 * math.pi
-        )
         places = d.x_um, d.y_um[rows][:, None]
-        shadow = lens.layers.shadow(
-            (tangents[0], tangents[1]), source_um, wavelength_um, places, d.pitch_um
+        path = source_path(*places, tangents, 1 / source_um)
+        phase = np.remainder(
+            lens.rows_phase_rad(rows, wavelength_um, tilt) + k * path, 2 * math.pi
         )
-        found[rows] = level[rows] * shadow * np.exp(1j * phase)
-    return found
+        shadow = lens.layers.shadow(
+            tangents, source_um, wavelength_um, places, d.pitch_um
+        )
+        field[rows] = level[rows] * shadow * np.exp(1j * phase)
+    return field
 
 
 def _spectrum(
     light: Array, steps: tuple[float, float], wavelength_um: float, square: float
 ) -> tuple[tuple[Array, Array], Array]:
-    """((x, y) direction cosines, ascending), and (y, x) |F|² at them up to a factor,
-    finely enough for its sums.
+    """Direction cosines (x, y), ascending, and (y, x) |F|², the squared padded FFT.
+
+    The padding gives two samples or more for each square of direction cosines.
+
+    Args:
+        light: (y, x) field behind the pillars.
+        steps: of the lattice along x and y, um.
+        wavelength_um: in vacuum.
+        square: width of a square of direction cosines.
     """
     counts = [
         fft.next_fast_len(max(2 * n, math.ceil(2 * wavelength_um / (step * square))))
@@ -196,32 +218,35 @@ def _spectrum(
 def _orders(lens: Lens) -> list[tuple[float, float]]:
     """Diffraction orders of the lattice next to the axis, one of each pair, 1/um."""
     x, y = lens.diameters.steps_um
-    beside = (
-        [(0.5 / x, 0.5 / y), (0.5 / x, -0.5 / y)]
-        if lens.diameters.lattice.centred
-        else []
-    )
-    return [*beside, (0.0, 1 / y), (1 / x, 0.0)]
+    orders = [(0.0, 1 / y), (1 / x, 0.0)]
+    if lens.diameters.lattice.centred:
+        return [(0.5 / x, 0.5 / y), (0.5 / x, -0.5 / y), *orders]
+    return orders
 
 
 def _radiated(
     power: Array, p: tuple[Array, Array], orders: list[tuple[float, float]]
 ) -> tuple[float, float]:
-    """(light of one period of the lattice, that of it whose sine is above 1); both are
-    taken out of ``power``.
+    """Light of one period of the lattice, and its part of sine above 1.
 
-    orders: where the transform holds several periods, those that a direction must be
-    farther from than from the axis.
+    Samples of other periods and of sines above 1 are set to 0 in ``power``, in place.
+
+    Args:
+        power: (y, x) |F|² of the transform.
+        p: (x, y) direction cosines of its samples.
+        orders: diffraction orders that bound the period (Brillouin zone): a direction
+            in it is nearer to the axis than to any of them. Empty where the transform
+            has one period.
     """
-    held = beyond = 0.0
+    total = beyond = 0.0
     for line, y in zip(power, p[1], strict=True):
         for qx, qy in orders:
             line[np.abs(qx * p[0] + qy * y) > (qx * qx + qy * qy) / 2] = 0
-        held += float(line.sum(dtype=float))
+        total += float(line.sum(dtype=float))
         outside = p[0] ** 2 > 1 - y * y
         beyond += float(line[outside].sum(dtype=float))
         line[outside] = 0
-    return held, beyond
+    return total, beyond
 
 
 def _beam_sine(lens: Lens, wavelength_um: float) -> tuple[float, float]:
@@ -233,11 +258,18 @@ def _beam_sine(lens: Lens, wavelength_um: float) -> tuple[float, float]:
 def _squares(
     power: Array, p: tuple[Array, Array], square: float, count: int
 ) -> tuple[Array, Array]:
-    """Sums over squares (y, x), samples at their edges shared out by area, and over
-    rings about the axis.
+    """(y, x) sums of ``power`` over squares, and (n,) sums over rings about the axis.
+
+    A sample across the edge of a square counts by its area in it.
+
+    Args:
+        power: (y, x) |F|² of the transform.
+        p: (x, y) direction cosines of its samples.
+        square: width of squares and rings.
+        count: squares along each axis.
     """
-    across, down = (_overlap(axis, square, count) for axis in p)
-    share = np.asarray((across @ (down @ power).T).T)
+    along_x, along_y = (_overlap(axis, square, count) for axis in p)
+    share = np.asarray((along_x @ (along_y @ power).T).T)
     rings = np.zeros(math.ceil(1 / square) + 1)
     for y, line in zip(p[1], power, strict=True):
         ring = np.minimum(np.hypot(p[0], y) / square, len(rings) - 1).astype(int)
@@ -246,7 +278,13 @@ def _squares(
 
 
 def _overlap(axis: Array, square: float, count: int) -> sparse.csr_array:
-    """(squares, samples) share of each sample of the transform that lies in a square."""
+    """(squares, samples) share of each sample of the transform in each square.
+
+    Args:
+        axis: (samples,) direction cosines of the samples.
+        square: width of a square, wider than a sample.
+        count: squares, centred on 0.
+    """
     step = axis[1] - axis[0]
     first = (axis - step / 2) / square + count / 2
     low = np.floor(first + 1e-9)
@@ -254,46 +292,49 @@ def _overlap(axis: Array, square: float, count: int) -> sparse.csr_array:
     rows = np.concatenate([low, low + 1]).astype(int)
     columns = np.tile(np.arange(len(axis)), 2)
     shares = np.concatenate([1 - beyond, beyond])
-    held = (rows >= 0) & (rows < count)
-    where = rows[held], columns[held]
+    inside = (rows >= 0) & (rows < count)
+    index = rows[inside], columns[inside]
     return sparse.csr_array(
-        (shares[held].astype(np.float32), where), shape=(count, len(axis))
+        (shares[inside].astype(np.float32), index), shape=(count, len(axis))
     )
 
 
 def _beams(
-    plain: "_Sum", power: Array, p: tuple[Array, Array], radius: float, held: float
+    exact: "_Sum", power: Array, p: tuple[Array, Array], radius: float, total: float
 ) -> tuple[DiffractedBeam, ...]:
-    """Brightest spots one after the other, the circle of each taken out before the next
-    is looked for.
+    """Brightest beams in turn, the circle of each set to 0 before the next is searched.
 
-    A spot has three quarters of its circle's light within half the radius: rings and
-    haze have not.
+    A beam has ``SPOT`` of its circle's light within half the radius, which rings and
+    haze have not. The search ends at ``BEAMS`` circles, or at a circle of less than
+    ``LEAST`` of the light.
+
+    Args:
+        exact: sum over pillars that refines each direction.
+        power: (y, x) |F|² of the transform.
+        p: (x, y) direction cosines of its samples.
+        radius: of a circle, direction cosine.
+        total: light in all directions.
     """
-    left, found = power.copy(), []
+    power = power.copy()
+    beams = []
+    x, y = p
     for _ in range(BEAMS):
-        i, j = np.unravel_index(int(left.argmax()), left.shape)
-        rows, columns = (
-            np.flatnonzero(np.abs(a - a[at]) <= radius)
-            for a, at in ((p[1], i), (p[0], j))
-        )
-        here = np.ix_(rows, columns)
-        off = np.hypot(p[0][columns] - p[0][j], p[1][rows][:, None] - p[1][i])
-        total, inner = (
-            float(left[here][off <= reach].sum(dtype=float))
+        i, j = np.unravel_index(int(power.argmax()), power.shape)
+        rows = np.flatnonzero(np.abs(y - y[i]) <= radius)
+        columns = np.flatnonzero(np.abs(x - x[j]) <= radius)
+        window = np.ix_(rows, columns)
+        distance = np.hypot(x[columns] - x[j], y[rows][:, None] - y[i])
+        light, inner = (
+            float(power[window][distance <= reach].sum(dtype=float))
             for reach in (radius, radius / 2)
         )
-        if total < LEAST * held:
+        if light < LEAST * total:
             break
-        if inner >= SPOT * total:
-            found.append(
-                DiffractedBeam(
-                    *plain.peak(p[0][j], p[1][i], p[0][1] - p[0][0], p[1][1] - p[1][0]),
-                    total / held,
-                )
-            )
-        left[here] = np.where(off <= radius, 0, left[here])
-    return tuple(found)
+        if inner >= SPOT * light:
+            peak = exact.peak(x[j], y[i], x[1] - x[0], y[1] - y[0])
+            beams.append(DiffractedBeam(*peak, light / total))
+        power[window] = np.where(distance <= radius, 0, power[window])
+    return tuple(beams)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -327,34 +368,46 @@ class _Sum:
     def peak(
         self, sine_x: float, sine_y: float, step_x: float, step_y: float
     ) -> tuple[float, float]:
-        """The brightest direction next to a sample of the transform: a parabola through
-        sums a quarter as far apart.
+        """(x, y) direction cosines of the maximum of |F|² near a sample.
+
+        A parabola along each axis, through the largest of sums at a quarter of the
+        sample's step.
+
+        Args:
+            sine_x, sine_y: direction cosines of the sample.
+            step_x, step_y: steps of the samples.
         """
         offsets = np.arange(-4, 5) / 4
-        seen = self.power(sine_x + offsets * step_x, sine_y + offsets * step_y)
+        power = self.power(sine_x + offsets * step_x, sine_y + offsets * step_y)
         i, j = (
-            int(v) for v in np.unravel_index(int(seen[1:-1, 1:-1].argmax()), (7, 7))
+            int(v) for v in np.unravel_index(int(power[1:-1, 1:-1].argmax()), (7, 7))
         )
-        column, row = seen[i : i + 3, j + 1], seen[i + 1, j : j + 3]
+        column = power[i : i + 3, j + 1]
+        row = power[i + 1, j : j + 3]
         dx, dy = (
             0.5 * (v[0] - v[2]) / min(v[0] - 2 * v[1] + v[2], -1e-300)
             for v in (row, column)
         )
-        return sine_x + (offsets[j + 1] + dx / 4) * step_x, sine_y + (
-            offsets[i + 1] + dy / 4
-        ) * step_y
+        x = sine_x + (offsets[j + 1] + dx / 4) * step_x
+        y = sine_y + (offsets[i + 1] + dy / 4) * step_y
+        return x, y
 
 
 def _error(plain: _Sum, p: tuple[Array, Array], power: Array) -> float:
-    """Relative L2 of |F|² at directions drawn by their light, against plain sums."""
+    """Relative L2 error of |F|² at random directions, against sums over pillars.
+
+    ``DRAWN`` directions are drawn with a probability in proportion to their light.
+    """
     rows = np.cumsum(power.sum(1, dtype=float))
     generator = np.random.default_rng(5)
-    found, exact = [], []
-    for low, high in generator.random((DRAWN, 2)):
-        i = min(int(np.searchsorted(rows, low * rows[-1])), len(rows) - 1)
-        along = np.cumsum(power[i], dtype=float)
-        j = min(int(np.searchsorted(along, high * along[-1])), len(along) - 1)
-        found.append(float(power[i, j]))
+    transformed, exact = [], []
+    for row_draw, column_draw in generator.random((DRAWN, 2)):
+        i = min(int(np.searchsorted(rows, row_draw * rows[-1])), len(rows) - 1)
+        columns = np.cumsum(power[i], dtype=float)
+        j = min(
+            int(np.searchsorted(columns, column_draw * columns[-1])), len(columns) - 1
+        )
+        transformed.append(float(power[i, j]))
         exact.append(float(plain.power(p[0][j : j + 1], p[1][i : i + 1])[0, 0]))
-    wrong = np.array(found) - np.array(exact)
-    return float(np.sqrt((wrong**2).sum() / (np.array(exact) ** 2).sum()))
+    error = np.array(transformed) - np.array(exact)
+    return float(np.sqrt((error**2).sum() / (np.array(exact) ** 2).sum()))

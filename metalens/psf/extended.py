@@ -20,7 +20,7 @@ from metalens.propagate import PropagationCase
 from metalens.psf.cells import MOST, nyquist_um
 from metalens.psf.record import SourceShape
 
-# steps of Nyquist's around what the source blurs in: light that is cut there rings
+# steps of Nyquist's around the reach of the source: light that is cut off rings
 GUARD = 12
 SIGMA = {
     "disc": 1 / 4,
@@ -37,8 +37,8 @@ class Extent:
 
     shape: disc, square (sides along x and y) or gaussian.
     size_um: diameter, side, or full width at half maximum, of sources at finite depths.
-    size_rad: in its place, size over depth: alike at all depths, and the only one at
-    infinity.
+    size_rad: in its place, size over depth: equal at all depths, and required at
+        infinity.
 
     Raises:
         PropagationError: not one size above 0, or a shape that is not known.
@@ -63,12 +63,19 @@ class Extent:
             )
 
     def transform(self, u: Any, v: Any) -> tuple[Array, Array]:
-        """(ŵ, |∇ŵ| / (2π)) at (u, v) cycles per size along x and y."""
+        """Fourier transform ŵ of the radiance, and |∇ŵ| / (2π); ŵ(0) = 1.
+
+        A square has sinc u sinc v, a Gaussian exp(-(πρ)² / (4 ln 2)), a disc
+        2 J1(πρ) / (πρ), with ρ² = u² + v².
+
+        Args:
+            u, v: cycles per size of the source along x and y.
+        """
         if self.shape == "square":
-            along, across = np.sinc(u), np.sinc(v)
-            return along * across, np.hypot(
-                _sinc_slope(u) * across, along * _sinc_slope(v)
-            ) / (2 * np.pi)
+            along = np.sinc(u)
+            across = np.sinc(v)
+            slope = np.hypot(_sinc_slope(u) * across, along * _sinc_slope(v))
+            return along * across, slope / (2 * np.pi)
         rho = np.hypot(u, v)
         if self.shape == "gaussian":
             level = np.exp(-((np.pi * rho) ** 2) / (4 * math.log(2)))
@@ -88,38 +95,50 @@ def _sinc_slope(u: Any) -> Array:
 
 
 def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
-    """(depth, 2, 2) M of the module's heading times the size: sizes of the source to um
-    on the sensor, [x, y].
+    """(depth, 2, 2) matrices from the source, in its sizes, to the sensor, in um.
+
+    M of the module's heading times the size; rows and columns are [x, y]. It is the
+    product of ∂(place on sensor)/∂(tangents) and ∂(tangents)/∂(place of source).
 
     Args:
-        case: maps, geometry and window of the propagation.
+        case: direction, depths and films.
         extent: size and shape of the source.
 
     Raises:
         PropagationError: a size in um at infinity.
     """
-    onto = _slopes(lambda t: _met(case, t), case)
+    to_sensor = _slopes(lambda t: _sensor_place(case, t), case)
     return np.array(
-        [onto @ _turn(case, extent, inverse) for inverse in case.inverse_depths_per_um]
+        [
+            to_sensor @ _tangent_change(case, extent, inverse)
+            for inverse in case.inverse_depths_per_um
+        ]
     )
 
 
-def _turn(case: PropagationCase, extent: Extent, inverse: float) -> Array:
-    """(2, 2) change of the tangents by one size of the source along x and y."""
+def _tangent_change(case: PropagationCase, extent: Extent, inverse: float) -> Array:
+    """(2, 2) change of the tangents [x, y] by one size of the source along x and y.
+
+    Args:
+        case: direction and films.
+        extent: size of the source, as a length or an angle.
+        inverse: 1 / depth, 1/um.
+
+    Raises:
+        PropagationError: a size in um at infinity.
+    """
     if extent.size_rad:
         return -extent.size_rad * np.eye(2)
     if inverse == 0:
         raise PropagationError(
             f"source of {extent.size_um:g} um at infinity has no angle: give its size as an angle (size_rad)"
         )
-    return np.asarray(
-        extent.size_um
-        * np.linalg.inv(_slopes(lambda t: _place(case, t, 1 / inverse), case))
-    )
+    by_tangent = _slopes(lambda t: _source_place(case, t, 1 / inverse), case)
+    return np.asarray(extent.size_um * np.linalg.inv(by_tangent))
 
 
-def _met(case: PropagationCase, tangents: tuple[float, float]) -> list[float]:
-    """(x, y) where the chief ray meets the sensor."""
+def _sensor_place(case: PropagationCase, tangents: tuple[float, float]) -> list[float]:
+    """(x, y) where the chief ray of these tangents meets the sensor, um."""
     return [
         float(
             propagate.chief_ray_offset(
@@ -130,22 +149,25 @@ def _met(case: PropagationCase, tangents: tuple[float, float]) -> list[float]:
     ]
 
 
-def _place(
+def _source_place(
     case: PropagationCase, tangents: tuple[float, float], depth_um: float
 ) -> list[float]:
-    """(x, y) of the source of these tangents (in air) on its plane, through the films
-    in front.
+    """(x, y) of the source on its plane, um, for a chief ray through the films before.
+
+    Args:
+        case: films before the lens.
+        tangents: (x, y) slopes of the chief ray in air.
+        depth_um: of the source's plane.
     """
     steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
     thick = sum(t for _, t in case.front)
-    away = float(
-        media.reach_per_direction([(1.0, depth_um - thick), *case.front], 1 - 1 / steep)
-    ) / math.sqrt(steep)
-    return [-away * tangents[0], -away * tangents[1]]
+    layers = [(1.0, depth_um - thick), *case.front]
+    reach = float(media.reach_per_direction(layers, 1 - 1 / steep)) / math.sqrt(steep)
+    return [-reach * tangents[0], -reach * tangents[1]]
 
 
 def _slopes(of: Any, case: PropagationCase) -> Array:
-    """(2, 2) derivatives of a place [x, y] by the tangents of the case [x, y], to 1e-9."""
+    """(2, 2) derivatives of a place [x, y] by the tangents [x, y], exact to 1e-9."""
     h = 1e-4
     tx, ty = case.tangents
     pairs = (((tx + h, ty), (tx - h, ty)), ((tx, ty + h), (tx, ty - h)))
@@ -155,10 +177,12 @@ def _slopes(of: Any, case: PropagationCase) -> Array:
 def widen_case(
     fine: PropagationCase, extent: Extent
 ) -> tuple[PropagationCase, tuple[int, int]]:
-    """The case with the samples around its window that the source blurs into it, and
-    how many (y, x) on each side.
+    """The case with a wider window, and the samples (y, x) added on each side.
+
+    The margin is the reach of the source's image plus ``GUARD`` steps of Nyquist.
 
     Args:
+        fine: case with the samples of the window.
         extent: size and shape of the source.
 
     Raises:
@@ -172,53 +196,53 @@ def widen_case(
             "the cells be integrated, or give more samples"
         )
     guard = GUARD * math.ceil(limit / fine.step_um)
-    far = source_image_reach(fine, extent)
-    more = far[0] + guard, far[1] + guard
-    samples = fine.samples[0] + 2 * more[0], fine.samples[1] + 2 * more[1]
+    reach = source_image_reach(fine, extent)
+    margin = reach[0] + guard, reach[1] + guard
+    samples = fine.samples[0] + 2 * margin[0], fine.samples[1] + 2 * margin[1]
     if max(samples) > MOST:
         raise PropagationError(
-            f"the image of the source is up to {2 * max(far) * fine.step_um:.4g} um wide, which with the window "
+            f"the image of the source is up to {2 * max(reach) * fine.step_um:.4g} um wide, which with the window "
             f"would take {max(samples)} samples along an axis, at most {MOST}: give a smaller source or window"
         )
-    return replace(fine, samples=samples), more
+    return replace(fine, samples=samples), margin
 
 
 def blur_by_source(
     light: torch.Tensor, case: PropagationCase, extent: Extent, more: tuple[int, int]
 ) -> tuple[torch.Tensor, float]:
-    """(depth, y, x) light on the window from that on the widened one, and what is wrong
-    at its edges, relative L2.
+    """(depth, y, x) light of a finite source on the window, and its relative L2 error.
+
+    The light of a point is convolved with the source's image. The error is the change
+    of the result when the outer half of the guard samples is set to 0.
 
     Args:
-        case: maps, geometry and window of the propagation.
+        light: (depth, y, x) of a point source, on the widened window.
+        case: with the widened window.
         extent: size and shape of the source.
+        more: (y, x) samples added on each side of the window.
     """
     whole = _filtered(light, case, extent, 0)
     with torch.no_grad():
         down, across = (
-            (n - far) // 2
-            for n, far in zip(more, source_image_reach(case, extent), strict=True)
+            (n - reach) // 2
+            for n, reach in zip(more, source_image_reach(case, extent), strict=True)
         )
         inner = torch.zeros_like(light)
         inner[..., down:-down, across:-across] = light[..., down:-down, across:-across]
-        cut = _cropped(_filtered(inner, case, extent, 0) - whole, more)
-        edge = float(cut.norm() / _cropped(whole, more).norm())
-    return _cropped(whole, more).clamp_min(0), edge
+        change = _cropped(_filtered(inner, case, extent, 0) - whole, more)
+        error = float(change.norm() / _cropped(whole, more).norm())
+    return _cropped(whole, more).clamp_min(0), error
 
 
 def source_image_reach(case: PropagationCase, extent: Extent) -> tuple[int, int]:
-    """(y, x) samples that the image of the source reaches from its middle, at the depth
-    where that is most.
+    """(y, x) half width of the source's image in samples, the largest over depths.
 
     Args:
-        case: maps, geometry and window of the propagation.
+        case: direction, depths and step of the samples.
         extent: size and shape of the source.
     """
-    x, y = np.ceil(
-        np.abs(source_to_image_matrices(case, extent)).sum(2).max(0)
-        * REACH[extent.shape]
-        / case.step_um
-    )
+    size_um = np.abs(source_to_image_matrices(case, extent)).sum(2).max(0)
+    x, y = np.ceil(size_um * REACH[extent.shape] / case.step_um)
     return int(y), int(x)
 
 
@@ -229,7 +253,14 @@ def _cropped(light: torch.Tensor, more: tuple[int, int]) -> torch.Tensor:
 def _filtered(
     light: torch.Tensor, case: PropagationCase, extent: Extent, which: int
 ) -> torch.Tensor:
-    """Light through ŵ (which 0), or through √(|ŵ|² + |∇ŵ|²/(2πσ)²) (which 1)."""
+    """(depth, y, x) light filtered by the source's transform, with zero padding.
+
+    Args:
+        light: (depth, y, x) of a point source.
+        case: step of the samples, direction and depths.
+        extent: size and shape of the source.
+        which: 0 for the filter ŵ, 1 for √(|ŵ|² + |∇ŵ|² / (2πσ)²).
+    """
     shape = [scipy.fft.next_fast_len(n, real=True) for n in light.shape[-2:]]
     fy = np.fft.fftfreq(shape[0], case.step_um)[:, None]
     fx = np.fft.rfftfreq(shape[1], case.step_um)
@@ -254,43 +285,44 @@ def shift_invariance_error(
     extent: Extent,
     probe: Callable[[PropagationCase], torch.Tensor],
 ) -> float:
-    """Relative L2 error of a shift-invariant PSF over the source, at the nearest and
-    the farthest depth.
+    """Relative L2 error of one PSF for all points of the source.
+
+    The larger of those at the nearest and the farthest depth. PSFs of two points, one
+    standard deviation from the middle along x and along y, are compared with that of
+    the middle.
 
     Args:
+        light: (depth, y, x) PSFs of the source's middle, on the widened window.
+        case: with the widened window.
         extent: size and shape of the source.
-        light: (depth, y, x) on the widened window of ``case``, from the middle of the
-            source.
-        probe: the same (1, y, x) for another case.
+        probe: function from a case of one depth to its PSF (1, y, x).
     """
     errors = []
     inverse = case.inverse_depths_per_um
     for depth in {int(np.argmin(inverse)), int(np.argmax(inverse))}:
-        one = replace(case, inverse_depths_per_um=(inverse[depth],))
+        single = replace(case, inverse_depths_per_um=(inverse[depth],))
         middle = light[depth : depth + 1].detach()
         square = 0.0
+        sizes = _tangent_change(case, extent, inverse[depth])
         for axis in (0, 1):
-            other = probe(
-                _moved(
-                    one,
-                    _turn(case, extent, inverse[depth])[:, axis] * SIGMA[extent.shape],
-                )
-            )
-            square += (
-                float(_filtered(other.detach() - middle, one, extent, 1).norm()) ** 2
-            )
-        errors.append(
-            math.sqrt(square) / float(_filtered(middle, one, extent, 0).norm())
-        )
+            other = probe(_moved(single, sizes[:, axis] * SIGMA[extent.shape]))
+            change = _filtered(other.detach() - middle, single, extent, 1)
+            square += float(change.norm()) ** 2
+        blurred = _filtered(middle, single, extent, 0)
+        errors.append(math.sqrt(square) / float(blurred.norm()))
     return max(errors)
 
 
 def _moved(case: PropagationCase, turn: Array) -> PropagationCase:
-    """The case of a source whose tangents are changed; the window follows its chief
-    ray.
+    """The case with its tangents changed, and its window moved with the chief ray.
+
+    Args:
+        case: direction and window.
+        turn: [x, y] added to the tangents.
     """
     tangents = case.tangents[0] + float(turn[0]), case.tangents[1] + float(turn[1])
-    x, y = np.add(
-        case.centre_um, np.subtract(_met(case, tangents), _met(case, case.tangents))
-    ).tolist()
+    shift = np.subtract(
+        _sensor_place(case, tangents), _sensor_place(case, case.tangents)
+    )
+    x, y = np.add(case.centre_um, shift).tolist()
     return replace(case, tangents=tangents, centre_um=(x, y))

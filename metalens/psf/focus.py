@@ -60,7 +60,7 @@ def focus_metrics(
     for i, (x, y) in enumerate(plain.angles_rad.tolist()):
         best = int((light[i].max((-1, -2)) * energy[i]).argmax())
         figures.append(
-            _of_one(
+            _point_metrics(
                 plain,
                 lens,
                 (light[i, best], float(energy[i, best])),
@@ -71,14 +71,22 @@ def focus_metrics(
     return tuple(figures)
 
 
-def _of_one(
+def _point_metrics(
     stack: PsfStack,
     lens: Lens,
     psf: tuple[Array, float],
     at: tuple[Point, float],
     power_error: float,
 ) -> FocusMetrics:
-    """Figures of a PSF of sum 1 and its energy, of an angle and depth."""
+    """Width, Strehl ratio, MTF50 and efficiency of one PSF, with their errors.
+
+    Args:
+        stack: wavelengths, step and error budget.
+        lens: aperture and |T|.
+        psf: (y, x) PSF of sum 1, and its energy in um².
+        at: (x, y) field angle in rad, and depth in um.
+        power_error: relative error of the power behind the pillars.
+    """
     light, energy_um2 = psf
     angle, depth_um = at
     error = _error_at(stack, angle)
@@ -86,20 +94,16 @@ def _of_one(
     area_um2 = incident_um2(lens, angle, depth_um)
     d = lens.diameters
     # a round aperture of the same area as the cells that the light reaches
-    part = math.sqrt(area_um2 / math.pi) / (d.radius_um + d.pitch_um / 2)
-    sine = min(part, 1.0) * sine_aperture(lens, angle)
+    fill = math.sqrt(area_um2 / math.pi) / (d.radius_um + d.pitch_um / 2)
+    sine = min(fill, 1.0) * sine_aperture(lens, angle)
     limit = diffraction_limit(sine, float(stack.weights @ stack.wavelengths_um))
     peak = find_peak(light)
     width, slope = half_maximum(light, peak)
     fwhm_um = width * step
     power = energy_um2 / area_um2
     share = encircled_power(light, peak, SPOT_FWHM / 2 * width)
-    strehl = (
-        peak[2]
-        * energy_um2
-        / step**2
-        / in_phase_irradiance(lens, angle, depth_um, stack)
-    )
+    in_phase = in_phase_irradiance(lens, angle, depth_um, stack)
+    strehl = peak[2] * energy_um2 / step**2 / in_phase
     ends = [mtf50(light.sum(axis), step, limit.cutoff_per_um) for axis in (0, 1)]
     return FocusMetrics(
         angle_rad=angle,
@@ -118,8 +122,9 @@ def _of_one(
 
 
 def _error_at(stack: PsfStack, angle_rad: Point) -> float:
-    """Relative L2 error of the device at an angle: its budget, whose term of the angle
-    grows with the square of the sine.
+    """Relative L2 error of the device at a field angle, from the stack's budget.
+
+    The budget's term ``angle`` is scaled by sin² of this angle over the largest sin².
     """
     steep = (np.tan(stack.angles_rad) ** 2).sum(-1)
     squares = steep / (1 + steep)
@@ -129,26 +134,28 @@ def _error_at(stack: PsfStack, angle_rad: Point) -> float:
 
 
 def incident_um2(lens: Lens, angle_rad: Point, depth_um: float) -> float:
-    """Power on the aperture for unit irradiance of the lens: the area of its cells, or
-    of those that the light of an angle and depth reaches through a stop.
+    """Power on the aperture per unit irradiance, um²: a Σ |S|² over the pillars.
+
+    a is the area of a site, S the shadow of a stop for this angle and depth.
 
     Args:
+        lens: pillars and stop.
         angle_rad: field angles along x and y, rad.
         depth_um: source depth from the lens, um.
     """
     d = lens.diameters
-    there = np.asarray(d.diameter_um) > 0
+    has_pillar = np.asarray(d.diameter_um) > 0
     shadow = np.abs(lens_stop_shadow(lens, angle_rad, depth_um))
-    return float(d.site_um2 * ((there * shadow) ** 2).sum())
+    return float(d.site_um2 * ((has_pillar * shadow) ** 2).sum())
 
 
 def in_phase_irradiance(
     lens: Lens, angle_rad: Point, depth_um: float, stack: PsfStack
 ) -> float:
-    """Irradiance at the chief ray's place if the light of all pillars arrived in phase.
+    """Peak irradiance of the lens without aberrations, per unit irradiance of the lens.
 
-    (Σ |T| a |h|)², h the Rayleigh-Sommerfeld kernel, for unit irradiance of the lens:
-    the peak of a PSF without aberrations, whose Strehl ratio is 1.
+    (Σ |T| a |h|)² at the chief ray's place, with h the Rayleigh-Sommerfeld kernel: the
+    light of all pillars in phase. It is the reference of the Strehl ratio.
 
     Accuracy: the distance to the focus is taken as one over 8 x 8 pillars: 1e-4.
 
@@ -164,11 +171,11 @@ def in_phase_irradiance(
     d = lens.diameters
     level = level * np.abs(lens_stop_shadow(lens, angle_rad, depth_um))
     total = 0.0
-    for one, wave, weight in zip(
+    for transmission, wave, weight in zip(
         level, nodes.wavelengths_um.tolist(), nodes.weights.tolist(), strict=True
     ):
         case = propagate.make_case(
-            one.shape,
+            transmission.shape,
             **d.grid._asdict(),
             wavelength_um=wave,
             sensor_distance_um=lens.sensor_distance_um,
@@ -178,7 +185,7 @@ def in_phase_irradiance(
             samples=1,
             layers=lens.layers.open,
         )
-        sums = _blocks(one)
+        sums = _blocks(transmission)
         y, x = (
             _blocks(a[None])[0] / _blocks(np.ones((1, len(a))))[0]
             for a in case.pillars_um

@@ -54,7 +54,7 @@ TIGHTEST = 1e-12  # setting below which float64 has nothing left to give
 MOVING = 1000  # tighter setting: parts of a derivative in the geometry nearly cancel
 HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once
 SAMPLE_BYTES = 18  # for each sample and depth, per byte of a number of the maps
-CELLS = 0.5  # of the tolerance, for the integration over cells; the rest is the sums
+CELLS = 0.5  # of the tolerance, for the integration over cells; else for the sums
 STRICTER = 4  # tolerance of point PSFs, whose differences judge a finite source
 
 Maps = tuple[torch.Tensor, torch.Tensor]
@@ -65,7 +65,7 @@ class IntensityRequest:
     """Which PSFs of one lens are computed, in one direction.
 
     maps: (wavelength · map, y, x) phase and transmission of the pillars.
-    cases, weights: of the wavelengths, alike in direction, depths and window.
+    cases, weights: of the wavelengths, all with one direction, depths and window.
     tolerance: relative L2 error of the PSFs.
     mixing: of both polarisations; None for |U|² of one scalar.
     layers: whose stop lays its shadow on the maps.
@@ -85,7 +85,7 @@ class IntensityRequest:
 
     @property
     def differentiable(self) -> bool:
-        """Whether a gradient is wanted in the maps or in the geometry."""
+        """Whether the maps or the geometry require a gradient."""
         return self.moving is not None or any(m.requires_grad for m in self.maps)
 
     @property
@@ -100,13 +100,13 @@ class IntensityRequest:
         return stop is not None and stop.distance_um > 0
 
     def at(self, like: PropagationCase, tolerance: float) -> "IntensityRequest":
-        """The same with the direction, depths and window of a case."""
+        """This request with the direction, depths and window of another case."""
         names = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
         cases = [replace(c, **{n: getattr(like, n) for n in names}) for c in self.cases]
         return replace(self, cases=cases, tolerance=tolerance)
 
     def shaded(self) -> "IntensityRequest":
-        """The same with the maps as the light of the first depth meets them."""
+        """This request with the stop's shadow, at the first depth, on the maps."""
         if self.layers is None or self.layers.stop is None:
             return self
         shadows = [_shadow(case, self.layers) for case in self.cases]
@@ -119,9 +119,9 @@ class IntensityRequest:
         """(maps, case, weight, mixing) of every wavelength."""
         count, (phase, level) = self.map_count, self.maps
         for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
-            some = slice(i * count, (i + 1) * count)
+            own = slice(i * count, (i + 1) * count)
             pupils = None if self.mixing is None else self.mixing.pupils(case)
-            yield (phase[some], level[some]), case, weight, pupils
+            yield (phase[own], level[own]), case, weight, pupils
 
     @property
     def films_error(self) -> float:
@@ -164,8 +164,11 @@ class IntensityResult:
 
 
 def _shadow(case: PropagationCase, layers: Layers) -> Array:
-    """(y, x) complex amplitude of the light of a case's first depth at each pillar,
-    over that without the stop.
+    """(y, x) complex amplitude at each pillar over that without the stop.
+
+    Args:
+        case: its first depth and its direction are those of the light.
+        layers: with the stop.
     """
     y, x = case.pillars_um
     inverse = case.inverse_depths_per_um[0]
@@ -179,18 +182,22 @@ def _shadow(case: PropagationCase, layers: Layers) -> Array:
 def compute_intensity(request: IntensityRequest) -> IntensityResult:
     """Irradiance on the window, cells as fine as they must be, with its error by cause.
 
-    Cells wider than Nyquist's step are integrated over points inside them. Depths are
-    taken so many at a time as memory holds, and one by one behind a stop.
+    Cells wider than Nyquist's step are integrated over points inside them, with finer
+    points until that error is within its share of the tolerance. As many depths are
+    computed at once as memory holds; one by one behind a stop.
 
     Args:
-        request: lens, direction, depths and window.
+        request: maps of the lens, direction, depths and window.
+
+    Returns:
+        IntensityResult: (depth, y, x) irradiance, power (depth,) and error budget.
 
     Raises:
         PropagationError: no light in the window, empty or infinite maps, too many
             samples.
     """
     shortest = min(request.cases, key=lambda case: case.wavelength_um)
-    wanted = request.tolerance
+    tolerance = request.tolerance
     for finer in FINER:
         fine = PixelCells(1, shortest)
         if request.integrate:
@@ -202,25 +209,27 @@ def compute_intensity(request: IntensityRequest) -> IntensityResult:
             raise PropagationError(
                 f"cells of {fine.points} points in {wide.samples} samples: give a smaller window"
             )
-        own = wanted if fine.points == 1 else wanted * math.sqrt(1 - CELLS**2)
-        shares = [
-            _on_cells(request.at(some, own), some, fine)
-            for some in _shares(wide, request)
+        sum_tolerance = (
+            tolerance if fine.points == 1 else tolerance * math.sqrt(1 - CELLS**2)
+        )
+        results = [
+            _on_cells(request.at(part, sum_tolerance), part, fine)
+            for part in _shares(wide, request)
         ]
-        budget = worst_of_budgets([one.budget for one in shares])
-        if budget.sampling <= CELLS * wanted or max(fine.case.samples) > MOST / 2:
+        budget = worst_of_budgets([result.budget for result in results])
+        if budget.sampling <= CELLS * tolerance or max(fine.case.samples) > MOST / 2:
             break
-    reason = max(shares, key=lambda one: one.budget.numerical).reason
-    if len(shares) > 1:
-        reason += f"; depths in {len(shares)} shares"
+    reason = max(results, key=lambda result: result.budget.numerical).reason
+    if len(results) > 1:
+        reason += f"; depths in {len(results)} shares"
     if fine.points > 1:
         reason += (
             f"; light integrated over cells of {fine.points} x {fine.points} points"
         )
-    light = [one.intensity for one in shares]
-    power = np.concatenate([one.power for one in shares])
-    whole = light[0] if len(light) == 1 else torch.cat(light)
-    return IntensityResult(whole, budget, reason, power * _passed(request.cases[0]))
+    intensities = [result.intensity for result in results]
+    power = np.concatenate([result.power for result in results])
+    intensity = intensities[0] if len(intensities) == 1 else torch.cat(intensities)
+    return IntensityResult(intensity, budget, reason, power * _passed(request.cases[0]))
 
 
 def _passed(case: PropagationCase) -> float:
@@ -232,28 +241,40 @@ def _passed(case: PropagationCase) -> float:
 def _shares(
     wide: PropagationCase, request: IntensityRequest
 ) -> Iterator[PropagationCase]:
-    """The case with as many of its depths as fit in ``HELD_BYTES``, in even shares; all
-    where gradients hold them anyway; one by one behind a stop.
+    """The case split by depths into equal parts that fit in ``HELD_BYTES`` of memory.
+
+    Each depth is a part of its own behind a stop. All are one part where gradients keep
+    every field in memory.
+
+    Args:
+        wide: window and all depths.
+        request: maps and their gradients.
     """
-    inverse, count = wide.inverse_depths_per_um, 1
+    inverse = wide.inverse_depths_per_um
+    count = 1
     if request.behind_stop:
         count = len(inverse)
     elif not request.differentiable:
         itemsize = request.maps[0].element_size()
-        each = math.prod(wide.samples) * SAMPLE_BYTES * itemsize
-        count = -(-len(inverse) // max(1, int(HELD_BYTES / each)))
+        depth_bytes = math.prod(wide.samples) * SAMPLE_BYTES * itemsize
+        count = -(-len(inverse) // max(1, int(HELD_BYTES / depth_bytes)))
     for i in range(count):
-        some = slice(len(inverse) * i // count, len(inverse) * (i + 1) // count)
-        yield replace(wide, inverse_depths_per_um=inverse[some])
+        part = slice(len(inverse) * i // count, len(inverse) * (i + 1) // count)
+        yield replace(wide, inverse_depths_per_um=inverse[part])
 
 
 def _on_cells(
-    request: IntensityRequest, some: PropagationCase, fine: PixelCells
+    request: IntensityRequest, part: PropagationCase, fine: PixelCells
 ) -> IntensityResult:
-    """Irradiance of some depths on the samples of the window, blurred by the source and
-    integrated over the cells."""
+    """Irradiance of some depths, blurred by the source and integrated over cells.
+
+    Args:
+        request: lens and light.
+        part: the depths, and the window of the point PSFs.
+        fine: cells of the window and their inner points.
+    """
     source = request.source
-    result = _blurred(request, some, fine, source) if source else _of_point(request)
+    result = _blurred(request, part, fine, source) if source else _of_point(request)
     if fine.points > 1:
         light, sampling = integrate_cells(result.intensity, fine)
         budget = replace(result.budget, sampling=sampling)
@@ -262,53 +283,64 @@ def _on_cells(
 
 
 def _blurred(
-    request: IntensityRequest, some: PropagationCase, fine: PixelCells, source: Extent
+    request: IntensityRequest, part: PropagationCase, fine: PixelCells, source: Extent
 ) -> IntensityResult:
-    """Of a source of finite size, on the samples of the cells."""
+    """Irradiance of a source of finite size, on the points of the cells.
+
+    The PSF of its middle is convolved with the source's image. The error has two parts:
+    the blur's own, and the change of the PSF over the source.
+
+    Args:
+        request: lens and light.
+        part: depths, and the window widened by the source's image.
+        fine: cells whose points are returned.
+        source: shape and size.
+    """
 
     def point(case: PropagationCase) -> IntensityResult:
         return _of_point(request.at(case, request.tolerance / STRICTER))
 
-    result = point(some)
-    down, across = (
-        (n - m) // 2 for n, m in zip(some.samples, fine.case.samples, strict=True)
+    result = point(part)
+    rows, columns = (
+        (n - m) // 2 for n, m in zip(part.samples, fine.case.samples, strict=True)
     )
     light, edge = extended.blur_by_source(
-        result.intensity, some, source, (down, across)
+        result.intensity, part, source, (rows, columns)
     )
     with torch.no_grad():
-        varied = extended.shift_invariance_error(
-            result.intensity, some, source, lambda case: point(case).intensity
+        shift_variance = extended.shift_invariance_error(
+            result.intensity, part, source, lambda case: point(case).intensity
         )
-    budget = replace(result.budget, source=math.hypot(edge, varied))
+    budget = replace(result.budget, source=math.hypot(edge, shift_variance))
     reason = f"{result.reason}; blurred by a {source.shape} source"
     return replace(result, intensity=light, budget=budget, reason=reason)
 
 
 def _of_point(request: IntensityRequest) -> IntensityResult:
-    """|U|² on the samples of a point source, wavelengths added with their weights.
+    """Irradiance |U|² of a point source on the samples, summed over wavelengths.
 
-    Pillars are added in the precision of their maps where that holds the tolerance, all
-    later sums in float64. The result of the last try is returned with its estimate in
-    any case.
+    The exact sum is used where it is the cheapest method. Otherwise the windowed method
+    is tried at three settings, each tighter. The first result whose measured error is
+    within the tolerance is returned, else the last with its error. Pillars are summed
+    in the precision of their maps where that suffices, then in float64.
     """
     request = request.shaded()
     phase = request.maps[0]
     case = request.cases[0]
     tolerance = request.tolerance
     moving = request.moving is not None
-    rest = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
+    model_error = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
 
     def finish(result: IntensityResult) -> IntensityResult:
         """In the precision of the maps, with what rounding and films add."""
-        error = math.hypot(result.budget.numerical, rest)
+        error = math.hypot(result.budget.numerical, model_error)
         budget = replace(result.budget, numerical=error)
         light = result.intensity.to(phase.dtype)
         return replace(result, intensity=light, budget=budget)
 
     if not request.differentiable:
         setting = max(tolerance / 2, TIGHTEST)
-        choices = [choose_method(one, setting) for one in request.cases]
+        choices = [choose_method(wave_case, setting) for wave_case in request.cases]
         if all(choice.method == "exact" for choice in choices):
             return finish(_exact(request, choices[0].reason))
     first = phase.dtype if tolerance > 1e-6 else torch.float64
@@ -328,16 +360,25 @@ def _of_point(request: IntensityRequest) -> IntensityResult:
 
 
 def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
-    """The exact sum over pillars, of every component of the light."""
+    """Exact sum over pillars, Σ weight · |U|² over wavelengths and components.
+
+    Its error is that of float64: half an epsilon of the largest phase for each pillar.
+
+    Args:
+        request: maps, cases and weights of the wavelengths.
+        reason: words for why this method was chosen.
+    """
     total: Any = 0.0
-    power, noise, checked = 0.0, 0.0, []
+    power = 0.0
+    noise = 0.0
+    checked = []
     for (phase, level), case, weight, pupils in request.each():
         phase, level = phase.double(), level.double()
         powers = (level**2).sum((-1, -2)).tolist()
         power += weight * request.power(case, powers, level)
-        turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
-        turns += float((phase.abs() * (level != 0)).max())
-        rounding = np.finfo(float).eps / 2 * turns
+        angle = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
+        angle += float((phase.abs() * (level != 0)).max())
+        rounding = np.finfo(float).eps / 2 * angle
         noise = max(noise, rounding * _incoherent(sum(powers), case))
         if request.own_mixing is not None:
             checked.append(_pillar_light((phase, level), case, weight, pupils))
@@ -354,8 +395,12 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
 
 
 def _noise_error(light: Array, noise: float) -> float:
-    """Twice the relative L2 error of PSFs by noise of this size on the field of
-    ``light`` (depth, y, x): its part along the field, 2 Re U* n."""
+    """Twice the relative L2 error of PSFs by noise n on the field U: that of 2 Re U* n.
+
+    Args:
+        light: (depth, y, x) |U|².
+        noise: standard deviation of n at each sample.
+    """
     whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
     share, square = light / whole[:, None, None], 2 * noise**2 / whole
     return 2 * math.sqrt(float(square.sum() / (share**2).sum()))
@@ -364,13 +409,16 @@ def _noise_error(light: Array, noise: float) -> float:
 def _pillar_light(
     maps: Maps, case: PropagationCase, weight: float, pupils: Pupils | None
 ) -> NodeLight:
-    """Light of all pillars with its carrier taken off, to be checked."""
+    """Light of all pillars without its carrier, for the check of one mixing for all.
+
+    The carrier is k times the path from source to pillar to window centre.
+    """
     y, x = case.pillars_um
     path = paths.from_source(
         case, x, y[:, None], case.tangents, paths.reference_depth(case)
     )
-    turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
-    light = torch.polar(maps[1], maps[0] + torch.as_tensor(turn)).numpy()
+    carrier = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
+    light = torch.polar(maps[1], maps[0] + torch.as_tensor(carrier)).numpy()
     at = None if pupils is None else pupils(y, x)
     return NodeLight(case, weight, light, (y, x), 0.0, pupils=at)
 
@@ -381,16 +429,33 @@ def _with_rays(
     checked: list[list[NodeLight]],
     light: list[Any],
 ) -> Budget:
-    """Error of the sums, and of one polarisation mixing for the whole window."""
-    own = request.own_mixing
-    rays = math.nan if own is None else pupil_error(checked, light, own)
-    return Budget(error, polarisation=rays)
+    """Budget of the sums' error, and of one polarisation mixing for the whole window.
+
+    Args:
+        error: relative L2 error of the sums.
+        request: with the mixing by the rays to a single point, if any.
+        checked: light of the nodes, by part of the window.
+        light: irradiance of each part.
+    """
+    point_mixing = request.own_mixing
+    mixing_error = (
+        math.nan if point_mixing is None else pupil_error(checked, light, point_mixing)
+    )
+    return Budget(error, polarisation=mixing_error)
 
 
 def _windowed(
     request: IntensityRequest, dtype: torch.dtype, tolerance: float
 ) -> IntensityResult:
-    """One try: every wavelength and part of the window, then the measured error.
+    """Irradiance by the windowed or wide method at one setting, with measured error.
+
+    Every wavelength is summed over every part of the window. The error is measured
+    against exact sums at points of the window.
+
+    Args:
+        request: maps, cases and weights of the wavelengths.
+        dtype: in which pillars are summed.
+        tolerance: setting of the method, relative L2.
 
     Raises:
         PropagationError: no light in the window.
@@ -402,7 +467,7 @@ def _windowed(
     is_wide = choice.method == "wide"
     checked: list[list[NodeLight]] = [[] for row in choice.tiles for _ in row]
     parts: list[Any] = [0] * len(checked)
-    whole_power = 0.0
+    power = 0.0
     for maps, case, weight, pupils in request.each():
         for i, window in enumerate(_windows(case, choice, tolerance)):
             plan: Any
@@ -418,17 +483,23 @@ def _windowed(
                 light, nodes, powers = light_windowed(maps, plan, shifted, pupils)
             _check(maps, case, sum(powers), nodes)
             at_um = plan.judged_um
-            at = None if pupils is None else pupils(*at_um)
+            mixing_at_nodes = None if pupils is None else pupils(*at_um)
             rounding = plan.moments.carrier.rounding_rad
             noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
-            noise *= _incoherent(_noisy_power(powers, at), case)
-            cut = 1 if is_wide else plan.layout.parts
-            checked[i].append(NodeLight(window, weight, nodes, at_um, noise, cut, at))
-            light = light if weight == 1 else weight * light
+            noise *= _incoherent(_noisy_power(powers, mixing_at_nodes), case)
+            node_parts = 1 if is_wide else plan.layout.parts
+            checked[i].append(
+                NodeLight(
+                    window, weight, nodes, at_um, noise, node_parts, mixing_at_nodes
+                )
+            )
+            if weight != 1:
+                light = weight * light
             parts[i] = light if isinstance(parts[i], int) else parts[i] + light
-        whole_power += weight * request.power(case, powers, maps[1])
+        power += weight * request.power(case, powers, maps[1])
     light_of_parts = [part.detach().numpy() for part in parts]
-    rows, first = [], 0
+    rows = []
+    first = 0
     for row in choice.tiles:
         rows.append(_joined(parts[first : first + len(row)], -1))
         first += len(row)
@@ -441,28 +512,37 @@ def _windowed(
     if is_wide:
         error = math.hypot(error, ROUNDING[dtype][1])
     budget = _with_rays(error, request, checked, light_of_parts)
-    return IntensityResult(
-        total, budget, choice.reason, np.full(len(total), whole_power)
-    )
+    return IntensityResult(total, budget, choice.reason, np.full(len(total), power))
 
 
 def _joined(parts: list[torch.Tensor], axis: int) -> torch.Tensor:
-    """Parts in a row, without a copy of a single one."""
+    """Parts concatenated along an axis; a single part is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(parts, axis)
 
 
-def _noisy_power(powers: list[float], at: tuple[Array, Array] | None) -> float:
-    """Sum of squares of the transmission of all components, each factor at its largest:
-    what rounds."""
-    if at is None:
+def _noisy_power(powers: list[float], mixing: tuple[Array, Array] | None) -> float:
+    """Power that bounds the rounding noise: Σ |t|² of all components.
+
+    Args:
+        powers: sum of squares of each map's transmission.
+        mixing: signs and factors of the mixing at the nodes; each factor counts at its
+            largest. None for one scalar.
+    """
+    if mixing is None:
         return powers[0]
-    return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
+    return float((np.abs(mixing[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
 
 
 def _windows(
     case: PropagationCase, choice: MethodChoice, tolerance: float
 ) -> list[PropagationCase]:
-    """Parts of the window of a wavelength, cut as at the first wavelength."""
+    """Parts of the window for one wavelength, as many as at the first wavelength.
+
+    Args:
+        case: of this wavelength.
+        choice: method and parts at the first wavelength.
+        tolerance: setting of the method.
+    """
     if choice.method == "wide":
         return [case]
     tiles = choose_method(case, tolerance, differentiable=True, moving=True).tiles
@@ -476,8 +556,9 @@ def _windows(
 
 
 def _check(maps: Maps, case: PropagationCase, power: float, nodes: Array) -> None:
-    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars
-    tell.
+    """Raise for maps that are empty or not finite.
+
+    The sums over all pillars show this at no cost; only then are the maps searched.
 
     Raises:
         PropagationError: naming row and column.
@@ -495,7 +576,7 @@ def _check(maps: Maps, case: PropagationCase, power: float, nodes: Array) -> Non
 def _shifted(
     moving: MovingGeometry | None, case: PropagationCase, tile: PropagationCase
 ) -> MovingGeometry | None:
-    """Moving geometry as a tile of the window has it."""
+    """Moving geometry with its centre at that of a tile of the window."""
     if moving is None or tile.centre_um == case.centre_um:
         return moving
     shift = np.subtract(tile.centre_um, case.centre_um)
@@ -503,8 +584,9 @@ def _shifted(
 
 
 def _incoherent(power: float, case: PropagationCase) -> float:
-    """Magnitude of the field at the window centre if all pillars added with random
-    phases.
+    """Field magnitude at the window centre if all pillars added with random phases.
+
+    √(Σ |t|²) a (d / λ) / r²: a the area of a pillar, r the path of the chief ray.
     """
-    near = case.sensor_distance_um * case.wavenumber / (2 * math.pi)
-    return math.sqrt(power) * case.area_um2 * near / chief_path(case) ** 2
+    distance_waves = case.sensor_distance_um * case.wavenumber / (2 * math.pi)
+    return math.sqrt(power) * case.area_um2 * distance_waves / chief_path(case) ** 2

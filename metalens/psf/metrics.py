@@ -40,28 +40,28 @@ def mtf(stack: PsfStack, *, frequencies_per_um: Array) -> Array:
 
 
 def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
-    """(…,) radius of the uniform disc with the spread of (…, y, x), by quartiles along
-    x and y.
+    """(…,) radius of the uniform disc of equal spread, um, by quartiles along x and y.
 
     The middle half of a disc of radius b lies within 0.404 b of its middle along an
-    axis.
+    axis. The radius is at most √(area / (π held)), that of a disc of the window's mean
+    brightness, and equal to it where less than half of the light is in the window.
 
     Args:
-        step_um: step of the samples, um.
-        held: (…,) share of the whole light that (…, y, x) is. What lies outside counts
-            on either side; the disc is at
-            most one as bright as the window on the mean, √(area / π held), and that
-            where less than half is held.
+        light: (…, y, x) irradiance.
+        step_um: step of the samples.
+        held: (…,) share of all light that falls in the window. Half of the light
+            outside counts on either side.
     """
-    held, widths = np.clip(held, 1e-6, 1.0), []
+    held = np.clip(held, 1e-6, 1.0)
+    widths = []
     for axis in (-1, -2):
         total = np.cumsum(light.sum(axis), -1)
         parts = [np.clip(0.5 + side / held, 0, 1)[..., None] for side in (-0.25, 0.25)]
         quarters = [(total < part * total[..., -1:]).sum(-1) for part in parts]
         widths.append((quarters[1] - quarters[0] + 1) / 2 * step_um)
-    even = step_um * np.sqrt(light.shape[-1] * light.shape[-2] / (math.pi * held))
-    apart = np.hypot(*widths) / (0.404 * math.sqrt(2))
-    return np.asarray(np.where(held < 0.5, even, np.minimum(apart, even)))
+    largest = step_um * np.sqrt(light.shape[-1] * light.shape[-2] / (math.pi * held))
+    radius = np.hypot(*widths) / (0.404 * math.sqrt(2))
+    return np.asarray(np.where(held < 0.5, largest, np.minimum(radius, largest)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +127,12 @@ def diffraction_limit(
 
 
 def find_peak(light: Array) -> tuple[float, float, float]:
-    """(row, column, value) of the peak of (y, x) samples, by a quintic spline.
+    """(row, column, value) of the peak of a quintic spline through samples.
+
+    It is searched within one sample of the brightest.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (y, x) irradiance.
     """
     spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
     start = np.array(np.unravel_index(int(light.argmax()), light.shape), float)
@@ -160,18 +162,23 @@ def fwhm(light: Array, step_um: float) -> float:
 
 
 def half_maximum(light: Array, peak: tuple[float, float, float]) -> tuple[float, float]:
-    """FWHM in samples of the azimuthal mean, and its fall at half maximum: part of the
-    peak a sample.
+    """FWHM of the azimuthal mean in samples, and its slope at half maximum.
+
+    The slope is the fall per sample over the peak. Both are nan where the mean stays
+    above one half within the window.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (y, x) irradiance.
+        peak: row, column and value of the peak.
     """
     row, column, top = peak
     spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
-    turn = 2 * np.pi * np.arange(72) / 72
+    azimuth = 2 * np.pi * np.arange(72) / 72
 
     def above(radius: float) -> float:
-        ring = _at(spline, row + radius * np.sin(turn), column + radius * np.cos(turn))
+        ring = _at(
+            spline, row + radius * np.sin(azimuth), column + radius * np.cos(azimuth)
+        )
         return float(ring.mean()) / top - 0.5
 
     widest = min(row, column, light.shape[0] - 1 - row, light.shape[1] - 1 - column)
@@ -192,14 +199,15 @@ def _at(spline: Array, row: Array | float, column: Array | float) -> Array:
 
 
 def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
-    """Light of (y, x) samples within a circle about (row, column), in samples.
+    """Sum of the samples within a circle; nan for a radius that is not finite.
 
-    Samples are even over their cells; those that the rim crosses count by their part
-    (16 x 16 points a cell: to 1e-3 of a cell).
+    Light is uniform over the cell of a sample. Cells that the circle cuts count by
+    their area in it, by 16 x 16 points each (to 1e-3 of a cell).
 
     Args:
-        light: (..., y, x) irradiance.
-        radius: radius of the circle, um.
+        light: (y, x) irradiance.
+        at: (row, column) of the circle's centre.
+        radius: of the circle, in samples.
     """
     if not math.isfinite(radius):
         return math.nan
@@ -215,11 +223,14 @@ def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
 
 
 def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, float]:
-    """Lowest frequency at which a line spread of samples has a modulation of 1/2, and
-    its change a unit of modulation; both per um, nan where it stays above.
+    """Lowest frequency of modulation 1/2, and its change per unit of modulation, 1/um.
+
+    Both are nan where the modulation stays above 1/2 up to the cut-off.
 
     Args:
+        line: (n,) line spread function.
         step_um: step of the samples, um.
+        cutoff_per_um: largest frequency that is searched, at most Nyquist's.
     """
     total = float(line.sum())
     x = np.arange(len(line)) * step_um
@@ -232,6 +243,5 @@ def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, flo
     if below is None:
         return math.nan, math.nan
     frequency_50 = float(optimize.brentq(above, steps[below - 1], steps[below]))
-    return frequency_50, 0.1 * frequency_50 / (
-        above(0.95 * frequency_50) - above(1.05 * frequency_50)
-    )
+    fall = above(0.95 * frequency_50) - above(1.05 * frequency_50)
+    return frequency_50, 0.1 * frequency_50 / fall

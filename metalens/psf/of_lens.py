@@ -37,12 +37,10 @@ from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import MeasuredSpectrum, Source, SpectralNodes
 from metalens.psf.stack import psf_stack
 
-PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
-ROWS, NEARBY = (
-    64,
-    1e-4,
-)  # rows of pillars whose delays are taken, and how far apart their wavelengths are
-TRIES = 3  # at a spectrum: the light of one tells the paths for the next
+PLACES = 9  # along each axis of the window, to which optical paths are computed
+ROWS = 64  # rows of pillars whose delays are computed
+NEARBY = 1e-4  # relative step of the wavelength for those delays
+TRIES = 3  # at a spectrum: the PSFs of one give the paths for the next
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
@@ -104,7 +102,7 @@ def from_lens(
         provenance: settings and input files, kept in the record.
         polarisation: as for :func:`psf_stack`, or ``"auto"``: the scalar where its
             error is below the tolerance, else the flux.
-        left_out: what is known of neighbours and angles of the lens's own pillars
+        left_out: errors by neighbours and angles of the lens's own pillars
             (:func:`metalens.design.left_out`); None for rough numbers of another cell.
 
     Returns:
@@ -146,15 +144,25 @@ def _over_spectrum(
     tolerance: float,
     **how: Any,
 ) -> PsfStack:
-    """PSFs of a spectrum: as many wavelengths as paths to the middle of the window ask
-    for; more where the paths to the light that they show do.
+    """PSF stack of a spectrum, by as few wavelengths as the tolerance needs.
+
+    The first rule of wavelengths follows from the paths to the middle of the window. If
+    the PSFs show light where paths differ more, the rule is refined, ``TRIES`` times at
+    most. The spectrum takes half of the tolerance.
+
+    Args:
+        lens: pillars, response, distances and films.
+        view: depths, angles and window.
+        source: a diode or measured curves.
+        tolerance: relative L2 error of the PSFs.
+        how: arguments of :func:`_at_wavelengths`.
     """
     within = lens.proxy.wavelengths_um
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
-    middle = max(
+    middle_um = max(
         float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans
     )
-    nodes = spectra.spectral_nodes(source, path_um=middle, tolerance=tolerance / 2)
+    nodes = spectra.spectral_nodes(source, path_um=middle_um, tolerance=tolerance / 2)
     for _ in range(TRIES):
         nodes = spectra.nodes_inside_library(nodes, source, within)
         stack = _at_wavelengths(lens, view, nodes, tolerance=tolerance, **how)
@@ -172,10 +180,15 @@ def _nodes_for(
     stack: PsfStack,
     tolerance: float,
 ) -> SpectralNodes:
-    """Wavelengths for the paths of every direction (:func:`paths_um`) to where the
-    light of PSFs lies.
+    """The longest rule of wavelengths that any direction needs.
+
+    Args:
+        source: a diode or measured curves.
+        spans: (depth, y, x) path differences of each direction (:func:`paths_um`), um.
+        stack: PSFs, whose light weighs the places of the window.
+        tolerance: relative error of the sum over wavelengths.
     """
-    found = [
+    rules = [
         spectra.spectral_nodes(
             source,
             path_um=span.ravel(),
@@ -184,7 +197,7 @@ def _nodes_for(
         )
         for span, light in zip(spans, stack.intensity, strict=True)
     ]
-    return max(found, key=lambda one: len(one.weights))
+    return max(rules, key=lambda rule: len(rule.weights))
 
 
 def paths_um(
@@ -193,76 +206,85 @@ def paths_um(
     angle_rad: tuple[float, float],
     source: Source | MeasuredSpectrum,
 ) -> Array:
-    """(depth, y, x) largest difference of optical path through two pillars to places of
-    the window, first to last.
+    """(depth, y, x) range of optical paths through the pillars to places of the window.
 
-    Rays of some places of the aperture through the films, and the delays of the pillars
-    themselves; a window that a
-    source of finite size blurs into is as much wider.
+    Rays are traced from each source through ``RINGS`` x ``SPOKES`` places of the
+    aperture and the films. The range of the pillars' own delays is added, um. A source
+    of finite size widens the window by the reach of its image.
 
     Args:
-        lens: the lens.
+        lens: pillars, distances and films.
+        view: depths, window and size of the source.
         angle_rad: field angles along x and y, rad.
+        source: spectrum, over which the delays are computed.
     """
-    grid = lens.diameters.grid._asdict()
-    given = {
-        name: value for name, value in view.arguments.items() if name != "source"
-    } | grid
-    about: dict[str, Any] = {
-        "wavelength_um": lens.wavelength_um,
-        "sensor_distance_um": lens.sensor_distance_um,
-    }
-    about["layers"] = lens.layers.open
+    geometry = view.arguments | lens.diameters.grid._asdict()
+    del geometry["source"]
     case = propagate.make_case(
-        lens.diameters.diameter_um.shape, angle_rad=angle_rad, **given, **about
+        lens.diameters.diameter_um.shape,
+        angle_rad=angle_rad,
+        wavelength_um=lens.wavelength_um,
+        sensor_distance_um=lens.sensor_distance_um,
+        layers=lens.layers.open,
+        **geometry,
     )
-    more = (0, 0) if view.source is None else source_image_reach(case, view.source)
+    margin = (0, 0) if view.source is None else source_image_reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
     turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
     x = (radius * np.cos(turn)).ravel()
     y = (radius * np.sin(turn)).ravel()
-    come = np.array(
+    from_source = np.array(
         [
             paths.from_source(case, x, y, case.tangents, inverse)
             for inverse in case.inverse_depths_per_um
         ]
     )
-    down, across = (
-        np.linspace(-1, 1, min(PLACES, n)) * ((n - 1) / 2 + far) * case.step_um + middle
-        for n, far, middle in zip(case.samples, more, case.centre_um[::-1], strict=True)
+    rows, columns = (
+        np.linspace(-1, 1, min(PLACES, n)) * ((n - 1) / 2 + extra) * case.step_um
+        + centre
+        for n, extra, centre in zip(
+            case.samples, margin, case.centre_um[::-1], strict=True
+        )
     )
-    goes = np.array(
+    to_sensor = np.array(
         [
-            [paths.to_sensor(case, x, y, (float(i), float(j))) for i in across]
-            for j in down
+            [paths.to_sensor(case, x, y, (float(i), float(j))) for i in columns]
+            for j in rows
         ]
     )
-    return np.asarray(
-        np.ptp(come[:, None, None] + goes, axis=-1) + _delay_um(lens, angle_rad, source)
-    )
+    total = from_source[:, None, None] + to_sensor
+    return np.asarray(np.ptp(total, axis=-1) + _delay_um(lens, angle_rad, source))
 
 
 def _delay_um(
     lens: Lens, angle_rad: tuple[float, float], source: Source | MeasuredSpectrum
 ) -> float:
-    """Largest difference of the pillars' delays, d(phase)/dk, over some rows and three
-    wavelengths of a spectrum.
+    """Range of the pillars' delays d(phase)/dk, um, the largest at three wavelengths.
+
+    The delay is the change of phase, in turns, over that of 1/λ between two
+    wavelengths. It is computed at the 5 %, 50 % and 95 % points of the spectrum, over
+    some ``ROWS`` rows. It is 0 where the library has one wavelength, or pairs of sizes.
+
+    Args:
+        lens: pillars and their response.
+        angle_rad: field angles along x and y, rad.
+        source: spectrum of the light.
     """
     low, high = lens.proxy.wavelengths_um
     if lens.pairs is not None or not high > low:
         return 0.0
     um, share = spectra.spectrum_points(source)
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
-    there = np.asarray(lens.diameters.diameter_um[rows]) > 0
+    has_pillar = np.asarray(lens.diameters.diameter_um[rows]) > 0
     tilt = library_incidence(lens, angle_rad)
     delays = []
     for quantile in (0.05, 0.5, 0.95):
-        middle = float(
-            np.clip(um[np.searchsorted(np.cumsum(share), quantile)], low, high)
-        )
+        point = um[np.searchsorted(np.cumsum(share), quantile)]
+        middle = float(np.clip(point, low, high))
         ends = max(low, middle * (1 - NEARBY)), min(high, middle * (1 + NEARBY))
         turns = [
-            lens.rows_phase_rad(rows, wave, tilt)[there] / (2 * np.pi) for wave in ends
+            lens.rows_phase_rad(rows, wave, tilt)[has_pillar] / (2 * np.pi)
+            for wave in ends
         ]
         change = turns[0] - turns[1]
         delays.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
@@ -270,17 +292,17 @@ def _delay_um(
 
 
 def light_shares(light: Array, places: tuple[int, ...]) -> Array:
-    """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to
-    places as in :func:`paths_um`.
+    """(depth, y, x) share of Σ light² whose samples lie nearest to each place.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (depth, y, x) irradiance.
+        places: numbers (y, x) of places at equal steps over the window, from edge to
+            edge, as in :func:`paths_um`.
     """
     square = np.asarray(light, float) ** 2
     for axis, count in zip((1, 2), places, strict=True):
-        first = np.ceil(
-            (np.arange(1, count) - 0.5) * (square.shape[axis] - 1) / max(count - 1, 1)
-        ).astype(int)
+        borders = (np.arange(1, count) - 0.5) * (square.shape[axis] - 1)
+        first = np.ceil(borders / max(count - 1, 1)).astype(int)
         square = np.add.reduceat(square, [0, *first], axis=axis)
     return np.asarray(square / square.sum())
 
@@ -292,16 +314,17 @@ def _quadrature_error(
     stack: PsfStack,
     nodes: SpectralNodes,
 ) -> float:
-    """Error of wavelengths that stand for a spectrum, by the paths to where the light
-    of a direction fell.
+    """Relative error of the quadrature over a spectrum, for one direction.
+
+    The root mean square over the window of the error at each place's range of paths,
+    weighted with the squared light at that place.
     """
     if nodes.source is None:
         return nodes.error
     span = paths_um(lens, view, angle_rad, nodes.source)
     share = light_shares(stack.intensity[0], span.shape[1:])
-    return float(
-        np.sqrt(share.ravel() @ spectra.quadrature_error(nodes, span.ravel()) ** 2)
-    )
+    errors = spectra.quadrature_error(nodes, span.ravel())
+    return float(np.sqrt(share.ravel() @ errors**2))
 
 
 def _at_wavelengths(
@@ -314,41 +337,51 @@ def _at_wavelengths(
     own: LeftOut,
     provenance: Provenance,
 ) -> PsfStack:
-    """PSFs of wavelengths with weights."""
+    """PSF stack at wavelengths with weights, direction by direction, with its error.
+
+    Each direction is computed with the pillars' response at its angle. The model's
+    errors are added to its budget, and the worst budget is that of the stack.
+
+    Args:
+        lens: pillars, response, distances and films.
+        view: depths, angles and window.
+        nodes: wavelengths in um with their weights.
+        tolerance: relative L2 error of the PSFs of one direction.
+        polarisation: ``"auto"``, ``"scalar"``, ``"flux"`` or ``"vector"``.
+        own: errors of the pillars' model by neighbours and angles.
+        provenance: settings and input files.
+    """
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
     budgets, parts = [], []
-    kept: tuple[float, bool] | None = None
+    cached: tuple[float, bool] | None = None
     for angle in view.angles_rad:
-        counted = _decided_polarisation(lens, angle, polarisation, tolerance)
-        response = library_incidence(lens, angle), counted == "scalar"
-        if (
-            kept != response
-        ):  # without angles in the library all directions share the maps
+        decided = _decided_polarisation(lens, angle, polarisation, tolerance)
+        response = library_incidence(lens, angle), decided == "scalar"
+        # without angles in the library all directions share the maps
+        if cached != response:
             (phase, level), fields = all_maps(
-                lens, nodes, angle, dtype, scalar=counted == "scalar"
+                lens, nodes, angle, dtype, scalar=decided == "scalar"
             )
-            kept = response
-        parts.append(
-            psf_stack(
-                phase,
-                level,
-                **lens.diameters.grid._asdict(),
-                wavelength_um=nodes.wavelengths_um.tolist(),
-                weights=nodes.weights.tolist(),
-                sensor_distance_um=lens.sensor_distance_um,
-                angle_rad=[list(angle)],
-                **view.arguments,
-                tolerance=share,
-                layers=lens.layers,
-                polarisation=counted,
-                neighbours=fields,
-            ).numpy()
-        )
-        judged = dataclasses.replace(
-            nodes, error=_quadrature_error(lens, view, angle, parts[-1], nodes)
-        )
-        budgets.append(with_model(parts[-1].budget, lens, angle, judged, counted, own))
+            cached = response
+        part = psf_stack(
+            phase,
+            level,
+            **lens.diameters.grid._asdict(),
+            wavelength_um=nodes.wavelengths_um.tolist(),
+            weights=nodes.weights.tolist(),
+            sensor_distance_um=lens.sensor_distance_um,
+            angle_rad=[list(angle)],
+            **view.arguments,
+            tolerance=share,
+            layers=lens.layers,
+            polarisation=decided,
+            neighbours=fields,
+        ).numpy()
+        parts.append(part)
+        error = _quadrature_error(lens, view, angle, part, nodes)
+        judged = dataclasses.replace(nodes, error=error)
+        budgets.append(with_model(part.budget, lens, angle, judged, decided, own))
     budget = worst_of_budgets(budgets)
     stack = _concatenated(parts, provenance)
     words = [
@@ -370,13 +403,19 @@ def _at_wavelengths(
 
 
 def mean_over_polarizations(x: PsfStack, y: PsfStack) -> PsfStack:
-    """PSFs of light without polarisation: the mean irradiance of those of light along x
-    and along y, as one stack.
+    """PSF stack of unpolarised light: the mean irradiance of two polarisations.
+
+    Each PSF is of sum 1, so they are averaged with their energies as weights. The error
+    and its budget are those of the worse stack.
+
+    Args:
+        x: stack of light polarised along x.
+        y: the same along y.
     """
     energy = (x.energy_um2 + y.energy_um2) / 2
     shares = [
-        (one.energy_um2 / (2 * np.where(energy > 0, energy, 1.0)))[..., None, None]
-        for one in (x, y)
+        (stack.energy_um2 / (2 * np.where(energy > 0, energy, 1.0)))[..., None, None]
+        for stack in (x, y)
     ]
     intensity = (x.intensity * shares[0] + y.intensity * shares[1]).astype(
         x.intensity.dtype
@@ -390,7 +429,14 @@ def mean_over_polarizations(x: PsfStack, y: PsfStack) -> PsfStack:
 def _decided_polarisation(
     lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float
 ) -> Polarisation:
-    """``auto`` decided."""
+    """The polarisation that is computed for one direction, ``"auto"`` resolved.
+
+    Pillars of circular light, of two sizes or known for one polarisation are scalar.
+    ``"auto"`` is the flux where the scalar's error is above the tolerance.
+
+    Raises:
+        PropagationError: flux or vector for pillars that only the scalar describes.
+    """
     if lens.hand or lens.pairs is not None or lens.one_light:
         if polarisation in ("flux", "vector"):
             sized = (
@@ -404,21 +450,17 @@ def _decided_polarisation(
                 "'scalar'"
             )
         return "scalar"
-    if polarisation == "auto":
-        return (
-            "flux"
-            if scalar_error(
-                sine_aperture(lens, angle), obliquity_variation(lens, angle)
-            )
-            > tolerance
-            else "scalar"
-        )
-    return polarisation
+    if polarisation != "auto":
+        return polarisation
+    aperture = sine_aperture(lens, angle)
+    error = scalar_error(aperture, obliquity_variation(lens, angle))
+    return "flux" if error > tolerance else "scalar"
 
 
 def library_incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Angle in rad at which the pillars are asked for light from a direction: 0 where
-    their library has no angles.
+    """Angle of incidence, rad, at which the pillars' response is looked up.
+
+    It is 0 where the library has no angles.
 
     Args:
         lens: the lens.
@@ -436,42 +478,41 @@ def all_maps(
     *,
     scalar: bool,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], NeighbourJonesFactors | None]:
-    """(wavelength, y, x) phase and transmission of every pillar for light from a
-    direction, with the mean factor of
-    unlike neighbours; or that factor on both fields beside them.
+    """Phase and transmission of every pillar, (wavelength, y, x), for one direction.
+
+    The coupling of unequal neighbours multiplies the scalar's maps. Otherwise its
+    factors on both fields are returned as well; None without solved neighbours.
 
     Args:
-        lens: the lens.
-        nodes: wavelengths with their weights.
+        lens: pillars and their response.
+        nodes: wavelengths in um with their weights.
         angle_rad: field angles along x and y, rad.
+        dtype: of the maps.
+        scalar: whether one scalar stands for both polarisations.
     """
     shape = len(nodes.weights), *lens.diameters.diameter_um.shape
     phase = torch.empty(shape, dtype=dtype)
     level = torch.empty(shape, dtype=dtype)
-    for wave, one, other in zip(
+    for wave, phase_map, level_map in zip(
         nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True
     ):
-        response.fill_response(
-            lens, (float(wave), library_incidence(lens, angle_rad)), one, other
-        )
+        light = float(wave), library_incidence(lens, angle_rad)
+        response.fill_response(lens, light, phase_map, level_map)
     if lens.neighbours is None:
         return (phase, level), None
+    coupling = phase, level, lens.neighbours, lens.diameters.pitch_um
     if scalar:
-        return among.apply_scalar_coupling(
-            phase, level, lens.neighbours, lens.diameters.pitch_um
-        ), None
-    return (phase, level), among.apply_jones_coupling(
-        phase, level, lens.neighbours, lens.diameters.pitch_um
-    )
+        return among.apply_scalar_coupling(*coupling), None
+    return (phase, level), among.apply_jones_coupling(*coupling)
 
 
 def passed_um2(
     lens: Lens, angle_rad: tuple[float, float], depths_um: Sequence[float]
 ) -> Array:
-    """(depths,) light that leaves the pillars, and the faces behind them, for unit
-    irradiance from this direction.
+    """(depths,) power behind the lens per unit irradiance from a direction, um².
 
-    Σ |T S|² a at the design wavelength: S the shadow of a stop, a the area of a site.
+    F Σ |T S|² a at the design wavelength: T the transmission of a pillar, S the shadow
+    of a stop, a the area of a site, F the share that passes the faces behind it.
 
     Args:
         lens: the lens.
@@ -509,12 +550,12 @@ def lens_stop_shadow(
 
 
 def _concatenated(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
-    """Stacks of single directions (1, depth, y, x) as one."""
+    """One stack of stacks of single directions (1, depth, y, x); the worst error."""
     join: Any = {
         n: np.concatenate([getattr(p, n) for p in parts])
         for n in ("intensity", "energy_um2", "angles_rad", "centres_um")
     }
-    least = max(parts, key=lambda p: p.error)
+    worst = max(parts, key=lambda p: p.error)
     return dataclasses.replace(
-        parts[0], **join, error=least.error, reason=least.reason, provenance=provenance
+        parts[0], **join, error=worst.error, reason=worst.reason, provenance=provenance
     )

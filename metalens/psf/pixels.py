@@ -20,8 +20,9 @@ def on_pixels(
     shift_um: tuple[float, float] = (0.0, 0.0),
     count: int | None = None,
 ) -> PsfStack:
-    """Light per pixel, each PSF again of sum 1 over the pixels; one without light there
-    stays 0, with no energy.
+    """PSF stack with light summed over pixels, each PSF of sum 1 over the pixels.
+
+    A PSF without light on the pixels is 0, with no energy.
 
     Args:
         stack: PSFs over angle, depth and wavelength.
@@ -46,11 +47,11 @@ def on_pixels(
     pixels = integrate_pixels(
         light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um
     )
-    share = pixels.sum((-1, -2))
-    least = torch.finfo(share.dtype).tiny
+    total = pixels.sum((-1, -2))
+    least = torch.finfo(total.dtype).tiny
     result: tuple[Any, Any] = (
-        pixels / share.clamp_min(least)[..., None, None],
-        torch.as_tensor(stack.energy_um2) * share,
+        pixels / total.clamp_min(least)[..., None, None],
+        torch.as_tensor(stack.energy_um2) * total,
     )
     if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
         result = result[0].numpy(), result[1].numpy()
@@ -60,8 +61,7 @@ def on_pixels(
 
 
 def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that cover ``samples`` samples; one where the pixel is
-    larger than the image.
+    """Number of pixels of this pitch that cover ``samples`` samples, at least 1.
 
     Args:
         sample_um: step of the samples, um.
@@ -71,8 +71,9 @@ def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
 
 
 def whole_pixels(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that lie wholly inside ``samples`` samples, however the
-    lengths are rounded.
+    """Number of pixels of this pitch that lie wholly inside ``samples`` samples.
+
+    A relative tolerance of 1e-12 allows for rounded lengths.
 
     Args:
         sample_um: step of the samples, um.
@@ -90,32 +91,27 @@ def pixel_weights(
     shift_um: float = 0.0,
     grid_um: float | None = None,
 ) -> Tensor:
-    """(pixels, samples) share of each sample's light that falls on each pixel, in
-    float64.
+    """(pixels, samples) share of each sample's light that falls on each pixel, float64.
 
     The cumulative light at the sample edges is interpolated by a Catmull-Rom cubic and
-    differenced at the pixel
-    edges: exact area overlap where the edges coincide, telescoping (so the energy is
-    kept), and with a continuous
-    derivative in the pitch everywhere. Plain overlap has a kink wherever a pixel edge
-    meets a sample edge.
+    differenced at the pixel edges. It equals the area overlap where the edges coincide,
+    conserves energy, and has a continuous derivative by the pitch. Plain overlap has a
+    kink at every pitch at which a pixel edge meets a sample edge.
 
     Args:
-        sample_um: step of the samples, um.
         samples: of the image along this axis; the image is centred on the pixel row.
+        sample_um: step of the samples, um.
         pitch_um: float, or a tensor that the weights are differentiable in.
         count: of pixels; by default as many as cover the image.
         shift_um: of the pixel row towards + along the axis.
-        grid_um: distance of the pixels, the pitch by default. Where it is given the
-            places stay and ``pitch_um`` is
-            the width of the box alone (the paper's learnable box filter), in the light
-            of a box of ``grid_um``.
+        grid_um: spacing of the pixels, the pitch by default. With it ``pitch_um`` is
+            the width of the box alone (the paper's learnable box filter). Its light is
+            scaled to a box of ``grid_um``.
 
     Accuracy:
         Column sums are 1 to rounding where the pixels reach one sample beyond the
-        image. A pixel cut by an
-        isolated bright sample takes up to -0.075 of it: the overshoot of the cubic;
-        none on sampled PSFs.
+        image. The cubic overshoots: a pixel next to an isolated bright sample has up to
+        -0.075 of it, but none on sampled PSFs.
     """
     pitch = torch.as_tensor(pitch_um, dtype=torch.float64)
     pixels = pixel_count(
@@ -124,17 +120,19 @@ def pixel_weights(
     pixels = pixels if count is None else count
     place = torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2
 
-    def light(edge_um: Tensor) -> Tensor:
+    def cumulative(edge_um: Tensor) -> Tensor:
         position = (edge_um + shift_um) / sample_um + samples / 2
         return _smooth_step(
             position[:, None] - torch.arange(samples, dtype=torch.float64)
         )
 
     if grid_um is None:
-        step = light(place * pitch)
-        return step[1:] - step[:-1]
-    middle = (place[:-1] + 0.5) * grid_um
-    return (light(middle + pitch / 2) - light(middle - pitch / 2)) * (grid_um / pitch)
+        edges = cumulative(place * pitch)
+        return edges[1:] - edges[:-1]
+    centres = (place[:-1] + 0.5) * grid_um
+    return (cumulative(centres + pitch / 2) - cumulative(centres - pitch / 2)) * (
+        grid_um / pitch
+    )
 
 
 def integrate_pixels(
@@ -146,13 +144,12 @@ def integrate_pixels(
     shift_um: tuple[float, float] = (0.0, 0.0),
     grid_um: float | None = None,
 ) -> Tensor:
-    """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's
-    area.
+    """Light on every pixel: the sum of ``image`` over the pixel's area.
 
     Args:
+        image: (..., y, x) light per sample.
         sample_um: step of the samples, um.
-        pitch_um: lattice constant, um.
-        image: (..., y, x).
+        pitch_um: of the pixels, um, a number or a tensor.
         shape: (rows, columns) of pixels; by default as many as cover the image.
         shift_um: (y, x) of the pixel grid.
         grid_um: see :func:`pixel_weights`.
@@ -161,24 +158,16 @@ def integrate_pixels(
         (..., rows, columns) in the dtype of ``image``; differentiable in image and
         pitch.
     """
-    axes = list(
-        zip(
-            image.shape[-2:],
-            (None, None) if shape is None else shape,
-            shift_um,
-            strict=True,
-        )
-    )
+    counts = (None, None) if shape is None else shape
+    axes = list(zip(image.shape[-2:], counts, shift_um, strict=True))
     if not (
         isinstance(pitch_um, Tensor)
         and pitch_um.requires_grad
         and torch.is_grad_enabled()
     ):
         width = float(pitch_um.detach()) if isinstance(pitch_um, Tensor) else pitch_um
-        lengths = [
-            length / sample_um
-            for length in (width, width if grid_um is None else grid_um)
-        ]
+        spacing = width if grid_um is None else grid_um
+        lengths = [width / sample_um, spacing / sample_um]
         if all(
             _samples(n, count, shift / sample_um, lengths) for n, count, shift in axes
         ):
@@ -200,11 +189,13 @@ def integrate_pixels(
 def _samples(
     samples: int, count: int | None, shift: float, lengths: Sequence[float]
 ) -> bool:
-    """Whether every pixel is one sample, to the rounding of its edges' places (double
-    precision).
+    """Whether every pixel is one sample, to the rounding of its edges in float64.
 
-    count: of pixels. shift: of the grid. lengths: width and distance of the pixels, all
-    in samples.
+    Args:
+        samples: of the image.
+        count: of pixels; None for as many as cover the image.
+        shift: of the pixel grid, in samples.
+        lengths: width and spacing of the pixels, in samples.
     """
     if (pixel_count(samples, 1.0, lengths[1]) if count is None else count) != samples:
         return False
@@ -212,14 +203,15 @@ def _samples(
 
 
 def _smooth_step(t: Tensor) -> Tensor:
-    """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left
-    of -1, 1 right of 2.
+    """Cumulative light at t of a cell [0, 1] of unit light, by a Catmull-Rom cubic.
+
+    It is 0 for t < -1 and 1 for t > 2.
     """
-    u, w = t + 1, t - 1
+    u = t + 1
+    w = t - 1
     before = 0.5 * u**2 * (u - 1)
     inside = t * (0.5 + t * (1.5 - t))
     after = 1 + 0.5 * w * (1 - w) ** 2
-    left = torch.where(
-        t < 0, torch.where(t < -1, 0.0, before), inside
-    )  # one piece each: its slope counts once
+    # exactly one piece at each t, so that its slope counts once
+    left = torch.where(t < 0, torch.where(t < -1, 0.0, before), inside)
     return torch.where(t < 1, left, torch.where(t < 2, after, 1.0))

@@ -186,10 +186,10 @@ def _encircled(stack: PsfStack, light: Array, radius_um: Array) -> Array:
     x, y = stack.x_um, stack.y_um
     cx = light.sum(0) @ x / light.sum()
     cy = light.sum(1) @ y / light.sum()
-    away = np.hypot(x - cx, (y - cy)[:, None]).ravel()
-    order = np.argsort(away)
+    distance = np.hypot(x - cx, (y - cy)[:, None]).ravel()
+    order = np.argsort(distance)
     shares = np.cumsum(light.ravel()[order])
-    return np.asarray(np.interp(radius_um, away[order], shares))
+    return np.asarray(np.interp(radius_um, distance[order], shares))
 
 
 def along_z(scan: "FocusScan") -> bytes:

@@ -16,7 +16,7 @@ from metalens.core.errors import MaterialError, PropagationError
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
 PATHS = 129  # from 0 to the longest, at which a rule is judged
-SUM_ERROR = 1e-6  # of weights: all light counts as so much more or less
+SUM_ERROR = 1e-6  # of the sum of weights: a relative error of all light
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
 
 
@@ -46,13 +46,12 @@ class Source:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SpectralNodes:
-    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band
-    that was asked for.
+    """Wavelengths and weights of a quadrature over a spectrum, and its error.
 
-    source: the spectrum that they stand for, by which :func:`quadrature_error` judges
-    them on any
-    path; None for wavelengths as
-        such.
+    wavelengths_um, weights: (n,), the weights of sum 1.
+    error: of the quadrature, for the paths that it was chosen for.
+    source: the spectrum, by which :func:`quadrature_error` judges them on any path;
+        None for plain wavelengths.
 
     Raises:
         PropagationError: no wavelength, one that is not above 0, or weights that are
@@ -87,11 +86,13 @@ class SpectralNodes:
 
 
 def spectral_weight(source: Source) -> tuple[Array, Array]:
-    """(wavelengths in um, weight of sum 1) of diode times silicon over ±2.5 FWHM, every
-    0.25 nm or FWHM / 40.
+    """Wavelengths (n,) in um and weights of sum 1 of a diode on a silicon sensor.
+
+    weight ∝ exp(-4 ln 2 ((λ - peak) / FWHM)²) λ (1 - exp(-4π k thickness / λ)) over
+    ±2.5 FWHM, every 0.25 nm or FWHM / 40, whichever is less.
 
     Args:
-        source: spectrum of the source.
+        source: peak, width and thickness of silicon.
 
     Raises:
         MaterialError: the line leaves the range of the silicon data.
@@ -111,11 +112,11 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
                 f"the sensor's silicon is not known; {error}"
             ) from None
     count = round(2.5 * source.fwhm_nm / step_nm)
-    away = np.arange(-count, count + 1) * step_nm / source.fwhm_nm
-    um = (source.peak_nm + away * source.fwhm_nm) * 1e-3
+    widths = np.arange(-count, count + 1) * step_nm / source.fwhm_nm
+    um = (source.peak_nm + widths * source.fwhm_nm) * 1e-3
     k = np.array([materials.index("Si", w).imag for w in um])
-    seen = um * (1 - np.exp(-4 * np.pi * k * source.silicon_um / um))
-    value = np.exp(-4 * np.log(2) * away**2) * seen
+    response = um * (1 - np.exp(-4 * np.pi * k * source.silicon_um / um))
+    value = np.exp(-4 * np.log(2) * widths**2) * response
     return um, value / value.sum()
 
 
@@ -123,8 +124,8 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
 class MeasuredSpectrum:
     """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
 
-    beside: share of the light that is left out at its ends, outside of what the pillars
-    are known for.
+    beside: share of the light that is cut off at its ends, outside the wavelengths of
+        the pillars' library.
     """
 
     wavelengths_um: Array
@@ -135,26 +136,25 @@ class MeasuredSpectrum:
 def read_measured_spectrum(
     files: Sequence[Path], *, within_um: tuple[float, float]
 ) -> MeasuredSpectrum:
-    """Product of measured curves (LED, filter, sensor) where all of them are known.
+    """Normalised product of measured curves (LED, filter, sensor), where all exist.
 
-    A file has two columns, wavelength in nm and value, parted by commas, semicolons or
-    blanks; lines that start with #
-    or with a word are skipped. Where semicolons, tabs or blanks part the columns, a
-    comma stands for the decimal
-    point. Values are interpolated linearly, and the product is integrated from one row
-    of any of the curves to the
-    next, at two points each and at most 0.25 nm at a time, so that lines narrower than
-    that are seen; a constant
-    factor of each drops out.
+    A file has two columns, wavelength in nm and value, separated by commas, semicolons
+    or blanks. Lines that start with # or with a word are skipped. Where semicolons,
+    tabs or blanks separate the columns, a comma is the decimal point.
+
+    Values are interpolated linearly. The product is integrated by two-point Gauss rules
+    between the rows of all curves, and over 0.25 nm at most. A constant factor of each
+    curve drops out.
 
     Args:
-        files: settings files of the stages.
+        files: one for each curve.
+        within_um: (least, largest) wavelength of the pillars' library, um; equal for a
+            single wavelength, which cuts nothing off.
 
     Raises:
-        PropagationError: no file, one that is missing or no such table, curves without
-            a common range, or light outside
-            ``within_um``, which the pillars are known for (less than 1e-4 of the
-            largest value is left out there).
+        PropagationError: no file, a missing or malformed file, curves without a common
+            range, or light outside ``within_um`` (less than 1e-4 of the largest value
+            is cut off).
     """
     if not files:
         raise PropagationError(
@@ -169,10 +169,10 @@ def read_measured_spectrum(
         )
     rows = np.concatenate([c[:, 0] for c in curves] + [np.arange(low, high, STEP_NM)])
     ends = np.unique(np.clip(rows, low, high))
-    half, middle = np.diff(ends) / 2, (ends[1:] + ends[:-1]) / 2
-    nm = np.stack(
-        [middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1
-    ).ravel()  # Gauss, of third degree
+    half = np.diff(ends) / 2
+    middle = (ends[1:] + ends[:-1]) / 2
+    # Gauss, of third degree
+    nm = np.stack([middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1).ravel()
     value = np.prod([np.interp(nm, c[:, 0], c[:, 1]) for c in curves], axis=0)
     share = value * np.repeat(half, 2)
     if not share.sum() > 0:
@@ -180,28 +180,36 @@ def read_measured_spectrum(
             f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere"
         )
     share = share / share.sum()
-    first, last = _kept(nm, value, within_um)
-    nm, share = nm[first:last], share[first:last]
-    return MeasuredSpectrum(
-        nm * 1e-3, share / share.sum(), max(0.0, 1 - float(share.sum()))
-    )
+    first, last = _range_within(nm, value, within_um)
+    nm = nm[first:last]
+    share = share[first:last]
+    outside = max(0.0, 1 - float(share.sum()))
+    return MeasuredSpectrum(nm * 1e-3, share / share.sum(), outside)
 
 
-def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int, int]:
-    """First and last (excluded) point of what the pillars are known for; all that is
-    lit, where that is one wavelength.
+def _range_within(
+    nm: Array, value: Array, within_um: tuple[float, float]
+) -> tuple[int, int]:
+    """Index of the first point within the pillars' library, and of the last plus one.
+
+    A library of one wavelength cuts nothing off but points below 1e-4 of the largest.
+
+    Args:
+        nm: (n,) wavelengths, ascending.
+        value: (n,) of the spectrum.
+        within_um: (least, largest) wavelength of the library.
 
     Raises:
-        PropagationError: light beyond.
+        PropagationError: points above 1e-4 of the largest lie outside.
     """
     bright = np.flatnonzero(value > 1e-4 * value.max())
     low, high = (edge * 1e3 for edge in within_um)
     if not high > low:
         return int(bright[0]), int(bright[-1]) + 1
     if not (low - 1e-3 <= nm[bright[0]] and nm[bright[-1]] <= high + 1e-3):
-        few = slice(int(bright[0]), int(bright[-1]) + 1)
+        band = slice(int(bright[0]), int(bright[-1]) + 1)
         raise _refusal(
-            (nm[few], value[few] / value[few].sum()),
+            (nm[band], value[band] / value[band].sum()),
             within_um,
             "narrow it (a filter among the files)",
         )
@@ -210,7 +218,11 @@ def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int,
 
 
 def _curve(file: Path) -> Array:
-    """(n, [nm, value]) of a file, ascending."""
+    """(n, [nm, value]) rows of a file, ascending in wavelength.
+
+    Raises:
+        PropagationError: a file that is no such table, naming the line.
+    """
     rows = []
     try:
         lines = reading.read_text(file).splitlines()
@@ -243,16 +255,16 @@ def _curve(file: Path) -> Array:
             f"{file}: {len(rows)} rows, need two or more of wavelength in nm and value; a single line is wavelengths_nm"
         )
     table = np.array(sorted(rows))
-    twice = np.flatnonzero(np.diff(table[:, 0]) == 0)
-    if len(twice):
+    repeated = np.flatnonzero(np.diff(table[:, 0]) == 0)
+    if len(repeated):
         raise PropagationError(
-            f"{file}: {table[twice[0], 0]:g} nm stands twice; need one value for each wavelength"
+            f"{file}: {table[repeated[0], 0]:g} nm stands twice; need one value for each wavelength"
         )
     return table
 
 
 def _number(word: str) -> bool:
-    """Whether it is one, be it nan or inf: a row, not a name of columns."""
+    """Whether a word is a number, nan or inf: a row, not a name of columns."""
     try:
         float(word)
     except ValueError:
@@ -267,17 +279,17 @@ def spectral_nodes(
     tolerance: float,
     light: Array | None = None,
 ) -> SpectralNodes:
-    """As few wavelengths as meet the tolerance.
+    """The Gauss rule of fewest wavelengths that meets the tolerance.
+
+    Irradiance varies with wavelength as exp(2πi·path/λ) at most, path the difference of
+    optical paths through two parts of the lens. The rule's error is that of the mean of
+    this exponential over the spectrum.
 
     Args:
         source: spectrum of the source.
-        path_um: largest difference in optical path between two parts of the lens, for
-            light that reaches the window:
-            intensities vary with wavelength as exp(2πi·path/λ), and no faster. Or (n,)
-            of parts of the window, with
-            ``light`` (n,), the share of each in its squared intensity.
-        tolerance: of the mean over the spectrum of every such exponential, root mean
-            square over the parts.
+        path_um: largest difference of paths to the window, um; or (n,) to its parts.
+        tolerance: error, root mean square over the parts.
+        light: (n,) share of each part in the squared irradiance; None for one part.
 
     Raises:
         PropagationError: more than 64 wavelengths would be needed.
@@ -285,13 +297,13 @@ def spectral_nodes(
     spans = np.atleast_1d(path_um)
     light = np.ones(1) if light is None else light
     um, share = spectrum_points(source)
-    beside = getattr(source, "beside", 0.0)
+    outside = getattr(source, "beside", 0.0)
     for count in range(1, MOST_NODES + 1):
-        x, w = gauss_rule(um, share, count)
-        errors = beside + _mean_errors((x, w), (um, share), spans)
+        rule = gauss_rule(um, share, count)
+        errors = outside + _mean_errors(rule, (um, share), spans)
         error = float(np.sqrt(light @ errors**2))
         if error <= tolerance:
-            return SpectralNodes(x, w, error, source)
+            return SpectralNodes(*rule, error, source)
     raise PropagationError(
         f"more than {MOST_NODES} wavelengths needed for paths of {spans.max():.3g} um under a line from "
         f"{um[0] * 1e3:.1f} to {um[-1] * 1e3:.1f} nm; raise the tolerance or narrow the line"
@@ -299,24 +311,29 @@ def spectral_nodes(
 
 
 def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
-    """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up
-    to each of these.
+    """(n,) largest error of the mean of exp(2πi·path/λ), over paths up to each span.
 
     Args:
-        nodes: wavelengths with their weights.
+        nodes: wavelengths with weights, and the spectrum that they integrate.
+        span_um: (n,) largest difference of optical paths, um.
     """
     if nodes.source is None:
         return np.full(len(span_um), nodes.error)
     rule = nodes.wavelengths_um, nodes.weights
-    beside = getattr(nodes.source, "beside", 0.0)
-    return beside + _mean_errors(rule, spectrum_points(nodes.source), span_um)
+    outside = getattr(nodes.source, "beside", 0.0)
+    return outside + _mean_errors(rule, spectrum_points(nodes.source), span_um)
 
 
 def _mean_errors(
     rule: tuple[Array, Array], points: tuple[Array, Array], span_um: Array
 ) -> Array:
-    """(n,) largest difference of the means of exp(2πi·path/λ) by a rule and by points
-    (wavelengths, weights), for paths up to each span."""
+    """(n,) largest difference of two means of exp(2πi·path/λ), over paths up to a span.
+
+    Args:
+        rule: wavelengths in um and weights of the quadrature.
+        points: those of the spectrum itself.
+        span_um: (n,) largest paths, um.
+    """
     paths = np.linspace(0, span_um.max(), PATHS)
     means = [np.exp(2j * np.pi * paths[:, None] / um) @ w for um, w in (rule, points)]
     largest = np.maximum.accumulate(np.abs(means[0] - means[1]))
@@ -330,24 +347,20 @@ def spectrum_points(source: Source | MeasuredSpectrum) -> tuple[Array, Array]:
     Args:
         source: spectrum of the source.
     """
-    return (
-        (source.wavelengths_um, source.share)
-        if isinstance(source, MeasuredSpectrum)
-        else spectral_weight(source)
-    )
+    if isinstance(source, MeasuredSpectrum):
+        return source.wavelengths_um, source.share
+    return spectral_weight(source)
 
 
 def share_outside_library(
     source: Source | MeasuredSpectrum | SpectralNodes | None,
     within_um: tuple[float, float],
 ) -> float:
-    """Share of the light of a spectrum outside of the wavelengths that pillars are
-    known for, which those within stand
-    for; 0 of wavelengths as such and of pillars that are known at one, where others are
-    refused.
+    """Share of a spectrum's light outside the wavelengths of the pillars' library.
 
-    It is no error of that size: pillars that answer smoothly beyond are off by what the
-    quadrature is.
+    Nodes within the library stand for that light. The share is no error of that size:
+    where the response continues smoothly, the error is that of the quadrature. It is 0
+    of plain wavelengths, and of a library of one wavelength, which raises elsewhere.
 
     Args:
         source: spectrum of the source.
@@ -365,17 +378,16 @@ def nodes_inside_library(
     source: Source | MeasuredSpectrum,
     within_um: tuple[float, float],
 ) -> SpectralNodes:
-    """The wavelengths that stand for a spectrum, all of which lie within those that
-    pillars are known for.
+    """The nodes, unchanged, if all lie within the wavelengths of the pillars' library.
 
     Args:
         nodes: wavelengths with their weights.
-        source: spectrum of the source.
+        source: the spectrum of which they are a quadrature.
         within_um: (least, largest) wavelength of the library, um.
 
     Raises:
-        PropagationError: one lies beyond; with the share of the light that does, and
-            what serves.
+        PropagationError: a node lies outside; the text names the share of the light
+            outside, and the cure.
     """
     low, high = within_um
     um = np.asarray(nodes.wavelengths_um)
@@ -398,26 +410,29 @@ def nodes_inside_library(
 def _refusal(
     light: tuple[Array, Array], within_um: tuple[float, float], narrow: str
 ) -> PropagationError:
-    """What to say of light (nm ascending, shares of sum 1) that the pillars are not
-    known for, and of what serves.
+    """The error for light outside the pillars' library, with its share and the cure.
+
+    Args:
+        light: wavelengths in nm, ascending, and shares of sum 1.
+        within_um: (least, largest) wavelength of the library.
+        narrow: words for how to narrow the spectrum; may be empty.
     """
-    (nm, share), (low, high) = light, (edge * 1e3 for edge in within_um)
-    known = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
+    nm, share = light
+    low, high = (edge * 1e3 for edge in within_um)
+    library = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
     part = (
         float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum())
         if high > low
         else 1.0
     )
     return PropagationError(
-        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {known}, and {part:.2g} of it lies "
+        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {library}, and {part:.2g} of it lies "
         f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {library_sweep_hint(nm)})"
     )
 
 
 def library_sweep_hint(nm: Array) -> str:
-    """The key of CELL.toml whose library is known for light of these wavelengths (n,),
-    ascending.
-    """
+    """The key of CELL.toml that sweeps a library over wavelengths (n,), nm, ascending."""
     ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
     return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 
@@ -426,8 +441,7 @@ def outside_library_text(
     source: Source | MeasuredSpectrum | SpectralNodes | None,
     within_um: tuple[float, float],
 ) -> str:
-    """Words for :func:`share_outside_library` light; empty where that is less than 1e-4
-    of it.
+    """Words for the :func:`share_outside_library`; empty where it is below 1e-4.
 
     Args:
         source: spectrum of the source.
@@ -444,13 +458,21 @@ def outside_library_text(
 
 
 def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
-    """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1
-    (Lanczos, Golub and Welsch).
+    """Nodes (count,) and weights of the Gauss rule of a discrete weight.
+
+    It is exact for polynomials of degree 2·count - 1. Lanczos' recurrence, with its
+    vectors orthogonalised twice, gives the Jacobi matrix. Its eigenvalues are the nodes
+    (Golub and Welsch).
+
+    Args:
+        points: (n,) abscissas.
+        share: (n,) weights.
+        count: nodes, at most n.
     """
     count = min(count, len(points))
     basis = np.zeros((count, len(points)))
     diagonal = np.zeros(count)
-    beside = np.zeros(count)
+    off_diagonal = np.zeros(count)
     q = np.sqrt(share / share.sum())
     for i in range(count):
         basis[i] = q
@@ -458,9 +480,9 @@ def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
         diagonal[i] = q @ r
         r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
         r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
-        beside[i] = np.linalg.norm(r)
-        q = r / beside[i] if beside[i] > 0 else r
-    values, vectors = np.linalg.eigh(
-        np.diag(diagonal) + np.diag(beside[:-1], -1)
-    )  # by its lower triangle
-    return values, vectors[0] ** 2 * share.sum()
+        off_diagonal[i] = np.linalg.norm(r)
+        q = r / off_diagonal[i] if off_diagonal[i] > 0 else r
+    # eigh reads the lower triangle alone
+    jacobi = np.diag(diagonal) + np.diag(off_diagonal[:-1], -1)
+    nodes, vectors = np.linalg.eigh(jacobi)
+    return nodes, vectors[0] ** 2 * share.sum()

@@ -125,11 +125,11 @@ def psf_stack(
         raise PropagationError(
             f"tolerance is {tolerance}, need a relative error above 0 and below 1"
         )
-    maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
+    maps, waves, weight = _maps(phase_rad, transmission, wavelength_um, weights)
     shape = maps[0].shape
     maps, mixing = _polarised(maps, polarisation, neighbours, pitch_um)
     depths = np.atleast_1d(np.asarray(_value(depths_um), float))
-    about: dict[str, Any] = {
+    geometry: dict[str, Any] = {
         "pitch_um": pitch_um,
         "row_um": row_um,
         "site_um2": site_um2,
@@ -140,19 +140,19 @@ def psf_stack(
         "depths_um": depths,
         "offset_um": _value(offset_um),
     }
-    several, angles = _directions(angle_rad)
+    has_angle_axis, angles = _directions(angle_rad)
     lenses = [m.reshape(-1, *m.shape[-3:]) for m in maps]
     cases: list[PropagationCase] = []
     results: list[list[IntensityResult]] = []
     for angle in angles:
-        each = [
+        by_wave = [
             propagate.make_case(
-                shape, wavelength_um=wave, angle_rad=_value(angle), **about
+                shape, wavelength_um=wave, angle_rad=_value(angle), **geometry
             )
             for wave in waves
         ]
-        cases.append(each[int(share.argmax())])  # all wavelengths share its window
-        each = [replace(case, centre_um=cases[-1].centre_um) for case in each]
+        cases.append(by_wave[int(weight.argmax())])  # all wavelengths share its window
+        by_wave = [replace(case, centre_um=cases[-1].centre_um) for case in by_wave]
         moving = _geometry_with_gradients(
             angle, depths_um, sensor_distance_um, offset_um, cases[-1]
         )
@@ -162,8 +162,8 @@ def psf_stack(
                 compute_intensity(
                     IntensityRequest(
                         (phase, level),
-                        each,
-                        share.tolist(),
+                        by_wave,
+                        weight.tolist(),
                         tolerance,
                         mixing,
                         layers,
@@ -175,8 +175,8 @@ def psf_stack(
                 for phase, level in zip(*lenses, strict=True)
             ]
         )
-    batch = (*shape[:-3], *[len(cases)] * several)
-    axes = depths, np.array(waves), share
+    batch = (*shape[:-3], *[len(cases)] * has_angle_axis)
+    axes = depths, np.array(waves), weight
     stack = _record(results, batch, cases, axes, tolerance, layers)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
@@ -187,8 +187,17 @@ def _polarised(
     neighbours: NeighbourRows | NeighbourJonesFactors | None,
     pitch_um: float,
 ) -> tuple[Maps, PolarizationMixing | None]:
-    """Maps with the coupling of neighbours, three of every wavelength where it turns
-    the polarisation; and the mixing of both polarisations, None for one scalar."""
+    """Maps with the coupling of neighbours, and the mixing of both polarisations.
+
+    The scalar multiplies the maps by the mean coupling and has no mixing (None). Where
+    coupling turns the polarisation, three maps stand for every wavelength.
+
+    Args:
+        maps: phase in rad and transmission, each (…, wavelength, y, x).
+        polarisation: ``"scalar"``, ``"flux"`` or ``"vector"``.
+        neighbours: solved rows of unequal neighbours, or their factors on both fields.
+        pitch_um: distance of neighbouring pillars, um.
+    """
     if polarisation == "scalar":
         if isinstance(neighbours, NeighbourJonesFactors):
             raise PropagationError(
@@ -211,7 +220,7 @@ def _polarised(
 def _check_moving(
     moving: MovingGeometry | None, source: Extent | None, layers: Layers | None
 ) -> None:
-    """Refuse gradients in the geometry where there are none."""
+    """Raise where gradients in the geometry meet a finite source or a stop."""
     if moving is None:
         return
     if source is not None:
@@ -242,20 +251,30 @@ def _record(
     tolerance: float,
     layers: Layers | None,
 ) -> PsfStack:
-    """The stack of results by direction and lens; ``batch``: (…, [angle]); axes are
-    depths, wavelengths, weights.
+    """PSF stack of the results of all directions and lenses, each PSF of sum 1.
+
+    The error and its budget are those of the worst result.
+
+    Args:
+        by_direction: results of each direction, each a list over lenses.
+        batch: (…, [angle]) leading shape of the stack.
+        cases: geometry of each direction.
+        axes: depths in um, wavelengths in um and their weights.
+        tolerance: relative L2 error that was asked for.
+        layers: films and stop; None for a bare lens.
     """
-    rows = list(zip(*by_direction, strict=True))  # by lens, then by direction
-    results = [one for row in rows for one in row]
-    lights = [one.intensity for one in results]
+    by_lens = zip(*by_direction, strict=True)
+    results = [result for row in by_lens for result in row]
+    lights = [result.intensity for result in results]
     light = lights[0][None] if len(lights) == 1 else torch.stack(lights)
     light = light.view(*batch, *light.shape[1:])
     energy = light.sum((-1, -2))
-    power = np.reshape([one.power for one in results], energy.shape)
+    power = np.reshape([result.power for result in results], energy.shape)
     share = energy.detach().double().numpy() * cases[0].step_um ** 2
     share = share / (power * cases[0].area_um2)
-    worst = max(results, key=lambda one: one.budget.computed)
-    error, dtype = worst.budget.computed, light.dtype
+    worst = max(results, key=lambda result: result.budget.computed)
+    error = worst.budget.computed
+    dtype = light.dtype
     divide = torch.div if light.requires_grad else torch.Tensor.div_  # in place
     reason = worst.reason
     if error > tolerance:
@@ -288,8 +307,15 @@ def _stop_error(
     axes: tuple[Array, Array, Array],
     layers: Layers,
 ) -> float:
-    """Error of the shadow of a stop, the worst over angles, depths and wavelengths;
-    share: of the light that the windows hold."""
+    """Relative error of the stop's shadow, the worst over angles, depths, wavelengths.
+
+    Args:
+        psfs: (…, angle, depth, y, x) PSFs of sum 1.
+        share: (…, angle, depth) share of the light that falls in the window.
+        cases: geometry of each direction.
+        axes: depths in um, wavelengths in um and their weights.
+        layers: with the stop.
+    """
     light = psfs.detach().numpy().reshape(-1, len(cases), *psfs.shape[-3:])
     share = share.clip(1e-6, 1).reshape(light.shape[:-2])
     blurs_um = blur_um(light, cases[0].step_um, share)
@@ -304,7 +330,7 @@ def _stop_error(
 
 
 def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
-    """What keeps an estimate above the tolerance."""
+    """Words that name the largest term of an error above the tolerance."""
     least = torch.finfo(dtype).eps
     if tolerance < least:
         more = ", give float64 maps" if dtype != torch.float64 else ""
@@ -329,25 +355,36 @@ def _value(argument: Any) -> Any:
 def _geometry_with_gradients(
     angle: Any, depths: Any, distance: Any, offset: Any, case: PropagationCase
 ) -> MovingGeometry | None:
-    """Geometry as tensors where any of it carries a gradient."""
-    given = [
-        angle,
-        depths,
-        distance,
-        *(offset if isinstance(offset, list | tuple) else [offset]),
-    ]
-    if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in given):
+    """Geometry as float64 tensors; None where nothing in it carries a gradient.
+
+    The window's centre is where the chief ray meets the sensor, plus the offset.
+
+    Args:
+        angle: field angle along x, or a pair (x, y), rad.
+        depths: source depths, um.
+        distance: lens to sensor, um.
+        offset: (x, y) from the chief ray to the window's centre, um.
+        case: with the media behind the lens.
+    """
+    offsets = offset if isinstance(offset, list | tuple) else [offset]
+    arguments = [angle, depths, distance, *offsets]
+    if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in arguments):
         return None
     pair = _double(angle).reshape(-1)
     tangents = torch.tan(
         pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)])
     )
-    d = _double(distance).reshape(())
-    shift = torch.stack([_double(o).reshape(()) for o in offset])
-    meets = torch.stack(
-        [propagate.chief_ray_offset(case.behind, d, tangents, i) for i in (0, 1)]
+    distance_um = _double(distance).reshape(())
+    offset_um = torch.stack([_double(o).reshape(()) for o in offset])
+    chief = torch.stack(
+        [
+            propagate.chief_ray_offset(case.behind, distance_um, tangents, i)
+            for i in (0, 1)
+        ]
     )
-    return MovingGeometry(tangents, 1 / _double(depths).reshape(-1), d, meets + shift)
+    return MovingGeometry(
+        tangents, 1 / _double(depths).reshape(-1), distance_um, chief + offset_um
+    )
 
 
 def _double(argument: Any) -> torch.Tensor:
@@ -362,8 +399,16 @@ def _maps(
     wavelength_um: float | Sequence[float],
     weights: Sequence[float] | None,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], list[float], Array]:
-    """Maps (…, wavelength, y, x) as tensors of one dtype, the wavelengths, and their
-    weights of sum 1.
+    """Maps as tensors of one dtype, wavelengths in um, and their weights of sum 1.
+
+    Args:
+        phase: (…, y, x) rad; several wavelengths are the axis before y.
+        level: (…, y, x) transmission, of the shape of the phase or one that broadcasts.
+        wavelength_um: one wavelength or several.
+        weights: of the wavelengths; None for equal.
+
+    Returns:
+        ((phase, transmission), wavelengths, weights); maps (…, wavelength, y, x).
     """
     waves = np.atleast_1d(np.asarray(wavelength_um, float)).ravel().tolist()
     if not waves:
@@ -395,6 +440,6 @@ def _maps(
 
 
 def _broadcasts(level: torch.Tensor, phase: torch.Tensor) -> bool:
-    """Whether a transmission is one of these maps, or of all of them."""
-    alike = zip(level.shape[::-1], phase.shape[::-1], strict=False)
-    return level.ndim <= phase.ndim and all(n in (1, m) for n, m in alike)
+    """Whether the transmission's shape broadcasts to that of the phase."""
+    lengths = zip(level.shape[::-1], phase.shape[::-1], strict=False)
+    return level.ndim <= phase.ndim and all(n in (1, m) for n, m in lengths)

@@ -20,7 +20,7 @@ from metalens.propagate import (
 )
 from metalens.psf.among import NeighbourJonesFactors
 
-# blocks of pillars along an axis over which the cosine of a ray is taken as alike
+# blocks of pillars along an axis, each with one cosine of its rays
 POOLED = 64
 NOTHING = 1e-12  # of the light of the strongest combination of factors: rounding
 
@@ -37,12 +37,11 @@ class VectorPupil:
 
 @dataclass(frozen=True, slots=True)
 class PolarizationMixing:
-    """Both polarisations of light from maps of pillars, as smooth factors where a lens
-    is known by a few nodes.
+    """Both polarisations of the light from maps of pillars, as factors on the maps.
 
-    flux: through the sensor's plane, else |E|². apart: of three maps
-    (:func:`apart_maps`) in place of one, whose
-    pillars treat both polarisations alike.
+    flux: of the power through the sensor's plane, else of |E|².
+    apart: of three maps (:func:`apart_maps`), for pillars that respond differently to x
+        and y; else of one map.
     """
 
     flux: bool
@@ -54,38 +53,45 @@ class PolarizationMixing:
         return 3 if self.apart else 1
 
     def pupils(self, case: PropagationCase) -> Pupils:
-        """Components of the light of a case: of one map four of the flux of light along
-        x, which is that of light along
-        y but behind films, or six of the mean |E|²; of three maps or behind films eight
-        of the mean flux, or six. Those
-        that are 0 all over are left out."""
+        """Function from places (y, x) of the lens to signs and factors of a case.
+
+        One map without films has four components of the flux of light along x, equal to
+        that of light along y. Three maps, or films, have eight of the mean flux. |E|²
+        has six. Components that are 0 everywhere are left out.
+        """
         return lambda y_um, x_um: self._components(case, (y_um, x_um))
 
     def _components(
         self, case: PropagationCase, at_um: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """(components,) signs and (components, map, y, x) factors."""
+        """(components,) signs and (components, map, y, x) factors on the maps.
+
+        Args:
+            case: direction of the light, media and window.
+            at_um: (y,) and (x,) places on the lens.
+        """
         order = case.media.order
-        first, b = rays_to(case, at_um, order[0]), rays_to(case, at_um)
+        first = rays_to(case, at_um, order[0])
+        last = rays_to(case, at_um)
         steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
-        a = torch.tensor(
+        incident = torch.tensor(
             [case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep],
             dtype=torch.float64,
         )
-        x, y = beyond_faces(transmitted_polarization(a, first), first, order).chunk(2)
-        none = torch.zeros_like(x)
-        both = [
-            torch.cat(pair)
-            for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])
-        ]
+        behind = beyond_faces(transmitted_polarization(incident, first), first, order)
+        x, y = behind.chunk(2)
+        zero = torch.zeros_like(x)
+        pairs = [(x, zero), (zero, y), (y, x)] if self.apart else [(x, y)]
+        both = [torch.cat(pair) for pair in pairs]
         fields = [
-            of_flux(one, b) if self.flux else VectorPupil(one, (1.0,) * len(one))
-            for one in both
+            of_flux(e, last) if self.flux else VectorPupil(e, (1.0,) * len(e))
+            for e in both
         ]
-        factors = torch.stack([one.pupils for one in fields], 1).numpy()
+        factors = torch.stack([field.pupils for field in fields], 1).numpy()
         signs = np.array(fields[0].signs)
         if self.flux and not self.apart and not has_faces(case):
-            factors, signs = factors[:4], signs[:4]
+            factors = factors[:4]
+            signs = signs[:4]
         else:
             factors = factors * math.sqrt(0.5)
         size = np.abs(factors).max((1, 2, 3))
@@ -95,34 +101,34 @@ class PolarizationMixing:
     def power(
         self, case: PropagationCase, powers: Sequence[float], levels: Tensor
     ) -> float:
-        """Mean over both polarisations of what the pillars let through, from the sums
-        of squares of the maps; of |E|²
-        over the cosine of every ray, as it lies on the plane.
+        """Power behind the pillars, the mean over both polarisations.
 
-        levels: (map, y, x) transmissions.
+        For |E|² the power of each ray is divided by the cosine of its angle.
+
+        Args:
+            case: geometry of the rays.
+            powers: sum of squares of the transmission of each map.
+            levels: (map, y, x) transmissions.
         """
         weights = (0.5, 0.5, 1.0) if self.apart else (1.0,)
         total = 0.0
         for weight, power, level in zip(weights, powers, levels, strict=True):
-            total += (
-                weight
-                * power
-                * (1.0 if self.flux or not power > 0 else self._steep(case, level))
-            )
+            steep = 1.0 if self.flux or not power > 0 else self._steep(case, level)
+            total += weight * power * steep
         return total
 
     def _steep(self, case: PropagationCase, level: Tensor) -> float:
-        """Mean of 1/cos of the rays to the sensor, weighed by the light of the pillars;
-        from means over blocks.
+        """Mean of 1/cos θ of the rays to the sensor, weighted with the pillars' light.
+
+        Computed from means over ``POOLED`` x ``POOLED`` blocks of pillars.
+
+        Args:
+            case: geometry of the rays.
+            level: (y, x) transmission of a map.
         """
         counts = min(POOLED, case.shape[0]), min(POOLED, case.shape[1])
-        light = (
-            torch.nn.functional.adaptive_avg_pool2d(level.detach()[None] ** 2, counts)[
-                0
-            ]
-            .double()
-            .cpu()
-        )
+        pool = torch.nn.functional.adaptive_avg_pool2d
+        light = pool(level.detach()[None] ** 2, counts)[0].double().cpu()
         halves = [
             (n * step) / 2 for n, step in zip(case.shape, case.steps_um, strict=True)
         ]
@@ -145,65 +151,62 @@ def has_faces(case: PropagationCase) -> bool:
 def rays_to(
     case: PropagationCase, at_um: tuple[Array, Array], index: float | None = None
 ) -> Tensor:
-    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's
-    centre, as they reach the sensor, or
-    in a medium of this index.
+    """(3, y, x) unit vectors of the rays from the lens to the window's centre.
 
     Args:
-        case: maps, geometry and window of the propagation.
-        at_um: (points, 2) field points on the sensor, um.
+        case: geometry, media and window of the propagation.
+        at_um: (y,) and (x,) places on the lens, um.
+        index: of the medium in which they are; None for the last, at the sensor.
     """
-    across = at_um[1][None, :] - case.centre_um[0]
-    down = (at_um[0] - case.centre_um[1])[:, None]
+    dx = at_um[1][None, :] - case.centre_um[0]
+    dy = (at_um[0] - case.centre_um[1])[:, None]
     n = index or case.media.order[-1]
-    p, q = (
-        torch.as_tensor(-ray_cosines(case, *at) / n)
-        for at in ((across, down), (down, across))
-    )
+    p, q = (torch.as_tensor(-ray_cosines(case, *at) / n) for at in ((dx, dy), (dy, dx)))
     return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
 
 
 def s_and_p(case: PropagationCase) -> Pupils:
-    """Two components of a scalar's light behind films: light that is s all over, and p,
-    whose mean power is the light;
-    each over the one amplitude that the scalar takes for both, as they reach the
-    window's middle.
+    """Function from places of the lens to the s and p components of light behind films.
+
+    Each is the transmitted amplitude of s or p over the scalar's one amplitude, along
+    the ray to the window's middle. The light is the mean of both powers.
 
     Args:
         case: maps, geometry and window of the propagation.
     """
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
-        b = rays_to(case, (y_um, x_um), 1.0).numpy()  # p = n sin θ
-        return np.ones(2), np.stack(polarized_amplitudes(case, b[0] ** 2 + b[1] ** 2))[
-            :, None
-        ] * math.sqrt(0.5)
+        p = rays_to(case, (y_um, x_um), 1.0).numpy()  # n sin θ
+        both = np.stack(polarized_amplitudes(case, p[0] ** 2 + p[1] ** 2))
+        return np.ones(2), both[:, None] * math.sqrt(0.5)
 
     return components
 
 
 def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> Tensor:
-    """(2 polarisations x 3 components, …) fields in the last medium of rays whose
-    fields in the first are ``electric``.
+    """(6, …) fields of rays in the last medium, from their fields in the first.
 
-    E = √S (E·s) s + √P (E·p) p', times √(cos / cos') to keep |E|² cos θ: s across the
-    plane of the ray, p and p' in it,
-    S and P the powers that pass over the mean of both.
+    E' = √(cos θ / cos θ') (√S (E·s) s + √P (E·p) p'). The unit vector s is normal to
+    the plane of the ray, p and p' lie in it. S and P are transmitted powers over the
+    mean of both, and the root preserves |E|² cos θ.
 
     Args:
-        first: (3, …) directions in the first medium. order: indices of the media.
+        electric: (2 polarisations x 3 components, …) fields in the first medium.
+        first: (3, …) unit vectors of the rays in the first medium.
+        order: indices of the media.
     """
     if len(set(order)) == 1:
         return electric
     w = (first[0] ** 2 + first[1] ** 2) * order[0] ** 2
-    sine, least = torch.sqrt(w), torch.finfo(w.dtype).tiny
-    along_x = torch.stack(
-        [torch.ones_like(w), torch.zeros_like(w)]
-    )  # of the ray along the axis any plane is its own
+    sine = torch.sqrt(w)
+    least = torch.finfo(w.dtype).tiny
+    # a ray along the axis lies in every plane: that of x is used
+    along_x = torch.stack([torch.ones_like(w), torch.zeros_like(w)])
     ux, uy = torch.where(
         sine > least, first[:2] * order[0] / sine.clamp_min(least), along_x
     )
-    steep, cosine = sine / order[-1], torch.sqrt(1 - w / order[-1] ** 2)
+    last_sine = sine / order[-1]
+    cosine = torch.sqrt(1 - w / order[-1] ** 2)
     s_power, p_power = media.passed_apart(order, w)
     both = (s_power + p_power) / 2 * cosine / first[2]
     s_level = torch.sqrt(s_power / both)
@@ -212,57 +215,63 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
     for e in electric.reshape(2, 3, *electric.shape[1:]):
         s = (ux * e[1] - uy * e[0]) * s_level
         p = (first[2] * (ux * e[0] + uy * e[1]) - sine / order[0] * e[2]) * p_level
-        out += [p * cosine * ux - s * uy, p * cosine * uy + s * ux, -p * steep]
+        out += [p * cosine * ux - s * uy, p * cosine * uy + s * ux, -p * last_sine]
     return torch.stack(out)
 
 
 def apart_maps(
     maps: tuple[Tensor, Tensor], fields: NeighbourJonesFactors
 ) -> tuple[Tensor, Tensor]:
-    """(…, wavelength · 3, y, x) phase and transmission of light from x to x, y to y,
-    and between, of (…, wavelength, y,
-    x) maps of pillars with factors ``fields`` on the light that comes."""
-    phase, level = (one.unsqueeze(-3) for one in maps)
+    """(…, wavelength · 3, y, x) phase, rad, and transmission of xx, yy and xy.
+
+    Args:
+        maps: (…, wavelength, y, x) phase and transmission of the pillars.
+        fields: factors of their neighbours on both fields.
+    """
+    phase, level = (part.unsqueeze(-3) for part in maps)
     responses = torch.stack([fields.xx, fields.yy, fields.xy], -3)
-    return (phase + torch.angle(responses)).flatten(-4, -3), (
-        level * responses.abs()
-    ).flatten(-4, -3)
+    phases = phase + torch.angle(responses)
+    levels = level * responses.abs()
+    return phases.flatten(-4, -3), levels.flatten(-4, -3)
 
 
 def transmitted_polarization(a: Tensor, b: Tensor) -> Tensor:
-    """(2 polarisations x 3 components, …) of light of amplitude 1 that a lens turns
-    from the direction a to b.
+    """(6, …) fields of light of amplitude 1 that a lens turns from direction a to b.
+
+    The rotation about a x b takes e, normal to a, to e - (a + b) (e·b) / (1 + a·b). It
+    is divided by √b_z, so that the squares add up to 2 / b_z.
 
     Args:
-        a: (3,) unit vector of the light that comes. b: (3, …) of the rays that leave,
-            both towards the sensor.
+        a: (3,) unit vector of the incident light, towards the sensor.
+        b: (3, …) unit vectors of the rays that leave, towards the sensor.
 
     Returns:
-        x, y, z component of light polarised along x, then along y (both turned to a);
-        squares add up to 2 / b_z.
+        x, y, z component of light polarised along x, then along y (both turned to a).
     """
-    both = (a.reshape(3, *[1] * (b.ndim - 1)) + b) / (
-        1 + torch.einsum("i,i...->...", a, b)
-    )
+    column = 3, *[1] * (b.ndim - 1)
+    both = (a.reshape(column) + b) / (1 + torch.einsum("i,i...->...", a, b))
     out = []
     for e in _polarisations(a):
-        turned = e.reshape(3, *[1] * (b.ndim - 1)) - both * torch.einsum(
-            "i,i...->...", e, b
-        )
+        turned = e.reshape(column) - both * torch.einsum("i,i...->...", e, b)
         out.append(turned / torch.sqrt(b[2]))
     return torch.cat(out)
 
 
 def _polarisations(a: Tensor) -> list[Tensor]:
-    """Two unit vectors across the direction a: x and y turned to it."""
+    """Two unit vectors normal to the direction a: x and y, rotated with z to a."""
     unit = torch.eye(3, dtype=a.dtype, device=a.device)
-    axis, unit = unit[2] + a, unit[:2]
-    return [e - axis * (a @ e) / (1 + a[2]) for e in unit]
+    axis = unit[2] + a
+    return [e - axis * (a @ e) / (1 + a[2]) for e in unit[:2]]
 
 
 def of_flux(electric: Tensor, b: Tensor) -> VectorPupil:
-    """From (2 polarisations x 3 components, …) fields of rays in the directions b (3,
-    …) to those of their flux.
+    """Eight pupils and signs; Σ sign |·|² is the flux E_x H_y - E_y H_x, H = b x E.
+
+    E_x H_y = ((E_x + H_y)² - (E_x - H_y)²) / 4 of each polarisation, and so for y.
+
+    Args:
+        electric: (2 polarisations x 3 components, …) fields of the rays.
+        b: (3, …) unit vectors of the rays.
     """
     parts: list[Tensor] = []
     for e in electric.reshape(2, 3, *electric.shape[1:]):
@@ -272,31 +281,36 @@ def of_flux(electric: Tensor, b: Tensor) -> VectorPupil:
 
 
 def dominant_components(fields: VectorPupil, weight: Tensor, count: int) -> VectorPupil:
-    """Mixtures, ``count`` or all that are not 0, that hold most of the light, whose sum
-    is that of ``weight``².
+    """The ``count`` strongest mixtures of fields, scaled to the light Σ ``weight``².
 
-    With A Aᴴ the products of the fields over the nodes and D their signs, axes y of Aᵀ
-    D A* of eigenvalue λ are pupils
-    √|λ| (A*)⁻¹ y of sign λ. Differentiable in the fields.
+    With A Aᴴ the Gram matrix of the weighted fields and D their signs, an eigenvector y
+    of Aᵀ D A* with eigenvalue λ gives the pupil √|λ| (A*)⁻¹ y of sign λ. Mixtures of no
+    light are left out. The result is differentiable in the fields.
 
     Args:
-        weight: (…) of each node.
+        fields: pupils (components, …) and their signs.
+        weight: (…) amplitude of each node.
+        count: largest number of mixtures.
     """
     light = (fields.pupils.detach() * weight).flatten(1)
     power, axes = torch.linalg.eigh(light @ light.mH)
-    kept = power > NOTHING * power[-1]
-    root = torch.sqrt(power[kept])
+    nonzero = power > NOTHING * power[-1]
+    root = torch.sqrt(power[nonzero])
     signs = torch.tensor(fields.signs, dtype=light.dtype, device=light.device)
-    lit = axes[:, kept] * root
-    inner = lit.mT @ (signs[:, None] * lit.conj())
-    size, turn = torch.linalg.eigh(inner)
-    first = torch.argsort(size.abs(), descending=True)[:count]
-    first = first[size[first].abs() > NOTHING * size.abs().max()]
+    roots = axes[:, nonzero] * root
+    signed_gram = roots.mT @ (signs[:, None] * roots.conj())
+    eigenvalues, eigenvectors = torch.linalg.eigh(signed_gram)
+    strongest = torch.argsort(eigenvalues.abs(), descending=True)[:count]
+    strongest = strongest[
+        eigenvalues[strongest].abs() > NOTHING * eigenvalues.abs().max()
+    ]
     mixture = (
-        (axes[:, kept].conj() / root) @ turn[:, first] * torch.sqrt(size[first].abs())
+        (axes[:, nonzero].conj() / root)
+        @ eigenvectors[:, strongest]
+        * torch.sqrt(eigenvalues[strongest].abs())
     )
-    level = torch.sqrt((weight**2).sum() / size[first].sum())
+    scale = torch.sqrt((weight**2).sum() / eigenvalues[strongest].sum())
     return VectorPupil(
-        level * torch.einsum("dc,d...->c...", mixture, fields.pupils),
-        tuple(torch.sign(size[first]).tolist()),
+        scale * torch.einsum("dc,d...->c...", mixture, fields.pupils),
+        tuple(torch.sign(eigenvalues[strongest]).tolist()),
     )

@@ -46,10 +46,10 @@ class FocusScan:
         i = int(self.peak.argmax())
         if i in (0, len(self.peak) - 1):
             return float(self.shift_um[i])
-        before, here, after = self.peak[i - 1 : i + 2]
+        before, peak, after = self.peak[i - 1 : i + 2]
         step = float(self.shift_um[1] - self.shift_um[0])
-        bend = before - 2 * here + after
-        return float(self.shift_um[i] + step * (before - after) / (2 * bend))
+        curvature = before - 2 * peak + after
+        return float(self.shift_um[i] + step * (before - after) / (2 * curvature))
 
 
 def focus_scan(
@@ -59,32 +59,32 @@ def focus_scan(
     nodes: SpectralNodes | None = None,
     tolerance: float = 1e-3,
 ) -> FocusScan:
-    """PSFs on 21 planes about the sensor, by the angular spectrum of the field there.
+    """PSFs on 21 planes through focus, by the angular spectrum of the field.
 
-    From 1.75 waves of defocus at the rim on one side to as many on the other,
-    ± 3.5 wavelength n / NA², no nearer than half way to the lens. The field on a window
-    of 28 wavelength / NA of the sensor's plane goes on by exp(i kz shift) (Goodman,
+    Planes lie within ± 3.5 wavelength n / NA² of the sensor, 1.75 waves of defocus at
+    the rim, and no farther than half way to the lens. The field on a window of
+    28 wavelength / NA is multiplied by exp(i kz shift) in frequency (Goodman,
     Introduction to Fourier Optics, eq. 3-74).
 
     Args:
-        lens: its design source, on the axis, is looked at.
+        lens: with its design source, on the axis.
         offset_um: (x, y) of the window's middle on the sensor.
         nodes: wavelengths and weights; without them the design wavelength.
         tolerance: relative error of the field on the sensor.
 
-    Accuracy: beside the tolerance, light outside the window (1 % of an Airy pattern) is
-    not followed: 1e-3 of the peak.
+    Accuracy: the tolerance, and 1e-3 of the peak by light outside the window (1 % of an
+    Airy pattern), which is not propagated.
     """
     waves = nodes or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     maps, _ = all_maps(lens, waves, (0.0, 0.0), torch.float64, scalar=True)
     shade = lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
-    turn = torch.from_numpy(np.angle(shade))
-    part = torch.from_numpy(np.abs(shade))
+    stop_phase = torch.from_numpy(np.angle(shade))
+    stop_level = torch.from_numpy(np.abs(shade))
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = sine_aperture(lens, (0.0, 0.0))
-    depth = after.index[0] * lens.wavelength_um / sine**2
-    most = min(2 * RIM_WAVES * depth, after.thickness_um[0] / 2)
-    shifts = np.linspace(-most, most, PLANES)
+    focal_depth = after.index[0] * lens.wavelength_um / sine**2
+    range_um = min(2 * RIM_WAVES * focal_depth, after.thickness_um[0] / 2)
+    shifts = np.linspace(-range_um, range_um, PLANES)
     window = WIDTH * lens.wavelength_um / sine
     step = window / SAMPLES
     light = np.zeros((PLANES, SAMPLES, SAMPLES))
@@ -92,8 +92,8 @@ def focus_scan(
         *maps, waves.wavelengths_um, waves.weights, strict=True
     ):
         field = propagate.windowed(
-            phase + turn,
-            level * part,
+            phase + stop_phase,
+            level * stop_level,
             **lens.diameters.grid._asdict(),
             wavelength_um=float(wave),
             sensor_distance_um=lens.sensor_distance_um,
@@ -116,10 +116,17 @@ def focus_scan(
 
 
 def _shifted(field: Array, step_um: float, frequency: float, shifts_um: Array) -> Array:
-    """(shift, y, x) field on planes further on; ``frequency``: index / wavelength."""
+    """(shift, y, x) field on shifted planes: F⁻¹[exp(i kz shift) F[U]].
+
+    Args:
+        field: (y, x) field U on the sensor.
+        step_um: of its samples.
+        frequency: index / wavelength, 1/um; waves above it do not propagate.
+        shifts_um: (n,) along the axis, away from the lens.
+    """
     f = np.fft.fftfreq(len(field), step_um)
-    square = frequency**2 - f**2 - f[:, None] ** 2
-    kz = 2 * np.pi * np.sqrt(np.maximum(square, 0))
-    spectrum = np.where(square > 0, np.fft.fft2(field), 0)
-    turned = spectrum * np.exp(1j * kz * shifts_um[:, None, None])
-    return np.asarray(np.fft.ifft2(turned))
+    fz2 = frequency**2 - f**2 - f[:, None] ** 2
+    kz = 2 * np.pi * np.sqrt(np.maximum(fz2, 0))
+    spectrum = np.where(fz2 > 0, np.fft.fft2(field), 0)
+    shifted = spectrum * np.exp(1j * kz * shifts_um[:, None, None])
+    return np.asarray(np.fft.ifft2(shifted))
