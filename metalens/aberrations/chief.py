@@ -85,13 +85,8 @@ def chief_ray(
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     p_square = float(p @ p)
     if p_square >= 0.999 * after.layers[0][0] ** 2:
-        raise PropagationError(
-            _failure_text(
-                lens,
-                angle_rad,
-                f"leaves with n sin θ = {math.sqrt(p_square):.3f}, beyond the media",
-            )
-        )
+        why = f"leaves with n sin θ = {math.sqrt(p_square):.3f}, beyond the media"
+        raise PropagationError(_failure_text(lens, angle_rad, why))
     q = curvature + _jacobian(
         lambda x: _incident_direction(lens, x, source, depth_um), at, 1.0
     )
@@ -243,22 +238,39 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
 def _wave_front(
     lens: Lens, at: Array, angle_rad: tuple[float, float]
 ) -> tuple[Array, Array, list[Array]]:
-    """Slope (2,) and curvature (2, 2) of the pillars' phase over k about a place, and
-    changes of the curvature whose
-    squares add up to its variance."""
+    """Slope and curvature of the pillars' phase over k around a place, with errors.
+
+    A polynomial of 4th order is fitted to the phases of a patch of pillars. Its scatter
+    and the fit's covariance give the errors.
+
+    Args:
+        lens: the lens.
+        at: (2,) place on the pillars, um.
+        angle_rad: (x, y) field angle, rad.
+
+    Returns:
+        (2,) slope, (2, 2) curvature per um, and changes of the curvature whose squares
+        add up to its variance.
+
+    Raises:
+        PropagationError: too few pillars around the place, or a phase that is no wave
+            front.
+    """
     focal = 1 / (1 / lens.reduced_um + 1 / lens.source_distance_um)
-    k, site = 2 * math.pi / lens.wavelength_um, lens.diameters.site_um2
+    k = 2 * math.pi / lens.wavelength_um
+    site = lens.diameters.site_um2
     radius = max(
         ZONES * math.sqrt(lens.wavelength_um * focal),
         math.sqrt(2 * LEAST * site / math.pi),
     )
     x, y, phase, inside = _patch(lens, at, radius, library_incidence(lens, angle_rad))
     sites = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
-    wanted, count = max(sites, LEAST), np.count_nonzero(inside)
-    if count < wanted:
+    least = max(sites, LEAST)
+    count = np.count_nonzero(inside)
+    if count < least:
         why = (
             f"comes to the pillars' plane at ({at[0]:.1f}, {at[1]:.1f}) um, where the "
-            f"lens has {count} pillars; need {wanted:.0f} about it"
+            f"lens has {count} pillars; need {least:.0f} about it"
         )
         raise PropagationError(_failure_text(lens, angle_rad, why))
     phasors = np.where(inside, np.exp(1j * phase), 0.0)
@@ -271,19 +283,11 @@ def _wave_front(
     terms = np.stack(
         [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
     )[inside]
-    series, scatter = _fit_polynomial(
-        terms,
-        phasors[inside],
-        {(i, j): c * radius ** (i + j) for (i, j), c in guess.items()},
-    )
+    scaled = {(i, j): c * radius ** (i + j) for (i, j), c in guess.items()}
+    series, scatter = _fit_polynomial(terms, phasors[inside], scaled)
     if scatter > ROUGH:
-        raise PropagationError(
-            _failure_text(
-                lens,
-                angle_rad,
-                f"meets no wave front: phases scatter by {scatter:.2f} rad rms",
-            )
-        )
+        why = f"meets no wave front: phases scatter by {scatter:.2f} rad rms"
+        raise PropagationError(_failure_text(lens, angle_rad, why))
     by_power = dict(zip(POWERS, series / k, strict=True))
     slope = np.array([by_power[1, 0], by_power[0, 1]]) / radius
     deviation_columns = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
@@ -294,10 +298,12 @@ def _wave_front(
     return slope, _curvature(by_power, radius), deviations
 
 
-def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
+def _curvature(by_power: dict[tuple[int, int], float], radius: float) -> Array:
     """(2, 2) second derivatives at 0 of a polynomial in place / radius, per um²."""
-    mixed = named[1, 1]
-    return np.array([[2 * named[2, 0], mixed], [mixed, 2 * named[0, 2]]]) / radius**2
+    mixed = by_power[1, 1]
+    return (
+        np.array([[2 * by_power[2, 0], mixed], [mixed, 2 * by_power[0, 2]]]) / radius**2
+    )
 
 
 def _patch(
