@@ -166,13 +166,23 @@ class DesignSettings:
         )
 
     def at(self, held_um: Iterable[float]) -> "DesignSettings":
-        """The same, its wavelength filled in from those that the library holds."""
-        only = {round(1e3 * wave, 6) for wave in held_um}
-        default = only.pop() if len(only) == 1 else _WAVELENGTH_NM
+        """Settings with the wavelength filled in from those that the library holds.
+
+        That of a library of one wavelength, else 850 nm; a stated wavelength stays.
+
+        Args:
+            held_um: wavelengths of the library, um.
+        """
+        held_nm = {round(1e3 * wave, 6) for wave in held_um}
+        default = held_nm.pop() if len(held_nm) == 1 else _WAVELENGTH_NM
         return replace(self, wavelength_nm=self.wavelength_nm or default)
 
     def phase(self, folder: Path) -> PhaseOf:
-        """Wanted phase of a profile that needs no search; files lie below ``folder``."""
+        """Target phase of a profile that needs no search, as a function of position.
+
+        Args:
+            folder: that file names are relative to.
+        """
         shapes: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
             "double-helix": self.double_helix,
             "cubic": self.cubic,
@@ -184,8 +194,8 @@ class DesignSettings:
 
     def along(self, target: "YPolarizationTarget") -> "DesignSettings":
         """The same lens with the target of light along y."""
-        given = {f.name: getattr(target, f.name) for f in fields(target)}
-        return replace(self, **given, along_y=None)
+        values = {f.name: getattr(target, f.name) for f in fields(target)}
+        return replace(self, **values, along_y=None)
 
     def at_wavelength(self, light: "AdditionalWavelength") -> "DesignSettings":
         """The same lens with the target of another wavelength."""
@@ -223,39 +233,46 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Design the lens, check its focus, write it; exit 1 where light does not focus as
-    it should or the pillars' own errors are large.
+    """Design the lens, check its focus and write it.
+
+    Exit status 1 where light does not focus as it should or the pillars' own errors are
+    large.
 
     Args:
         options: of the command line.
+
+    Raises:
+        ConfigError: settings that need another library.
     """
-    wanted = config.load(options.config, DesignSettings, empty=False)
+    settings = config.load(options.config, DesignSettings, empty=False)
     folder, target = options.config.parent, options.output
-    path = None if wanted.library is None else folder / wanted.library
-    two_sizes = path is not None and _is_two_size_library(path)
-    maps = [one.map for one in (wanted, wanted.along_y) if one and one.map]
-    read = [*([path] if path else []), *(folder / one.file for one in maps)]
-    if two_sizes and (options.own_cell or wanted.wavelengths):
+    path = None if settings.library is None else folder / settings.library
+    two_size = path is not None and _is_two_size_library(path)
+    maps = [one.map for one in (settings, settings.along_y) if one and one.map]
+    inputs = [*([path] if path else []), *(folder / shape.file for shape in maps)]
+    if two_size and (options.own_cell or settings.wavelengths):
         raise ConfigError(
             "own_cell: rows of pillars of two sizes are not solved; leave --own-cell out"
             if options.own_cell
             else "wavelengths: need a library of pillars of one size; this one is over "
             "two (lengths_um)"
         )
-    if wanted.along_y is not None and not two_sizes:
+    if settings.along_y is not None and not two_size:
         raise ConfigError(
             "along_y: one phase for x and one for y need a library over two sizes "
             "(lengths_um); give it"
         )
-    ends = (".png",) if two_sizes else (".png", "_fisher.png")
-    with options.claim(target, companions=ends, inputs=read) as draft:
-        make = _design_two_sizes if two_sizes else _design_one_size
-        made, wanted, values, notes, checks = make(wanted, options, draft.path)
-        lens.save(draft.path, made)
-        write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(made))
+    ends = (".png",) if two_size else (".png", "_fisher.png")
+    with options.claim(target, companions=ends, inputs=inputs) as draft:
+        design_lens = _design_two_sizes if two_size else _design_one_size
+        designed, settings, values, notes, checks = design_lens(
+            settings, options, draft.path
+        )
+        lens.save(draft.path, designed)
+        write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(designed))
     title = (
-        f"{target}: {wanted.profile} lens of {values['pillars']:,} pillars, "
-        f"{wanted.aperture_mm} mm, {1e3 * made.wavelength_um:g} nm"
+        f"{target}: {settings.profile} lens of {values['pillars']:,} pillars, "
+        f"{settings.aperture_mm} mm, {1e3 * designed.wavelength_um:g} nm"
     )
     failures = [
         f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a "
@@ -263,60 +280,86 @@ def run(options: Options) -> int:
         for check in checks
         if check is not None and not check.passed
     ]
-    doubt = "" if two_sizes else made.proxy.doubt
+    doubt = "" if two_size else designed.proxy.doubt
     return options.console.report(
         title, values, notes=notes, failures=[*failures, doubt]
     )
 
 
+# lens, settings as filled in, values for JSON, notes, and checks of the foci
 _Outcome = tuple[
     Lens, DesignSettings, dict[str, Any], list[str], Sequence[FocusCheck | None]
-]  # with the settings as filled in, the values, notes and checks of the foci
+]
 
 
 def _design_two_sizes(
     wanted: DesignSettings, options: Options, draft: Path
 ) -> _Outcome:
-    """A lens of pillars of two sizes, for light along x and along y."""
+    """Design a lens of pillars of two sizes, for light along x and along y.
+
+    Args:
+        wanted: settings of the design.
+        options: of the command line.
+        draft: file that will be written, for pictures beside it.
+
+    Returns:
+        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+    """
     path = options.config.parent / (wanted.library or "")
-    pillars, inputs = axes.load(path), {path.name: store.sha256(path)}
+    pillars = axes.load(path)
+    inputs = {path.name: store.sha256(path)}
     wanted = wanted.at(pillars.wavelength_um.tolist())
     pillars.at(wanted.focus.wavelength_um)
     wanted = _fill_limits(wanted, options, pillars.cell, inputs)
     phase, focus, _ = _find_phase(wanted, options, draft)
-    other: tuple[PhaseOf | None, Focus] = None, focus
+    phase_y: PhaseOf | None = None
+    focus_y = focus
     if wanted.along_y is not None:
         target = wanted.along(wanted.along_y)
-        other = target.phase(options.config.parent), target.focus
-    made, split = design.assign_polarization_multiplexed(
-        (phase, other[0]), (focus, other[1]), library=pillars, **_common(wanted, inputs)
+        phase_y = target.phase(options.config.parent)
+        focus_y = target.focus
+    designed, metrics = design.assign_polarization_multiplexed(
+        (phase, phase_y), (focus, focus_y), library=pillars, **_common(wanted, inputs)
     )
     values: dict[str, Any] = {
-        "pillars": split.x.pillars,
-        "pairs_of_sizes": split.pairs,
-        "multiplexed": split.multiplexed,
-        "covered": split.covered,
+        "pillars": metrics.x.pillars,
+        "pairs_of_sizes": metrics.pairs,
+        "multiplexed": metrics.multiplexed,
+        "covered": metrics.covered,
     }
     checks: list[FocusCheck | None] = []
     lights: tuple[Literal["x", "y"], ...] = ("x", "y")
     profiles = wanted.profile, (wanted.along_y or wanted).profile
-    for place, light in enumerate(lights):
-        quality, seen = (split.x, split.y)[place], made.seen(light)
-        hyperbolic = profiles[place] == "hyperbolic"
-        check = _check(seen, quality, options, wanted=hyperbolic)
+    for i, light in enumerate(lights):
+        quality = (metrics.x, metrics.y)[i]
+        polarised = designed.seen(light)
+        hyperbolic = profiles[i] == "hyperbolic"
+        check = _check(polarised, quality, options, wanted=hyperbolic)
         checks.append(check)
-        own = _summarize(seen, quality, check)
+        own = _summarize(polarised, quality, check)
         del own["turns"]  # of a single diameter
         values[f"along_{light}"] = own | {
-            "wavefront_efficiency_error": split.wavefront_efficiency_error[place],
-            "leaked": split.leaked[place],
+            "wavefront_efficiency_error": metrics.wavefront_efficiency_error[i],
+            "leaked": metrics.leaked[i],
         }
     lost = describe_order_loss(pillars.cell, wanted.focus.wavelength_um)
-    return made, wanted, values, [lost], checks
+    return designed, wanted, values, [lost], checks
 
 
 def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _Outcome:
-    """A lens of pillars of one size: at one wavelength or several, or rotated."""
+    """Design a lens of pillars of one size: at one wavelength or several, or rotated.
+
+    Args:
+        wanted: settings of the design.
+        options: of the command line.
+        draft: file that will be written, for pictures beside it.
+
+    Returns:
+        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+
+    Raises:
+        ConfigError: several wavelengths of rotated pillars.
+    """
     pillars, inputs = _pillars(wanted, options.config.parent, options.console)
     cell = pillars.cell
     proxy = library.proxy_of(pillars)
@@ -329,7 +372,7 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
     if wanted.profile == "map" and wanted.map and (folder / wanted.map.file).is_file():
         inputs[wanted.map.file.name] = store.sha256(folder / wanted.map.file)
     phase, focus, values = _find_phase(wanted, options, draft)
-    about = _common(wanted, inputs)
+    common = _common(wanted, inputs)
     rotated = pillars.turned is not None
     targets: list[DesignSettings] = []
     others: list[Quality] = []
@@ -345,18 +388,18 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
             design.WavelengthTarget(one.phase(folder), one.focus, weight)
             for one, weight in zip([wanted, *targets], [1.0, *weights], strict=True)
         ]
-        made, (quality, *others) = design.assign_multi_wavelength(
-            lights, cell=cell, proxy=proxy, **about
+        designed, (quality, *others) = design.assign_multi_wavelength(
+            lights, cell=cell, proxy=proxy, **common
         )
     elif rotated:
-        made, quality, conversion = design.assign_geometric_phase(
-            phase, focus, library=pillars, hand=wanted.hand, **about
+        designed, quality, conversion = design.assign_geometric_phase(
+            phase, focus, library=pillars, hand=wanted.hand, **common
         )
         values["circular"] = {"hand": wanted.hand, **asdict(conversion)}
     else:
         partial = options.accept_partial_turn
-        made, quality = design.make(
-            phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about
+        designed, quality = design.make(
+            phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **common
         )
     radius_um = wanted.aperture_mm * 500
     notes = [describe_order_loss(cell, focus.wavelength_um)]
@@ -367,32 +410,34 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
         quality = replace(quality, focuses=meets)
         if not meets:
             notes.append(_meeting_note(phase, focus, radius_um, cell))
-    if made.one_light:
+    if designed.one_light:
         notes.append(
-            f"for {made.one_light} only: {cell.described} has another response for x "
+            f"for {designed.one_light} only: {cell.described} has another response for x "
             "and y (lengths_um in [sweep] makes a library for both)"
         )
-    made, coupling = _couple(made, quality, radius_um, options, rotated=rotated)
+    designed, coupling = _couple(designed, quality, radius_um, options, rotated=rotated)
     checkable = wanted.profile == "hyperbolic"
     expected = quality.strehl if others else 1.0
-    check = _check(made, quality, options, wanted=checkable, expected=expected)
-    values = _summarize(made, quality, check) | values
+    check = _check(designed, quality, options, wanted=checkable, expected=expected)
+    values = _summarize(designed, quality, check) | values
     if coupling is not None:
         values["neighbours"] = asdict(coupling)
-    checks, several = [check], []
+    checks, by_wavelength = [check], []
     for light, target, one in zip(wanted.wavelengths, targets, others, strict=True):
-        seen = replace(
-            made,
+        at_wavelength = replace(
+            designed,
             wavelength_um=target.focus.wavelength_um,
             sensor_distance_um=target.focus.sensor_distance_um,
             source_distance_um=target.focus.source_distance_um,
         )
-        check = _check(seen, one, options, wanted=checkable, expected=one.strehl)
+        check = _check(
+            at_wavelength, one, options, wanted=checkable, expected=one.strehl
+        )
         checks.append(check)
         named = {"wavelength_nm": light.wavelength_nm, "weight": light.weight}
-        several.append(named | _summarize(seen, one, check))
-    if several:
-        values["wavelengths"] = several
+        by_wavelength.append(named | _summarize(at_wavelength, one, check))
+    if by_wavelength:
+        values["wavelengths"] = by_wavelength
     elif quality.turns < 1:
         hint = design.phase_coverage_hint(proxy, cell, wanted.limits, quality.turns)
         notes.append(f"for a whole turn: {hint}")
@@ -405,9 +450,9 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
         "proxy_phase_error_rad": proxy.max_phase_error_rad,
         "proxy_transmission_error": proxy.max_transmission_error,
         "entry_error": proxy.entry_error,
-        "loss": pillars.mean_loss(made.diameters.diameter_um, focus.wavelength_um),
+        "loss": pillars.mean_loss(designed.diameters.diameter_um, focus.wavelength_um),
     }
-    return made, wanted, values, notes, checks
+    return designed, wanted, values, notes, checks
 
 
 def _is_two_size_library(path: Path) -> bool:
@@ -427,8 +472,17 @@ def _common(wanted: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
 def _fill_limits(
     wanted: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
 ) -> DesignSettings:
-    """The limits of a process file (by a package above this one that the command line
-    names), the gap behind the pillars filled by the cover; notes the files read.
+    """Settings with the limits of a process file, and the cell's cover behind the
+    pillars.
+
+    The process file is read by a package above this one. Hashes of the files that are
+    read are added to ``inputs``.
+
+    Args:
+        wanted: settings of the design.
+        options: of the command line.
+        cell: unit cell of the pillars.
+        inputs: SHA-256 by file name.
     """
     inputs[options.config.name] = store.sha256(options.config)
     layers = wanted.layers.covered_by(cell.cover)
@@ -458,8 +512,15 @@ def _pillars(
 def _find_phase(
     wanted: DesignSettings, options: Options, draft: Path
 ) -> tuple[PhaseOf, Focus, dict[str, Any]]:
-    """The phase of the profile, what it images onto what, and for a free form made for
-    axial information the comparison with simple lenses, whose picture it writes.
+    """Target phase of the profile, its focus, and the comparison of a free form.
+
+    A free form for axial information is compared with simple lenses; the comparison is
+    returned for JSON and its picture is written.
+
+    Args:
+        wanted: settings of the design.
+        options: of the command line.
+        draft: lens file that will be written; the picture is NAME_fisher.png.
     """
     if wanted.profile != "fisher":
         return wanted.phase(options.config.parent), wanted.focus, {}
@@ -472,20 +533,20 @@ def _find_phase(
     scenes = settings.objective == "scenes"
     objective = load_above("scenes").SceneObjective(pupil, settings) if scenes else None
     console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
-    phase, found = fisher_profile(
+    phase, free_form = fisher_profile(
         wanted.focus, radius_um=radius_um, settings=settings, objective=objective
     )
-    mean = float(found.score.information.mean())
+    mean = float(free_form.score.information.mean())
     goal = f"Eq. 6 {-mean:.3f} (0 without blur)" if scenes else f"I(z) {mean:.3f} /mm²"
-    least = float(found.score.encircled.min())
+    least = float(free_form.score.encircled.min())
     console.say(
-        f"free form: {goal}, encircled energy {least:.2f} or more; {found.reason}"
+        f"free form: {goal}, encircled energy {least:.2f} or more; {free_form.reason}"
     )
-    focus = replace(wanted.focus, source_distance_um=found.focus_um)
+    focus = replace(wanted.focus, source_distance_um=free_form.focus_um)
     if scenes:
         return phase, focus, {}
     console.say("tuning a hyperbolic lens and a double helix for the same task")
-    lenses = reports.judge_designs(found, pupil, settings)
+    lenses = reports.judge_designs(free_form, pupil, settings)
     picture = reports.report_picture(lenses, pupil, settings)
     write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
     return phase, focus, {"fisher": reports.report_values(lenses, settings)}
@@ -516,8 +577,19 @@ def format_place(at_um: tuple[float, float, float]) -> str:
 def _couple(
     made: Lens, quality: Quality, radius_um: float, options: Options, *, rotated: bool
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
-    """The lens, with its rows solved where asked for, and the loss by neighbour
-    coupling; None where there is no such number.
+    """The lens with its solved rows where asked for, and its neighbour coupling loss.
+
+    None for rotated pillars and phases without a focus.
+
+    Args:
+        made: the lens.
+        quality: of its pillars.
+        radius_um: radius of the aperture.
+        options: of the command line.
+        rotated: whether its phase is geometric.
+
+    Raises:
+        ConfigError: rows are asked for where there are none.
     """
     if rotated or not quality.focuses:
         if options.own_cell:
@@ -541,7 +613,15 @@ def _check(
     wanted: bool,
     expected: float = 1.0,
 ) -> FocusCheck | None:
-    """The exact sum around the focus, where the profile has one and it is asked for."""
+    """Exact diffraction sum around the focus; None where it is left out.
+
+    Args:
+        made: the lens.
+        quality: of its pillars.
+        options: of the command line.
+        wanted: whether the profile has a focus to check.
+        expected: Strehl ratio that the phase errors leave.
+    """
     if options.skip_focus_check or not wanted:
         return None
     if quality.pillars > MOST_SUMMED:
@@ -553,10 +633,15 @@ def _check(
 def _summarize(
     made: Lens, quality: Quality, check: FocusCheck | None
 ) -> dict[str, Any]:
-    """Quality of a lens, its PSF and its focus; None for what JSON does not know.
+    """Quality of a lens, of its PSF and of its focus, for JSON; None for nan.
 
     The PSF is left out of a phase without a focus, of a lens of more pillars than fit
     in memory at once, and where torch is not installed.
+
+    Args:
+        made: the lens.
+        quality: of its pillars.
+        check: of its focus; None without.
     """
     values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
     if quality.focuses:
@@ -594,12 +679,12 @@ def _summarize(
 
 
 def _of_psf(figures: Any) -> dict[str, Any]:
-    """Focusing efficiency and widths of the PSF of the design source."""
+    """Figures of the PSF of the design source for JSON; None for nan."""
     names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
-    found = {name: getattr(figures, name) for name in names}
-    found |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
+    values = {name: getattr(figures, name) for name in names}
+    values |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
     plain = {
         name: None if isinstance(v, float) and math.isnan(v) else v
-        for name, v in found.items()
+        for name, v in values.items()
     }
     return plain | {"diffraction_limit": asdict(figures.limit)}

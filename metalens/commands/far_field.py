@@ -54,10 +54,11 @@ class FarFieldRequest:
 
 
 def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
-    """Of the options of ``metalens psf``.
+    """The request of the options of ``metalens psf --far-field``.
 
     Args:
-        made: what was designed or computed.
+        options: of the command line.
+        made: the lens, whose wavelength is the default.
 
     Raises:
         ConfigError: an option that says nothing of a far field, or more than one depth
@@ -69,17 +70,19 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
             raise ConfigError(
                 f"{field.name}: not for a far field, which takes {', '.join(TAKES[:5])}"
             )
-    (source, *sources) = options.sources_mm or (math.inf,)
-    (wave, *waves) = options.wavelengths_nm or (1e3 * made.wavelength_um,)
+    sources = options.sources_mm or (math.inf,)
+    waves = options.wavelengths_nm or (1e3 * made.wavelength_um,)
     along_x = options.angles_deg or (0.0,)
     along_y = options.angles_y_deg or (0.0,) * len(along_x)
-    if sources or waves or len(along_x) != len(along_y):
+    if len(sources) > 1 or len(waves) > 1 or len(along_x) != len(along_y):
         raise ConfigError(
             f"sources_mm = {options.sources_mm}, wavelengths_nm = "
             f"{options.wavelengths_nm}, {len(along_x)} angles along x, {len(along_y)} "
             "along y: a far field takes one depth, one wavelength, and as many angles "
             "along y as along x"
         )
+    source = sources[0]
+    wave = waves[0]
     tilted = max(map(abs, (*along_x, *along_y)))
     if not (source > 0 and 0 < wave < math.inf and tilted < 90):
         raise ConfigError(
@@ -96,12 +99,13 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
 def compute_far_fields(
     made: lens.Lens, wanted: FarFieldRequest, console: Console
 ) -> list["FarField"]:
-    """One far field a direction of incidence; of pillars of two sizes the light along x
-    that the lens is for.
+    """One far field for each direction of incidence.
+
+    Of pillars of two sizes for the polarisation along x.
 
     Args:
-        made: what was designed or computed.
-        wanted: what the command asks for.
+        made: the lens.
+        wanted: directions, source distance, wavelength and samples.
         console: of the command.
     """
     directions = console.track(
@@ -127,28 +131,26 @@ def save_far_fields(
     inputs: dict[str, str],
     page: bool,
 ) -> None:
-    """The file of kind ``far-field``, its picture beside it, and with ``page`` its
-    report.
+    """Write the file of kind ``far-field``, its picture, and with ``page`` its report.
 
     Args:
-        path: file to read or write.
-        wanted: what the command asks for.
-        found: what was computed.
+        path: file to write.
+        wanted: the request, kept in the file.
+        found: far field of each direction.
         inputs: SHA-256 of each input file.
+        page: whether to write NAME.html.
     """
+    beams = [
+        (i, b.sine_x, b.sine_y, b.share)
+        for i, one in enumerate(found)
+        for b in one.beams
+    ]
     arrays = {
         "share": np.stack([one.share for one in found]).astype(np.float32),
         "sine": found[0].sines,
         "rings": np.stack([one.rings for one in found]),
         "angles_deg": np.array(wanted.angles_deg),
-        "beams": np.array(
-            [
-                (i, b.sine_x, b.sine_y, b.share)
-                for i, one in enumerate(found)
-                for b in one.beams
-            ],
-            float,
-        ).reshape(-1, 4),
+        "beams": np.array(beams, float).reshape(-1, 4),
         "beyond": np.array([one.beyond for one in found]),
         "transmitted": np.array([one.transmitted for one in found]),
         "error": np.array([one.error for one in found]),
@@ -174,11 +176,11 @@ def save_far_fields(
 def far_field_values(
     wanted: FarFieldRequest, found: list["FarField"]
 ) -> dict[str, Any]:
-    """Numbers for programs.
+    """Result of the command as a dictionary for JSON.
 
     Args:
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     fields = [
         {
@@ -203,12 +205,13 @@ def far_field_values(
 def far_field_text(
     target: Path, wanted: FarFieldRequest, found: list["FarField"]
 ) -> str:
-    """Lines for people.
+    """Result of the command in words: light that passes, cones and beams of each
+    direction.
 
     Args:
         target: output file.
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     source = (
         "plane waves"
@@ -233,10 +236,11 @@ def far_field_text(
             f"{b.sine_y:+.5f})"
             for b in one.beams
         ] or ["    no direction holds 1 % of it"]
-    return "\n".join([*lines, f"  {_counted(found[0])}"])
+    return "\n".join([*lines, f"  {_beam_note(found[0])}"])
 
 
-def _counted(one: "FarField") -> str:
+def _beam_note(one: "FarField") -> str:
+    """What a beam is in words, and the largest sine that the lattice samples."""
     limit = (
         ""
         if one.steepest >= 1
@@ -249,20 +253,22 @@ def _counted(one: "FarField") -> str:
 
 
 def _cone(one: "FarField", part: float) -> float | None:
-    """Angle about the axis in deg that holds a part of the transmitted light; None
-    where none does.
+    """Half angle in deg of the cone about the axis with a share of the transmitted
+    light.
+
+    None where no cone has it.
     """
     sine = one.within_sine(part)
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
 def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes:
-    """Light over direction cosines on a logarithmic scale (above), and within cones
-    about the axis (below).
+    """PNG of the light over direction cosines (log scale), and within cones about the
+    axis.
 
     Args:
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     from matplotlib.colors import LogNorm
 
@@ -303,6 +309,7 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
 def _report(
     path: Path, wanted: FarFieldRequest, found: list["FarField"], image: bytes
 ) -> None:
+    """Write the report: the picture of directions and the table of beams."""
     rows = [
         [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
         for (x, y), one in zip(wanted.angles_deg, found, strict=True)
@@ -310,7 +317,7 @@ def _report(
     ]
     words = "Light far behind the lens over direction cosines, +x right and +y down; below, what cones hold."
     caption = (
-        f"Shares are of the light that the pillars let through; {_counted(found[0])}."
+        f"Shares are of the light that the pillars let through; {_beam_note(found[0])}."
     )
     keys = [KeyFigure("relative error", f"{max(one.error for one in found):.1g}", True)]
     keys += [KeyFigure("of the light passes", f"{found[0].transmitted:.3f}")]

@@ -37,7 +37,7 @@ from metalens.library import (
 )
 from metalens.library import fit as proxy_fit
 
-LEAST_USABLE = 0.5  # of the pairs of sizes, below which a library is no library
+LEAST_USABLE = 0.5  # least share of usable pairs of sizes in a library
 NM = 1e3
 MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
@@ -79,48 +79,55 @@ class Options(DistributedOptions):
 
 
 def run(options: Options) -> int:
-    """Sweep, fit, write; exit 1 where an error bar misses the tolerance that is stated
-    or no full turn is covered.
+    """Sweep the pillar cell, fit the proxy and write the library.
+
+    Exit status 1 where an error bar misses the stated tolerance or no full turn is
+    covered.
 
     Args:
         options: of the command line.
     """
     if options.cell is not None:
         return _import_table(options, options.cell)
-    wanted = config.load(options.config, CellFile, empty=False)
-    if wanted.sweep.lengths_um is not None:
-        axes.check_axes_sweep(wanted.cell, wanted.sweep)
-        return _run_two_sizes(options, wanted)
-    library.check_sweep(wanted.cell, wanted.sweep)
+    settings = config.load(options.config, CellFile, empty=False)
+    if settings.sweep.lengths_um is not None:
+        axes.check_axes_sweep(settings.cell, settings.sweep)
+        return _run_two_sizes(options, settings)
+    library.check_sweep(settings.cell, settings.sweep)
     target = options.output
-    inputs = _inputs(options.config, wanted.cell)
+    inputs = _inputs(options.config, settings.cell)
     with options.claim(target, companions=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
-        made = library.sweep(
-            wanted.cell, wanted.sweep, console=options.console, checkpoint=journal
+        swept = library.sweep(
+            settings.cell, settings.sweep, console=options.console, checkpoint=journal
         )
         seconds = time.perf_counter() - start
-        if wanted.sweep.light == "circular":
-            made = library.with_rotations(made)
-        return _finish(options, draft.path, made, wanted, inputs, seconds)
+        if settings.sweep.light == "circular":
+            swept = library.with_rotations(swept)
+        return _finish(options, draft.path, swept, settings, inputs, seconds)
 
 
 def _import_table(options: Options, cell_file: Path) -> int:
-    """The library of a table."""
-    wanted = config.load(cell_file, CellFile, empty=False)
-    made = library.from_table(
+    """Write the library of a unit-cell table of another solver; the exit status.
+
+    Args:
+        options: of the command line, with the table in ``config``.
+        cell_file: CELL.toml of its cell.
+    """
+    settings = config.load(cell_file, CellFile, empty=False)
+    imported = library.from_table(
         options.config,
-        wanted.cell,
+        settings.cell,
         columns=options.columns,
-        wavelength_um=wanted.sweep.wavelengths_um[0],
+        wavelength_um=settings.sweep.wavelengths_um[0],
     )
-    wanted = dataclasses.replace(wanted, sweep=made.sweep)
-    inputs = _inputs(cell_file, wanted.cell) | {
+    settings = dataclasses.replace(settings, sweep=imported.sweep)
+    inputs = _inputs(cell_file, settings.cell) | {
         options.config.name: store.sha256(options.config)
     }
     with options.claim(options.output, companions=(".png",)) as draft:
-        return _finish(options, draft.path, made, wanted, inputs, 0.0)
+        return _finish(options, draft.path, imported, settings, inputs, 0.0)
 
 
 def _finish(
@@ -131,14 +138,24 @@ def _finish(
     inputs: dict[str, str],
     seconds: float,
 ) -> int:
-    """Fit the proxy, write the library to ``path``, draw and judge it."""
+    """Fit the proxy, write the library, draw and judge it; the exit status.
+
+    Args:
+        options: of the command line.
+        path: of the file to write.
+        made: the library without proxy.
+        wanted: settings of CELL.toml.
+        inputs: SHA-256 of each input file.
+        seconds: time of the sweep.
+    """
     fitted, refusal = _fit(made, wanted.proxy)
-    notes = made.notes + (
-        (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
-    )
-    about = store.Provenance(config.dumps(wanted), inputs)
+    if fitted:
+        notes = (*made.notes, *fitted.notes, *filter(None, [fitted.shortfall]))
+    else:
+        notes = (*made.notes, refusal)
+    provenance = store.Provenance(config.dumps(wanted), inputs)
     made = dataclasses.replace(
-        made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about
+        made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=provenance
     )
     library.save(path, made)
     _draw(path, made, fitted)
@@ -162,6 +179,7 @@ def _inputs(path: Path, cell: Cell) -> dict[str, str]:
 
 
 def _fit(made: PillarLibrary, wanted: ProxyTolerances) -> tuple[ProxyFit | None, str]:
+    """The fitted proxy and "", or None and why there is none."""
     try:
         return proxy_fit.fit(made, wanted), ""
     except DomainError as refused:
@@ -182,6 +200,15 @@ def _failures(
     stated: bool,
     accept_partial_turn: bool = False,
 ) -> list[str]:
+    """Reasons for exit status 1, in words: error bars, phase coverage, conversion.
+
+    Args:
+        made: the library.
+        fitted: its proxy; None where none fits.
+        refusal: why none fits.
+        stated: whether the tolerance of the error bars was stated.
+        accept_partial_turn: whether less than a full turn of phase is no failure.
+    """
     failures = []
     if stated and not made.converged:
         failures.append(
@@ -205,9 +232,10 @@ def _failures(
         failures.append(
             f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: {cure}"
         )
-    if (hardly := float((made.t_error > MOST_ERROR).mean())) > MOST_UNKNOWN:
+    unknown = float((made.t_error > MOST_ERROR).mean())
+    if unknown > MOST_UNKNOWN:
         failures.append(
-            f"error bars of {hardly:.0%} of the entries are above {MOST_ERROR:g}, whatever is asked for"
+            f"error bars of {unknown:.0%} of the entries are above {MOST_ERROR:g}, whatever is asked for"
         )
     if fitted is not None:
         failures += filter(None, [fitted.shortfall, fitted.proxy.doubt])
@@ -222,7 +250,7 @@ def _failures(
 
 
 def _above(made: PillarLibrary) -> str:
-    """How many error bars miss the tolerance, in words."""
+    """Number of error bars above the tolerance and the largest, in words."""
     missed = made.t_error > made.sweep.bar
     return (
         f"{int(missed.sum())} of {missed.size} error bars are above the tolerance {made.sweep.bar:g} "
@@ -233,6 +261,13 @@ def _above(made: PillarLibrary) -> str:
 def _values(
     made: PillarLibrary, fitted: ProxyFit | None, seconds: float
 ) -> dict[str, Any]:
+    """Result of a sweep as a dictionary for JSON.
+
+    Args:
+        made: the library.
+        fitted: its proxy; None where none fits.
+        seconds: time of the sweep.
+    """
     values: dict[str, Any] = {
         "engine": made.engine,
         "entries": made.t.size,
@@ -273,6 +308,15 @@ def _text(
     seconds: float,
     failures: list[str],
 ) -> str:
+    """Result of a sweep in words: effort, time and error of sweep and proxy.
+
+    Args:
+        target: output file.
+        made: the library.
+        fitted: its proxy; None where none fits.
+        seconds: time of the sweep.
+        failures: reasons for exit status 1.
+    """
     each = 1e3 * seconds / max(1, made.solves)
     effort = (
         f"  sweep    {made.solves:4d} solves ({made.engine}, {each:.0f} ms each)   {seconds:6.1f} s    "
@@ -310,7 +354,7 @@ def _text(
         lines.append(
             "  all of it for light along x: these pillars answer light along y otherwise"
         )
-        lines += _elsewhere(made)
+        lines += _cross_polarised_lines(made)
     return "\n".join(lines)
 
 
@@ -322,7 +366,7 @@ def _orders(made: PillarLibrary) -> tuple[DiffractionOrder, ...]:
 
 
 def _lost_lines(made: PillarLibrary) -> list[str]:
-    """What orders of the substrate take, in words; nothing where none propagates."""
+    """Light lost to orders of the substrate, in words; empty where none propagates."""
     orders, lost = _orders(made), made.lost
     if not orders:
         return []
@@ -333,9 +377,10 @@ def _lost_lines(made: PillarLibrary) -> list[str]:
     ]
 
 
-def _elsewhere(made: PillarLibrary) -> list[str]:
-    """What becomes of light along x in pillars that have no mirror along x or y: a part
-    of it leaves along y.
+def _cross_polarised_lines(made: PillarLibrary) -> list[str]:
+    """Share of light along x that leaves along y, in words.
+
+    It is not 0 only where no mirror of the shape lies along x or y.
     """
     outline = made.cell.outline(float(made.diameter_um[-1]))
     if outline.keeps(-1, 1) or outline.keeps(1, -1):
@@ -348,7 +393,7 @@ def _elsewhere(made: PillarLibrary) -> list[str]:
 
 
 def _circular(turned: GeometricPhase) -> dict[str, Any]:
-    """What the turned pillar does to circular light, the lesser hand."""
+    """Conversion of circular light by the rotated pillar, for the lesser hand."""
     share, bar = min(turned.efficiency(1.0), turned.efficiency(-1.0))
     kept, kept_bar = max(turned.unconverted(1.0), turned.unconverted(-1.0))
     return {
@@ -364,6 +409,7 @@ def _circular(turned: GeometricPhase) -> dict[str, Any]:
 
 
 def _turned_lines(turned: GeometricPhase) -> list[str]:
+    """Conversion of circular light by the rotated pillar, in words."""
     found = _circular(turned)
     return [
         f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {found['converted']:.3f} +- "
@@ -375,6 +421,7 @@ def _turned_lines(turned: GeometricPhase) -> list[str]:
 
 
 def _proxy_lines(fitted: ProxyFit) -> list[str]:
+    """Domain, coverage and errors of the proxy, in words."""
     proxy = fitted.proxy
     low, high = (1e3 * d for d in proxy.domain_um)
     turns = "" if math.isnan(fitted.turns) else f", {fitted.turns:.2f} turns"
@@ -391,8 +438,10 @@ def _proxy_lines(fitted: ProxyFit) -> list[str]:
 
 
 def _run_two_sizes(options: Options, wanted: CellFile) -> int:
-    """Sweep over two sizes and write; exit 1 where most bars miss the tolerance, or a
-    pair held out lies above its bar.
+    """Sweep over two sizes, write and draw the library.
+
+    Exit status 1 where most error bars miss the tolerance, or a held-out pair lies
+    above its bar.
     """
     from metalens.library import plots
 
@@ -419,25 +468,28 @@ def _run_two_sizes(options: Options, wanted: CellFile) -> int:
 
 
 def two_size_failures(made: axes.AxesLibrary) -> list[str]:
-    """What is wrong with a library, in words; nothing where it serves.
+    """Reasons for exit status 1 of a library over two sizes, in words; empty where it
+    serves.
 
     Args:
-        made: what was designed or computed.
+        made: the library.
     """
-    found, share = [], float(made.usable.mean())
+    failures = []
+    share = float(made.usable.mean())
     if share < LEAST_USABLE:
-        found.append(
+        failures.append(
             f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {made.sweep.bar:g} "
             f"(median {np.median(made.t_error):.2g}): allow a larger tolerance or take narrower ranges"
         )
     if made.missed:
-        found.append(
+        failures.append(
             f"{made.missed} of {len(made.held_out)} pairs held out lie above their error bar"
         )
-    return found
+    return failures
 
 
 def _two_size_values(made: axes.AxesLibrary, seconds: float) -> dict[str, Any]:
+    """Result of a sweep over two sizes as a dictionary for JSON."""
     return {
         "engine": "rcwa",
         "entries": made.t_error.size,
@@ -463,6 +515,9 @@ def _least(made: axes.AxesLibrary) -> list[float]:
 
 
 def _two_size_text(target: Path, made: axes.AxesLibrary, seconds: float) -> str:
+    """Result of a sweep over two sizes in words: sizes, effort, errors, held-out
+    pairs.
+    """
     x, y, held = NM * made.x_um, NM * made.y_um, made.held_out
     lines = [
         f"{target}: {len(x)} x {len(y)} sizes ({x[0]:.1f}-{x[-1]:.1f} nm along x, {y[0]:.1f}-{y[-1]:.1f} nm along y), "
