@@ -293,33 +293,33 @@ _Outcome = tuple[
 
 
 def _design_two_sizes(
-    wanted: DesignSettings, options: Options, draft: Path
+    settings: DesignSettings, options: Options, draft: Path
 ) -> _Outcome:
     """Design a lens of pillars of two sizes, for light along x and along y.
 
     Args:
-        wanted: settings of the design.
+        settings: of the design.
         options: of the command line.
         draft: file that will be written, for pictures beside it.
 
     Returns:
         Lens, settings as filled in, values for JSON, notes, and checks of the foci.
     """
-    path = options.config.parent / (wanted.library or "")
+    path = options.config.parent / (settings.library or "")
     pillars = axes.load(path)
     inputs = {path.name: store.sha256(path)}
-    wanted = wanted.at(pillars.wavelength_um.tolist())
-    pillars.at(wanted.focus.wavelength_um)
-    wanted = _fill_limits(wanted, options, pillars.cell, inputs)
-    phase, focus, _ = _find_phase(wanted, options, draft)
+    settings = settings.at(pillars.wavelength_um.tolist())
+    pillars.at(settings.focus.wavelength_um)
+    settings = _fill_limits(settings, options, pillars.cell, inputs)
+    phase, focus, _ = _find_phase(settings, options, draft)
     phase_y: PhaseOf | None = None
     focus_y = focus
-    if wanted.along_y is not None:
-        target = wanted.along(wanted.along_y)
+    if settings.along_y is not None:
+        target = settings.along(settings.along_y)
         phase_y = target.phase(options.config.parent)
         focus_y = target.focus
     designed, metrics = design.assign_polarization_multiplexed(
-        (phase, phase_y), (focus, focus_y), library=pillars, **_common(wanted, inputs)
+        (phase, phase_y), (focus, focus_y), library=pillars, **_common(settings, inputs)
     )
     values: dict[str, Any] = {
         "pillars": metrics.x.pillars,
@@ -329,7 +329,7 @@ def _design_two_sizes(
     }
     checks: list[FocusCheck | None] = []
     lights: tuple[Literal["x", "y"], ...] = ("x", "y")
-    profiles = wanted.profile, (wanted.along_y or wanted).profile
+    profiles = settings.profile, (settings.along_y or settings).profile
     for i, light in enumerate(lights):
         quality = (metrics.x, metrics.y)[i]
         polarised = designed.seen(light)
@@ -342,15 +342,17 @@ def _design_two_sizes(
             "wavefront_efficiency_error": metrics.wavefront_efficiency_error[i],
             "leaked": metrics.leaked[i],
         }
-    lost = describe_order_loss(pillars.cell, wanted.focus.wavelength_um)
-    return designed, wanted, values, [lost], checks
+    lost = describe_order_loss(pillars.cell, settings.focus.wavelength_um)
+    return designed, settings, values, [lost], checks
 
 
-def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _Outcome:
+def _design_one_size(
+    settings: DesignSettings, options: Options, draft: Path
+) -> _Outcome:
     """Design a lens of pillars of one size: at one wavelength or several, or rotated.
 
     Args:
-        wanted: settings of the design.
+        settings: of the design.
         options: of the command line.
         draft: file that will be written, for pictures beside it.
 
@@ -360,50 +362,54 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
     Raises:
         ConfigError: several wavelengths of rotated pillars.
     """
-    pillars, inputs = _pillars(wanted, options.config.parent, options.console)
+    pillars, inputs = _pillars(settings, options.config.parent, options.console)
     cell = pillars.cell
     proxy = library.proxy_of(pillars)
     folder = options.config.parent
-    sites = int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2)
+    sites = int(math.pi * (1e3 * settings.aperture_mm / cell.pitch_um) ** 2)
     transaction.check_room(options.output, sites)  # 4 bytes each
-    wanted = wanted.at(proxy.wavelengths_um)
-    proxy.at(wanted.focus.wavelength_um)  # refused here, not after the search
-    wanted = _fill_limits(wanted, options, cell, inputs)
-    if wanted.profile == "map" and wanted.map and (folder / wanted.map.file).is_file():
-        inputs[wanted.map.file.name] = store.sha256(folder / wanted.map.file)
-    phase, focus, values = _find_phase(wanted, options, draft)
-    common = _common(wanted, inputs)
+    settings = settings.at(proxy.wavelengths_um)
+    proxy.at(settings.focus.wavelength_um)  # refused here, not after the search
+    settings = _fill_limits(settings, options, cell, inputs)
+    if (
+        settings.profile == "map"
+        and settings.map
+        and (folder / settings.map.file).is_file()
+    ):
+        inputs[settings.map.file.name] = store.sha256(folder / settings.map.file)
+    phase, focus, values = _find_phase(settings, options, draft)
+    common = _common(settings, inputs)
     rotated = pillars.turned is not None
     targets: list[DesignSettings] = []
     others: list[Quality] = []
-    if wanted.wavelengths:
+    if settings.wavelengths:
         if rotated:
             raise ConfigError(
                 "wavelengths: turned pillars make one phase at all of them; need a "
                 "library for any light"
             )
-        targets = [wanted.at_wavelength(one) for one in wanted.wavelengths]
-        weights = [one.weight for one in wanted.wavelengths]
+        targets = [settings.at_wavelength(light) for light in settings.wavelengths]
+        weights = [light.weight for light in settings.wavelengths]
         lights = [
-            design.WavelengthTarget(one.phase(folder), one.focus, weight)
-            for one, weight in zip([wanted, *targets], [1.0, *weights], strict=True)
+            design.WavelengthTarget(at.phase(folder), at.focus, weight)
+            for at, weight in zip([settings, *targets], [1.0, *weights], strict=True)
         ]
         designed, (quality, *others) = design.assign_multi_wavelength(
             lights, cell=cell, proxy=proxy, **common
         )
     elif rotated:
         designed, quality, conversion = design.assign_geometric_phase(
-            phase, focus, library=pillars, hand=wanted.hand, **common
+            phase, focus, library=pillars, hand=settings.hand, **common
         )
-        values["circular"] = {"hand": wanted.hand, **asdict(conversion)}
+        values["circular"] = {"hand": settings.hand, **asdict(conversion)}
     else:
         partial = options.accept_partial_turn
         designed, quality = design.make(
             phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **common
         )
-    radius_um = wanted.aperture_mm * 500
+    radius_um = settings.aperture_mm * 500
     notes = [describe_order_loss(cell, focus.wavelength_um)]
-    if wanted.profile == "map":
+    if settings.profile == "map":
         meets = design.has_focus(
             phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um
         )
@@ -416,14 +422,14 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
             "and y (lengths_um in [sweep] makes a library for both)"
         )
     designed, coupling = _couple(designed, quality, radius_um, options, rotated=rotated)
-    checkable = wanted.profile == "hyperbolic"
+    checkable = settings.profile == "hyperbolic"
     expected = quality.strehl if others else 1.0
     check = _check(designed, quality, options, wanted=checkable, expected=expected)
     values = _summarize(designed, quality, check) | values
     if coupling is not None:
         values["neighbours"] = asdict(coupling)
     checks, by_wavelength = [check], []
-    for light, target, one in zip(wanted.wavelengths, targets, others, strict=True):
+    for light, target, one in zip(settings.wavelengths, targets, others, strict=True):
         at_wavelength = replace(
             designed,
             wavelength_um=target.focus.wavelength_um,
@@ -439,7 +445,7 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
     if by_wavelength:
         values["wavelengths"] = by_wavelength
     elif quality.turns < 1:
-        hint = design.phase_coverage_hint(proxy, cell, wanted.limits, quality.turns)
+        hint = design.phase_coverage_hint(proxy, cell, settings.limits, quality.turns)
         notes.append(f"for a whole turn: {hint}")
     if quality.steepest > quality.sampled_aperture:
         notes.append(
@@ -452,25 +458,25 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
         "entry_error": proxy.entry_error,
         "loss": pillars.mean_loss(designed.diameters.diameter_um, focus.wavelength_um),
     }
-    return designed, wanted, values, notes, checks
+    return designed, settings, values, notes, checks
 
 
 def _is_two_size_library(path: Path) -> bool:
     return path.is_file() and store.load(path).kind == axes.KIND
 
 
-def _common(wanted: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
+def _common(settings: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
     """Arguments of every assignment."""
     return {
-        "aperture_um": wanted.aperture_mm * 1e3,
-        "limits": wanted.limits,
-        "profile": wanted.profile,
-        "provenance": store.Provenance(config=config.dumps(wanted), inputs=inputs),
+        "aperture_um": settings.aperture_mm * 1e3,
+        "limits": settings.limits,
+        "profile": settings.profile,
+        "provenance": store.Provenance(config=config.dumps(settings), inputs=inputs),
     }
 
 
 def _fill_limits(
-    wanted: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
+    settings: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
 ) -> DesignSettings:
     """Settings with the limits of a process file, and the cell's cover behind the
     pillars.
@@ -479,38 +485,38 @@ def _fill_limits(
     read are added to ``inputs``.
 
     Args:
-        wanted: settings of the design.
+        settings: of the design.
         options: of the command line.
         cell: unit cell of the pillars.
         inputs: SHA-256 by file name.
     """
     inputs[options.config.name] = store.sha256(options.config)
-    layers = wanted.layers.covered_by(cell.cover)
+    layers = settings.layers.covered_by(cell.cover)
     if options.process is None:
-        return replace(wanted, layers=layers)
+        return replace(settings, layers=layers)
     inputs[options.process.name] = store.sha256(options.process)
     thinnest, gap = load_above("process").printable_limits(
         options.process, pitch_um=cell.pitch_um, height_um=cell.height_um
     )
-    limits = replace(wanted.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
-    return replace(wanted, layers=layers, limits=limits)
+    limits = replace(settings.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
+    return replace(settings, layers=layers, limits=limits)
 
 
 def _pillars(
-    wanted: DesignSettings, folder: Path, console: Console
+    settings: DesignSettings, folder: Path, console: Console
 ) -> tuple[PillarLibrary, dict[str, str]]:
     """The library of the pillars, and the hash of its file if there is one."""
-    if wanted.library is not None:
-        path = folder / wanted.library
+    if settings.library is not None:
+        path = folder / settings.library
         return library.load(path), {path.name: store.sha256(path)}
-    others = (1e-3 * one.wavelength_nm for one in wanted.wavelengths)
-    waves = tuple(sorted((wanted.focus.wavelength_um, *others)))
-    cell = wanted.cell or library.DEFAULT_CELL
+    others = (1e-3 * one.wavelength_nm for one in settings.wavelengths)
+    waves = tuple(sorted((settings.focus.wavelength_um, *others)))
+    cell = settings.cell or library.DEFAULT_CELL
     return library.sweep(cell, wavelengths_um=waves, console=console), {}
 
 
 def _find_phase(
-    wanted: DesignSettings, options: Options, draft: Path
+    settings: DesignSettings, options: Options, draft: Path
 ) -> tuple[PhaseOf, Focus, dict[str, Any]]:
     """Target phase of the profile, its focus, and the comparison of a free form.
 
@@ -518,23 +524,23 @@ def _find_phase(
     returned for JSON and its picture is written.
 
     Args:
-        wanted: settings of the design.
+        settings: of the design.
         options: of the command line.
         draft: lens file that will be written; the picture is NAME_fisher.png.
     """
-    if wanted.profile != "fisher":
-        return wanted.phase(options.config.parent), wanted.focus, {}
+    if settings.profile != "fisher":
+        return settings.phase(options.config.parent), settings.focus, {}
     from metalens.design.free_form import design_pupil, fisher_profile
     from metalens.design.free_form import report as reports
 
-    radius_um, console = wanted.aperture_mm * 500, options.console
-    settings = wanted.fisher.about(wanted.focus, radius_um)
-    pupil = design_pupil(wanted.focus, radius_um, settings)
-    scenes = settings.objective == "scenes"
-    objective = load_above("scenes").SceneObjective(pupil, settings) if scenes else None
-    console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
+    radius_um, console = settings.aperture_mm * 500, options.console
+    search = settings.fisher.about(settings.focus, radius_um)
+    pupil = design_pupil(settings.focus, radius_um, search)
+    scenes = search.objective == "scenes"
+    objective = load_above("scenes").SceneObjective(pupil, search) if scenes else None
+    console.say(f"free form: {search.starts} starts of {search.iterations} steps")
     phase, free_form = fisher_profile(
-        wanted.focus, radius_um=radius_um, settings=settings, objective=objective
+        settings.focus, radius_um=radius_um, settings=search, objective=objective
     )
     mean = float(free_form.score.information.mean())
     goal = f"Eq. 6 {-mean:.3f} (0 without blur)" if scenes else f"I(z) {mean:.3f} /mm²"
@@ -542,14 +548,14 @@ def _find_phase(
     console.say(
         f"free form: {goal}, encircled energy {least:.2f} or more; {free_form.reason}"
     )
-    focus = replace(wanted.focus, source_distance_um=free_form.focus_um)
+    focus = replace(settings.focus, source_distance_um=free_form.focus_um)
     if scenes:
         return phase, focus, {}
     console.say("tuning a hyperbolic lens and a double helix for the same task")
-    lenses = reports.judge_designs(free_form, pupil, settings)
-    picture = reports.report_picture(lenses, pupil, settings)
+    lenses = reports.judge_designs(free_form, pupil, search)
+    picture = reports.report_picture(lenses, pupil, search)
     write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
-    return phase, focus, {"fisher": reports.report_values(lenses, settings)}
+    return phase, focus, {"fisher": reports.report_values(lenses, search)}
 
 
 def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:
@@ -575,14 +581,19 @@ def format_place(at_um: tuple[float, float, float]) -> str:
 
 
 def _couple(
-    made: Lens, quality: Quality, radius_um: float, options: Options, *, rotated: bool
+    designed: Lens,
+    quality: Quality,
+    radius_um: float,
+    options: Options,
+    *,
+    rotated: bool,
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
     """The lens with its solved rows where asked for, and its neighbour coupling loss.
 
     None for rotated pillars and phases without a focus.
 
     Args:
-        made: the lens.
+        designed: the lens.
         quality: of its pillars.
         radius_um: radius of the aperture.
         options: of the command line.
@@ -597,16 +608,18 @@ def _couple(
             raise ConfigError(
                 f"own_cell: {why}: no rows are solved for it; leave --own-cell out"
             )
-        return made, None
+        return designed, None
     if not options.own_cell:
-        return made, design.estimate_neighbour_coupling_loss(made, radius_um=radius_um)
-    rows = design.solve_coupling_rows(made, radius_um=radius_um)
-    made = replace(made, neighbours=rows)
-    return made, design.neighbour_coupling_loss(made, radius_um=radius_um)
+        return designed, design.estimate_neighbour_coupling_loss(
+            designed, radius_um=radius_um
+        )
+    rows = design.solve_coupling_rows(designed, radius_um=radius_um)
+    designed = replace(designed, neighbours=rows)
+    return designed, design.neighbour_coupling_loss(designed, radius_um=radius_um)
 
 
 def _check(
-    made: Lens,
+    designed: Lens,
     quality: Quality,
     options: Options,
     *,
@@ -616,7 +629,7 @@ def _check(
     """Exact diffraction sum around the focus; None where it is left out.
 
     Args:
-        made: the lens.
+        designed: the lens.
         quality: of its pillars.
         options: of the command line.
         wanted: whether the profile has a focus to check.
@@ -627,11 +640,11 @@ def _check(
     if quality.pillars > MOST_SUMMED:
         options.console.say(f"more than {MOST_SUMMED:,} pillars: no exact focus check")
         return None
-    return design.check_focus(made, expected=expected)
+    return design.check_focus(designed, expected=expected)
 
 
 def _summarize(
-    made: Lens, quality: Quality, check: FocusCheck | None
+    designed: Lens, quality: Quality, check: FocusCheck | None
 ) -> dict[str, Any]:
     """Quality of a lens, of its PSF and of its focus, for JSON; None for nan.
 
@@ -639,7 +652,7 @@ def _summarize(
     in memory at once, and where torch is not installed.
 
     Args:
-        made: the lens.
+        designed: the lens.
         quality: of its pillars.
         check: of its focus; None without.
     """
@@ -652,7 +665,7 @@ def _summarize(
         }
         if quality.pillars <= MOST_SUMMED:
             try:
-                values |= _of_psf(design.focus_figures(made))
+                values |= _of_psf(design.focus_figures(designed))
             except ModuleNotFoundError as error:
                 if error.name != "torch":
                     raise
