@@ -31,30 +31,29 @@ PATCHES = 512  # along an axis, over the light of a stop in the pillars' plane
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OverField:
-    """Aberrations of a lens at its design wavelength; NaN where ``left_out`` says why
-    there is no number.
+    """Aberrations of a lens at its design wavelength, over n field angles.
 
-    angles_deg: (n,) field angles along x. depth_um: of the source. sensor_distance_um:
-    of the lens.
+    Numbers that do not exist are nan; ``left_out`` says why.
+
+    angles_deg: (n,) field angles along x.
+    depth_um: of the source.
+    sensor_distance_um: of the lens.
     chief_um: (n, 2) where the chief ray meets the sensor, [x, y] from the axis.
-    distortion: (n,) by how much farther it lies from that of angle 0 than the linear
-    image about angle 0 has it, along
-        the latter: (X - X0)·u / |M s| - 1, u = M s / |M s|, s the source from the one
-            at angle 0.
+    distortion: (n,) (X - X0)·u / |M s| - 1 against the linear image around angle 0:
+        u = M s / |M s|, s the source from that of angle 0.
     close_um: (n, 2) tangential and sagittal focus of rays close to the chief ray,
-    behind the sensor (+) or before it.
+        behind the sensor (+) or before it.
     close_error_um: (n, 2) one sigma of these.
     sharpest_um: (n, 2) the same of the whole aperture: where the line image along x
-    (tangential) and along y
-        (sagittal) is sharpest, largest ∫ L² / (∫ L)².
+        (tangential) and along y (sagittal) is sharpest, largest ∫ L² / (∫ L)².
     vignetting: (n,) share of the light through the stop's hole that misses the pillars;
-    0 where the lens is its own.
+        0 without a stop.
     illumination: (n,) irradiance in the image of an evenly bright (Lambertian) plane,
-    over that at angle 0.
-    frequencies_per_mm: (m,). mtf: (n, 2, m) modulation along x (tangential) and y
-    (sagittal), of all light that passes
-        the lens. held: (n,) share of it in the waves about the rays, beyond which is
-        light without detail.
+        over that at angle 0.
+    frequencies_per_mm: (m,) of the MTF.
+    mtf: (n, 2, m) modulation along x (tangential) and y (sagittal), of all light that
+        passes the lens.
+    held: (n,) share of it in the waves about the rays; the other light has no detail.
     left_out: what has no number, and why; one line each.
     """
 
@@ -136,6 +135,11 @@ def over_field(
 
 
 def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -> None:
+    """Refuse field angles, depth or frequencies out of range.
+
+    Raises:
+        PropagationError: naming the argument.
+    """
     if not angles_deg or not np.all(np.abs(angles_deg) < 85):
         raise PropagationError(
             f"angles_deg = {tuple(angles_deg)}: need one field angle or more, between -85 and 85"

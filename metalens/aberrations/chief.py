@@ -30,19 +30,18 @@ STEP = 1e-4  # of differences, in tangents or depths
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChiefRay:
-    """Where the ray through the middle of the stop goes, and the rays close to it;
-    vectors are [x, y].
+    """The chief ray of a source, and the rays close to it; vectors are [x, y].
 
-    at_um: (2,) on the pillars. p: (2,) n sin θ behind them. meets_um: (2,) on the
-    sensor.
+    at_um: (2,) on the pillars.
+    p: (2,) n sin θ behind them.
+    meets_um: (2,) on the sensor.
     focus_um: (2,) distance behind the pillars where close rays spread least along x and
-    along y of the sensor, the
-        films behind kept and the gap before them changed; below 0 for a virtual focus,
-        inf for parallel rays.
-    focus_error_um: (2,) one sigma of it, by how the pillars' phases scatter about their
-    polynomial.
-    source: (2,) where the source lies from the axis, in um; for collimated light its
-    tangents.
+        along y of the sensor, films fixed and the gap before them changed. Below 0 for
+        a virtual focus, inf for parallel rays.
+    focus_error_um: (2,) one sigma of it, by the scatter of the pillars' phases about
+        their polynomial.
+    source: (2,) place of the source from the axis, um; its tangents for collimated
+        light.
     moves: (2, 2) ∂ meets_um / ∂ source.
     """
 

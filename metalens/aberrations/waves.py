@@ -32,14 +32,16 @@ STEEPEST = 0.999  # largest sine over the index
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FieldPlaneWaves:
-    """Plane waves of one field angle at the design wavelength.
+    """Plane waves of one field angle behind a lens at the design wavelength.
 
-    amplitude: (y, x) complex128, √T A. p_x, p_y: (x,), (y,) n sin θ along each axis.
-    spacing: (x, y) of them.
-    light: what leaves the pillars and passes the faces, on the scale of Σ |amplitude|²;
-    passed_um2: the same for unit
-        irradiance on the lens. aperture: half the width (x, y) of the directions of the
-        rim's rays, the NA on axis.
+    amplitude: (y, x) complex128, √T A.
+    p_x, p_y: (x,), (y,) n sin θ along each axis.
+    spacing: (x, y) steps of them.
+    light: power behind the pillars that passes the faces, on the scale of Σ
+        |amplitude|².
+    passed_um2: the same power for unit irradiance on the lens.
+    aperture: half the width (x, y) of the directions of the rim's rays, the NA on axis.
+    wavelength_um: vacuum wavelength.
     after: media behind the pillars, at the lens's own sensor.
     """
 
@@ -219,23 +221,23 @@ def _directions(
 
 
 def _row_transforms(
-    light_rows: Callable[[Array], Array], ny: int, count: int, kept: Array
+    light_rows: Callable[[Array], Array], ny: int, count: int, orders: Array
 ) -> tuple[Array, float]:
-    """(y, kept) transforms along x of the light behind the pillars, and sum |light|².
+    """(y, orders) transforms along x of the light behind the pillars, and sum |light|².
 
     Args:
         light_rows: light of some rows, see :func:`_field_at_pillars`.
         ny: rows of the map.
         count: length of the transforms, padded with zeros.
-        kept: frequencies that are returned.
+        orders: indices of the frequencies that are returned.
     """
-    out = np.empty((ny, len(kept)), complex)
+    out = np.empty((ny, len(orders)), complex)
     power = 0.0
     for start in range(0, ny, ROWS):
         rows = np.arange(start, min(start + ROWS, ny))
         light = light_rows(rows)
         power += float((np.abs(light) ** 2).sum())
-        out[rows] = scipy.fft.fft(light, count, axis=1)[:, kept]
+        out[rows] = scipy.fft.fft(light, count, axis=1)[:, orders]
     return out, power
 
 

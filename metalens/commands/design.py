@@ -428,8 +428,9 @@ def _design_one_size(
     values = _summarize(designed, quality, check) | values
     if coupling is not None:
         values["neighbours"] = asdict(coupling)
-    checks, by_wavelength = [check], []
-    for light, target, one in zip(settings.wavelengths, targets, others, strict=True):
+    checks = [check]
+    by_wavelength = []
+    for light, target, other in zip(settings.wavelengths, targets, others, strict=True):
         at_wavelength = replace(
             designed,
             wavelength_um=target.focus.wavelength_um,
@@ -437,11 +438,11 @@ def _design_one_size(
             source_distance_um=target.focus.source_distance_um,
         )
         check = _check(
-            at_wavelength, one, options, wanted=checkable, expected=one.strehl
+            at_wavelength, other, options, wanted=checkable, expected=other.strehl
         )
         checks.append(check)
         named = {"wavelength_nm": light.wavelength_nm, "weight": light.weight}
-        by_wavelength.append(named | _summarize(at_wavelength, one, check))
+        by_wavelength.append(named | _summarize(at_wavelength, other, check))
     if by_wavelength:
         values["wavelengths"] = by_wavelength
     elif quality.turns < 1:
@@ -509,7 +510,7 @@ def _pillars(
     if settings.library is not None:
         path = folder / settings.library
         return library.load(path), {path.name: store.sha256(path)}
-    others = (1e-3 * one.wavelength_nm for one in settings.wavelengths)
+    others = (1e-3 * light.wavelength_nm for light in settings.wavelengths)
     waves = tuple(sorted((settings.focus.wavelength_um, *others)))
     cell = settings.cell or library.DEFAULT_CELL
     return library.sweep(cell, wavelengths_um=waves, console=console), {}
@@ -533,7 +534,8 @@ def _find_phase(
     from metalens.design.free_form import design_pupil, fisher_profile
     from metalens.design.free_form import report as reports
 
-    radius_um, console = settings.aperture_mm * 500, options.console
+    radius_um = settings.aperture_mm * 500
+    console = options.console
     search = settings.fisher.about(settings.focus, radius_um)
     pupil = design_pupil(settings.focus, radius_um, search)
     scenes = search.objective == "scenes"

@@ -229,9 +229,9 @@ def run(options: Options) -> int:
     return options.console.judged(numbers, "\n".join([title, *words]), failures)
 
 
-def _largest(one: NearField) -> float:
+def _largest(field: NearField) -> float:
     """Largest |E| of a field over that of the incident light."""
-    return float(field_magnitude(one.e).max())
+    return float(field_magnitude(field.e).max())
 
 
 def field_magnitude(field: Array) -> Array:
@@ -263,18 +263,17 @@ def save_near_field(
         "z_um": np.asarray(xz.grid.z_um),
     }
     arrays["heights_um"] = np.array(wanted.heights_um)
-    for name, one, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
-        for part, field in (("e", one.e), ("h", one.h), ("index", one.index)):
-            arrays[f"{name}/{part}"] = (
-                field if flat is None else field.squeeze(axis=flat)
-            )
+    for name, near, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
+        for part, field in (("e", near.e), ("h", near.h), ("index", near.index)):
+            squeezed = field if flat is None else field.squeeze(axis=flat)
+            arrays[f"{name}/{part}"] = squeezed
     about: dict[str, store.Attribute] = {
         "wavelength_um": wanted.wavelength_um,
         "step_um": wanted.step_um,
     }
     about |= {
-        f"error_{name}": one.error
-        for name, one in zip((*CUTS, "xy"), found, strict=True)
+        f"error_{name}": near.error
+        for name, near in zip((*CUTS, "xy"), found, strict=True)
     }
     provenance = store.Provenance(config.dumps(wanted), inputs)
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
@@ -288,22 +287,23 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
         wanted: the request.
         found: fields on the cuts xz and yz, and on the maps.
     """
-    cuts, maps = found[:2], found[2]
+    cuts = found[:2]
+    maps = found[2]
     columns = max(2, len(wanted.heights_um))
     figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
-    top = max(_largest(one) for one in found)
-    shown = None
-    for panel, one, name in zip(panels[0], cuts, CUTS, strict=False):
-        across = np.asarray(one.grid.x_um if name == "xz" else one.grid.y_um)
-        e = field_magnitude(one.e).squeeze()
-        index = one.index.squeeze().real
-        shown = _map(panel, across, np.asarray(one.grid.z_um), e, index, top)
+    top = max(_largest(near) for near in found)
+    image = None
+    for panel, near, name in zip(panels[0], cuts, CUTS, strict=False):
+        across = np.asarray(near.grid.x_um if name == "xz" else near.grid.y_um)
+        e = field_magnitude(near.e).squeeze()
+        index = near.index.squeeze().real
+        image = _map(panel, across, np.asarray(near.grid.z_um), e, index, top)
         panel.set(
             title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
         )
     for i, height in enumerate(wanted.heights_um):
         x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
-        shown = _map(
+        image = _map(
             panels[1, i], x, y, field_magnitude(maps.e)[i], maps.index[i].real, top
         )
         panels[1, i].invert_yaxis()
@@ -312,7 +312,7 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
         )
     for panel in (*panels[0, 2:], *panels[1, len(wanted.heights_um) :]):
         panel.set_axis_off()
-    figure.colorbar(shown, ax=panels, label="|E| of the light that comes", shrink=0.6)
+    figure.colorbar(image, ax=panels, label="|E| of the light that comes", shrink=0.6)
     return figure_png(figure)
 
 

@@ -112,10 +112,9 @@ def _short(value: object) -> str:
 
     Rounding to 12 digits drops the errors of arithmetic: 0.94 for 0.9400000000000001.
     """
+    text = str(value).strip().replace("\n", "; ")
     if isinstance(value, float):
         text = repr(float(f"{value:.12g}"))
-    else:
-        text = str(value).strip().replace("\n", "; ")
     return text if len(text) <= 100 else text[:97] + "..."
 
 

@@ -401,13 +401,15 @@ def _cross_polarised_lines(pillars: PillarLibrary) -> list[str]:
 def _circular(turned: GeometricPhase) -> dict[str, Any]:
     """Conversion of circular light by the rotated pillar, for the lesser hand."""
     share, bar = min(turned.efficiency(1.0), turned.efficiency(-1.0))
-    kept, kept_bar = max(turned.unconverted(1.0), turned.unconverted(-1.0))
+    unconverted, unconverted_bar = max(
+        turned.unconverted(1.0), turned.unconverted(-1.0)
+    )
     return {
         "size_um": turned.size_um,
         "converted": share,
         "converted_error": bar,
-        "unconverted": kept,
-        "unconverted_error": kept_bar,
+        "unconverted": unconverted,
+        "unconverted_error": unconverted_bar,
         "angles_deg": np.degrees(turned.angle_rad).tolist(),
         "isolated_error": turned.model_error,
         "solver_error": float(turned.t_error.max()),
@@ -416,13 +418,13 @@ def _circular(turned: GeometricPhase) -> dict[str, Any]:
 
 def _turned_lines(turned: GeometricPhase) -> list[str]:
     """Conversion of circular light by the rotated pillar, in words."""
-    found = _circular(turned)
+    shares = _circular(turned)
     return [
-        f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {found['converted']:.3f} +- "
-        f"{found['converted_error']:.2g} of circular light is converted with the geometric phase, "
-        f"{found['unconverted']:.2g} +- {found['unconverted_error']:.1g} keeps its hand",
-        f"  a pillar turned alone is {found['isolated_error']:.2g} of t off the solved ones at "
-        f"{len(turned.angle_rad)} turns (solver within {found['solver_error']:.1g})",
+        f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {shares['converted']:.3f} +- "
+        f"{shares['converted_error']:.2g} of circular light is converted with the geometric phase, "
+        f"{shares['unconverted']:.2g} +- {shares['unconverted_error']:.1g} keeps its hand",
+        f"  a pillar turned alone is {shares['isolated_error']:.2g} of t off the solved ones at "
+        f"{len(turned.angle_rad)} turns (solver within {shares['solver_error']:.1g})",
     ]
 
 
@@ -525,14 +527,14 @@ def _two_size_text(target: Path, pillars: axes.AxesLibrary, seconds: float) -> s
     """Result of a sweep over two sizes in words: sizes, effort, errors, held-out
     pairs.
     """
-    x, y, held = NM * pillars.x_um, NM * pillars.y_um, pillars.held_out
+    x, y, held_out = NM * pillars.x_um, NM * pillars.y_um, pillars.held_out
     lines = [
         f"{target}: {len(x)} x {len(y)} sizes ({x[0]:.1f}-{x[-1]:.1f} nm along x, {y[0]:.1f}-{y[-1]:.1f} nm along y), "
         f"Jones matrices at {len(pillars.wavelength_um)} wavelength(s)",
         f"  {pillars.solves} solves (rcwa, orders within {pillars.harmonics}), {seconds:.1f} s",
         f"  t within {np.median(pillars.t_error):.1e} in the median; {pillars.usable.mean():.1%} of the sizes are within "
         f"{pillars.sweep.bar:g}, the others are excluded bands of resonances",
-        f"  {len(held)} pairs held out: interpolated within {np.median(held[:, 3]):.1e} in the median, "
-        f"{held[:, 3].max():.1e} at most, {pillars.missed} above their bar",
+        f"  {len(held_out)} pairs held out: interpolated within {np.median(held_out[:, 3]):.1e} in the median, "
+        f"{held_out[:, 3].max():.1e} at most, {pillars.missed} above their bar",
     ]
     return "\n".join(lines)

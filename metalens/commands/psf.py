@@ -645,7 +645,8 @@ def _write(path: Path, computed: Computed, *, page: bool) -> None:
 
     psf_export.export_psf(path, computed.stack)
     limit = max(
-        (one.limit for one in computed.figures), key=lambda one: one.cutoff_per_um
+        (metrics.limit for metrics in computed.figures),
+        key=lambda limit: limit.cutoff_per_um,
     )
     pictures = psf_plots.psf_pictures(computed.stack, limit=limit, scan=computed.scan)
     depths = computed.stack.depths_um
@@ -764,7 +765,7 @@ def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens
 def _of_design(
     device: lens.Lens,
     settings: PsfSettings,
-    known: psf.LeftOut | None,
+    left_out: psf.LeftOut | None,
     provenance: Provenance,
 ) -> psf.PsfStack:
     """PSFs of a design; with pillars of two sizes the mean of light along x and y.
@@ -772,7 +773,7 @@ def _of_design(
     Args:
         device: the lens.
         settings: with nothing left to the lens.
-        known: solved terms of the error budget; None for rough ones.
+        left_out: solved terms of the error budget; None for rough ones.
         provenance: kept in the stack.
 
     Raises:
@@ -787,7 +788,7 @@ def _of_design(
             spectrum=settings.spectrum_of(polarised),
             provenance=provenance,
             polarisation=settings.polarisation,
-            left_out=known,
+            left_out=left_out,
         )
 
     if device.pairs is None or settings.light != "both":
@@ -862,11 +863,11 @@ def dark_window(computed: Computed) -> str:
     Args:
         computed: PSFs and figures.
     """
-    dark = [one for one in computed.figures if not one.window_share >= DARK]
+    dark = [metrics for metrics in computed.figures if not metrics.window_share >= DARK]
     if not dark:
         return ""
-    angles = ", ".join(_angle(one.angle_rad) for one in dark)
-    share = max(one.window_share for one in dark)
+    angles = ", ".join(_angle(metrics.angle_rad) for metrics in dark)
+    share = max(metrics.window_share for metrics in dark)
     meets = computed.meets_um
     where = (
         "rays of the design source meet nowhere (psf --far-field shows where its light goes)"
@@ -895,7 +896,7 @@ def psf_text(target: Path, computed: Computed) -> str:
     lines = [
         f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})",
         f"  {stack.budget.text}",
-        *(_figures(one) for one in computed.figures),
+        *(_figures(metrics) for metrics in computed.figures),
     ]
     if computed.scan is not None:
         ends = computed.scan.shift_um[[0, -1]]
@@ -927,11 +928,13 @@ def _figures(spot: psf.FocusMetrics) -> str:
 
 
 def _angle(angle_rad: tuple[float, float]) -> str:
+    """A field angle (x, y) in deg, in words."""
     x, y = np.rad2deg(angle_rad)
     return f"({x:.3g}, {y:.3g}) deg"
 
 
 def _depth(depth_um: float) -> str:
+    """A source depth in mm, in words."""
     return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
 
 
@@ -953,7 +956,7 @@ def psf_numbers(computed: Computed) -> dict[str, Any]:
         "depths_um": [_plain(depth) for depth in stack.depths_um.tolist()],
         "angles_rad": stack.angles_rad.tolist(),
         "wavelengths_um": stack.wavelengths_um.tolist(),
-        "focus": [_plain(asdict(one)) for one in computed.figures],
+        "focus": [_plain(asdict(metrics)) for metrics in computed.figures],
     }
     meets = computed.meets_um
     values["rays_meet_um"] = None if meets is None else list(meets)
@@ -967,9 +970,9 @@ def psf_numbers(computed: Computed) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """A value with None in place of numbers that are not finite."""
     if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
+        return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

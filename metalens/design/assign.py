@@ -530,9 +530,15 @@ class _MetricSums:
         self.field = 0j  # sum of T exp(i error)
         self.level = self.power = self.square = self.worst = 0.0
 
-    def add(self, wanted: Array, phase: Array, level: Array) -> None:
-        """Add pillars: wanted and assigned phase in rad, and |T|."""
-        error = np.remainder(phase - wanted + np.pi, 2 * np.pi) - np.pi
+    def add(self, target: Array, phase: Array, level: Array) -> None:
+        """Add pillars to the sums.
+
+        Args:
+            target: (n,) target phase, rad.
+            phase: (n,) assigned phase, rad.
+            level: (n,) |T|.
+        """
+        error = np.remainder(phase - target + np.pi, 2 * np.pi) - np.pi
         self.count += error.size
         self.field += complex((level * np.exp(1j * error)).sum())
         self.level += float(level.sum())

@@ -26,15 +26,16 @@ _AXIS = np.zeros((1, 2))  # the point x = y = 0
 
 @dataclass(frozen=True, slots=True)
 class FocusCheck:
-    """Where the light of the design source meets.
+    """Where the light of the design source meets, and how bright it is.
 
-    x_um, y_um: of the brightest point of the sensor plane (0, 0 is meant).
-    z_um: distance of the brightest point of the axis from the sensor plane (0 is
-    meant); nan where not asked for.
-    strehl: peak intensity against all pillars' magnitudes in step.
-    resolution_um: wavelength / (2 NA); depth_um: wavelength / NA².
+    x_um, y_um: of the brightest point of the sensor plane; the target is (0, 0).
+    z_um: distance of the brightest point of the axis from the sensor plane; nan where
+        it was not computed.
+    strehl: peak intensity over that of all pillars in phase.
+    resolution_um: wavelength / (2 NA).
+    depth_um: wavelength / NA².
     expected: Strehl ratio that the pillars' phase errors leave, where they are a
-    compromise.
+        compromise.
     """
 
     x_um: float

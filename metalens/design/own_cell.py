@@ -116,7 +116,9 @@ def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplin
     share = rows.share(sine, weight)
     reduced = [other.share(sine, weight) for other in rows.others]
     truncation = abs(rows.coarser.share(sine, weight) - share)
-    error = truncation + max((abs(one - share) for one in reduced), default=0.0)
+    error = truncation + max(
+        (abs(other_share - share) for other_share in reduced), default=0.0
+    )
     pitches = lens.wavelength_um / (rows.sine[~rows.diagonal] * lens.cell.pitch_um)
     return NeighbourCouplingLoss(
         share,

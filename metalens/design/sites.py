@@ -20,11 +20,15 @@ _BLOCK_SITES = 1 << 21  # sites of one block, so that memory does not grow with 
 
 @dataclass(frozen=True, slots=True)
 class LatticeSites:
-    """Where pillars may stand: centres half a pitch inside a round aperture.
+    """Sites of a lattice that may hold pillars: centres half a pitch inside an
+    aperture.
 
-    shape: (y, x) of the map. steps_um: (x, y) from site to site of the map; on a
-    hexagonal lattice every other site of
-    the map is one of the lattice, the middle one among them.
+    pitch_um: lattice constant.
+    lattice: square or hexagonal.
+    shape: (y, x) of the map.
+    steps_um: (x, y) from site to site of the map. On a hexagonal lattice every other
+        site of the map is one of the lattice, the middle one included.
+    aperture_um: diameter of the aperture.
     """
 
     pitch_um: float

@@ -29,9 +29,9 @@ class OwnRates:
     """Logarithmic derivatives of t at some sizes.
 
     rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0
-        of what such pillars cannot have.
-    edges: (n,) by a bias of all edges, less that by the size, which is what a proxy
-    knows: 0 where a shape keeps its form as its edges move (circles, squares), per um.
+        for errors that such pillars cannot have.
+    edges: (n,) by a bias of all edges less that by the size, per um; 0 where a shape
+        keeps its form as its edges move (circles, squares).
     error: largest relative change (rms over the sizes) of one of them from a coarser
         truncation.
     """

@@ -20,12 +20,13 @@ Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """Pillars as guides of one mode, over their diameters; what the quick derivatives
-    are made of.
+    """Pillars as single-mode waveguides over their diameters, for the quick
+    derivatives.
 
-    k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,)
-        effective index and its derivatives by the diameter. index, around: of pillar
-        and surroundings. height_um, sidewall_rad: of the design.
+    k: wavenumber in vacuum, rad/um. diameter_um: (n,). effective: (n,) effective index.
+    slope, curvature: (n,) its first and second derivative by the diameter. index,
+    around: refractive index of the pillar and of its surroundings. height_um,
+    sidewall_rad: of the design.
     """
 
     k: float
@@ -77,11 +78,11 @@ Kind = type[CDError] | type[ResponseError] | type[WavefrontError]
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """How a process spreads a cause, in PROCESS.toml's table ``spread``.
+    """How a process spreads a cause, by its entry in PROCESS.toml's table ``spread``.
 
-    name, sigma: entry there and its default. share: of the entry's amount that the
-        cause gets; two causes of one entry are the x and y of a direction that every
-        lens draws anew.
+    name, sigma: entry and its default standard deviation. share: factor of the entry's
+        amount for this cause; two causes of one entry are the x and y component of a
+        direction that is random for every lens.
     """
 
     name: str

@@ -26,14 +26,15 @@ _DEGREE = 5  # of the polynomials through these
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solved:
-    """Complex t at some diameters, as power series of single causes; cubic between the
-    diameters.
+    """Complex t of pillars as power series in single fabrication errors.
 
-    wavelength_um: that it was solved at. diameter_um: (n,) rising.
-    powers: (causes, orders, n) of t in powers of the amount of each pillar-response
-        error (um, rad, 1), in the table's order; the first is the designed t, the
-        others are 0 for a cause that was not solved. Between the amounts that were
-        solved a series misses resonances that move by: up to 0.03 of t near them.
+    Cubic splines between the diameters. Between the solved amounts a series misses
+    resonances that pass: up to 0.03 of t near them.
+
+    wavelength_um: at which it was solved. diameter_um: (n,) rising.
+    powers: (causes, orders, n) coefficients of t in powers of the amount of each
+        pillar-response error (um, rad, 1), in the table's order. The first is the
+        designed t; the others are 0 for a cause that was not solved.
     """
 
     wavelength_um: float
@@ -51,20 +52,19 @@ class Solved:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivity:
-    """First-order change of ln t with the pillar-response errors, as polynomials of the
-    diameter.
+    """First-order change of ln t with the pillar-response errors, over the diameter.
 
-    coefficients: (pillar-response errors, degree + 1) complex power series in (D -
-        center_um) of d ln t by the base unit (um, rad, 1) of each; a row of zeros
-        switches a cause off, and so does a row that is not there.
+    coefficients: (pillar-response errors, degree + 1) complex power series in
+        (D - center_um) of d ln t by the base unit (um, rad, 1) of each. A row of zeros,
+        or a row that is missing, switches a cause off.
+    center_um: origin of the power series.
     error: of the slopes, relative to their change across the lens; nan where not known.
-    low_um, high_um: diameters that the polynomials were made for; beyond them they go
-        on along their tangents.
-    solved: t itself under large changes, where a solver was asked; it stands for the
-        proxy then.
+    low_um, high_um: diameters of the fit; beyond them the polynomials continue along
+        their tangents.
+    solved: t itself under large changes from a solver, in place of the proxy.
     edges: (1, degree + 1) likewise of d ln t by a bias of all edges less that by the
-        size, per um: a proxy knows pillars that keep their form as they grow, which a
-        biased rectangle does not; None for those that do.
+        size, per um. A proxy has pillars that keep their form as they grow, which a
+        biased rectangle does not. None for shapes that do.
     pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
     """
 
@@ -130,12 +130,14 @@ class Sensitivity:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """Pillars of given diameters under the pillar-response errors: t over that of the
-    proxy at the design's wavelength.
+    """Response of pillars of given diameters to the pillar-response errors.
 
-    slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
-        orders, *shape) of t in powers of the others, the designed t first; None where
-        all are linear. proxy: (*shape) t of the proxy.
+    t over that of the proxy at the design wavelength.
+
+    slopes: (causes, *shape) d ln t by the causes that act linearly.
+    series: (causes, orders, *shape) of t in powers of the others, the designed t first;
+        None where all are linear.
+    proxy: (*shape) t of the proxy.
     """
 
     slopes: Array

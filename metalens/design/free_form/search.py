@@ -35,13 +35,12 @@ STILL = torch.tensor([[-0.25, 0.25], [0.25, -0.25]])
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DesignScore:
-    """Honest figures of a phase on the quick pupil model.
+    """Figures of a phase on the quick pupil model.
 
-    information: (depths,) I(z) per mm², averaged over sub-pixel positions, with several
-    field angles (angles, depths);
-        minus Eq. 6 (one value) for scenes.
+    information: (depths,), with several field angles (angles, depths), I(z) per mm²
+        averaged over sub-pixel positions; minus Eq. 6 (one value) for scenes.
     encircled: of the same shape (for scenes at their depths), share of the light
-    through the aperture in the radius.
+        through the aperture in the radius.
     """
 
     information: Tensor
@@ -49,17 +48,23 @@ class DesignScore:
 
 
 class Objective(Protocol):
-    """Something to climb."""
+    """An objective of the gradient ascent."""
 
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Loss and encircled energy at some depths; without a generator the same
-        function at every call.
+        """Loss, and encircled energy at some depths.
+
+        Without a generator the same function at every call.
+
+        Args:
+            phase_rad: (nodes, nodes) phase without its focus, rad.
+            focus_um: source distance of the hyperbolic part, um.
+            generator: of random depths, fields and positions.
         """
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """Honest figures."""
+        """Figures of a phase without randomness."""
 
 
 class AxialObjective:
@@ -228,15 +233,17 @@ def _stacks(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FisherPhase:
-    """A designed phase.
+    """A designed free-form phase.
 
     controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every
-    node of the pupil.
+        node of the pupil.
     focus_um: source distance of the hyperbolic part.
     zones: rings of the double helix below, 0 for none.
-    score: of this phase. starts: (information, least encircled energy) that each start
-    reached.
-    converged: whether the encircled energy is kept at every depth. reason: in words.
+    cells: whether the controls are one value for every node.
+    score: of this phase.
+    starts: (information, least encircled energy) of each start.
+    converged: whether the encircled energy is kept at every depth.
+    reason: in words.
     """
 
     controls: Tensor
