@@ -74,8 +74,11 @@ class OverField:
 
 
 def frequencies_per_mm(lens: Lens) -> tuple[float, ...]:
-    """An eighth, a quarter and a half of where a perfect lens of this aperture ends, 2
-    NA / wavelength; 2 digits.
+    """Default frequencies: 1/8, 1/4 and 1/2 of the cut-off 2 NA / wavelength, to 2
+    digits.
+
+    Args:
+        lens: the lens.
     """
     return tuple(
         float(f"{2e3 * share / reach.diffraction_um(lens):.2g}") for share in SHARES

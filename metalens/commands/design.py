@@ -467,7 +467,7 @@ def _is_two_size_library(path: Path) -> bool:
 
 
 def _common(settings: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
-    """Arguments of every assignment."""
+    """Arguments that all assignments of pillars share."""
     return {
         "aperture_um": settings.aperture_mm * 1e3,
         "limits": settings.limits,
@@ -506,7 +506,15 @@ def _fill_limits(
 def _pillars(
     settings: DesignSettings, folder: Path, console: Console
 ) -> tuple[PillarLibrary, dict[str, str]]:
-    """The library of the pillars, and the hash of its file if there is one."""
+    """The library of the pillars, and the SHA-256 of its file by name.
+
+    Without a library file the cell is swept at the wavelengths of the design.
+
+    Args:
+        settings: of the design.
+        folder: that file names are relative to.
+        console: for the progress of the sweep.
+    """
     if settings.library is not None:
         path = folder / settings.library
         return library.load(path), {path.name: store.sha256(path)}
@@ -561,7 +569,9 @@ def _find_phase(
 
 
 def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:
-    """Where the rays of a map that does not focus on the sensor meet."""
+    """Where the rays of a map meet, in words, for a map without a focus on the
+    sensor.
+    """
     meets = design.meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
     sensor, source = focus.sensor_distance_um, focus.source_distance_um
     if meets is None or abs(meets[2] / sensor - 1) <= 0.01:
@@ -573,7 +583,7 @@ def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) ->
 
 
 def format_place(at_um: tuple[float, float, float]) -> str:
-    """Words for a place behind the lens.
+    """A place behind the lens in words: x and y in um, z in mm.
 
     Args:
         at_um: x, y and z.
@@ -590,9 +600,9 @@ def _couple(
     *,
     rotated: bool,
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
-    """The lens with its solved rows where asked for, and its neighbour coupling loss.
+    """The lens, with solved rows under ``--own-cell``, and its neighbour coupling loss.
 
-    None for rotated pillars and phases without a focus.
+    The loss is None for rotated pillars and phases without a focus.
 
     Args:
         designed: the lens.
@@ -602,7 +612,7 @@ def _couple(
         rotated: whether its phase is geometric.
 
     Raises:
-        ConfigError: rows are asked for where there are none.
+        ConfigError: ``--own-cell`` for such pillars or phases.
     """
     if rotated or not quality.focuses:
         if options.own_cell:
@@ -634,7 +644,7 @@ def _check(
         designed: the lens.
         quality: of its pillars.
         options: of the command line.
-        wanted: whether the profile has a focus to check.
+        wanted: whether the profile has a focus that can be checked.
         expected: Strehl ratio that the phase errors leave.
     """
     if options.skip_focus_check or not wanted:

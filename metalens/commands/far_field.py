@@ -41,10 +41,10 @@ HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FarFieldRequest:
-    """What a far field is computed for, kept in the file.
+    """What a far field is computed for; stored in the file.
 
     angles_deg: (x, y) of every direction of incidence. source_mm: inf for plane waves.
-    samples: across.
+    wavelength_nm: in vacuum. samples: across the direction cosines.
     """
 
     angles_deg: tuple[tuple[float, float], ...]
@@ -135,7 +135,7 @@ def save_far_fields(
 
     Args:
         path: file to write.
-        wanted: the request, kept in the file.
+        wanted: the request, stored in the file.
         found: far field of each direction.
         inputs: SHA-256 of each input file.
         page: whether to write NAME.html.
@@ -311,7 +311,14 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
 def _report(
     path: Path, request: FarFieldRequest, fields: list["FarField"], image: bytes
 ) -> None:
-    """Write the report: the picture of directions and the table of beams."""
+    """Write the report: the picture of directions and the table of beams.
+
+    Args:
+        path: of the report.
+        request: directions, source distance, wavelength and samples.
+        fields: far field of each direction.
+        image: PNG of the picture.
+    """
     rows = [
         [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
         for (x, y), field in zip(request.angles_deg, fields, strict=True)

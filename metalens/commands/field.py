@@ -252,7 +252,7 @@ def save_near_field(
 
     Args:
         path: file to write.
-        wanted: the request, kept in the file.
+        wanted: the request, stored in the file.
         found: fields on the cuts xz and yz, and on the maps.
         inputs: SHA-256 of each input file.
     """

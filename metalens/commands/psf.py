@@ -774,7 +774,7 @@ def _of_design(
         device: the lens.
         settings: with nothing left to the lens.
         left_out: solved terms of the error budget; None for rough ones.
-        provenance: kept in the stack.
+        provenance: of the stack.
 
     Raises:
         ConfigError: x and y are focused at other distances.

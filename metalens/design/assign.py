@@ -43,13 +43,13 @@ class Quality:
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
     wavefront_efficiency: |sum T exp(i error)|² / N²: power on the aperture that leaves
-    in the wanted wave front. The focusing efficiency is that of the PSF
+    in the target wave front. The focusing efficiency is that of the PSF
     (:func:`metalens.design.focus_figures`).
     transmission: mean |T|².
     strehl: |sum T exp(i error)|² / (sum T)²: Strehl ratio left by the phase errors.
     field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a
     Strehl ratio of 0.8 on its flat sensor (Maréchal's criterion).
-    max_phase_error_rad: largest difference between wanted and assigned phase.
+    max_phase_error_rad: largest difference between target and assigned phase.
     rms_phase_error_rad: its root mean square over the pillars.
     turns: phase coverage of the pillars over 2 pi; below 1 some phases are replaced by
     the nearest.
@@ -98,7 +98,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class WavelengthTarget:
-    """Wanted phase at one wavelength.
+    """Target phase at one wavelength.
 
     phase: function of position, see :func:`metalens.design.phase_of`.
     focus: what is imaged onto what at this wavelength.
@@ -154,7 +154,7 @@ class ConversionMetrics:
 def phase_of(
     shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float
 ) -> PhaseOf:
-    """Wanted phase of a lens profile in rad as a function of position.
+    """Target phase of a lens profile in rad as a function of position.
 
     Args:
         shape: profile on top of the focus; None for the hyperbolic lens.
@@ -202,18 +202,18 @@ def make(
     provenance: Provenance | None = None,
     accept_partial_turn: bool = False,
 ) -> tuple[Lens, Quality]:
-    """Assign the pillar of the wanted phase to every site (paper Eq. 2 inverted).
+    """Assign the pillar of the target phase to every site (paper Eq. 2 inverted).
 
     Args:
-        phase: function of the sites' x (columns,) and y (rows,) in um to the wanted
+        phase: function of the sites' x (columns,) and y (rows,) in um to the target
             phase (rows, columns) in rad (:func:`phase_of`); called by blocks of rows.
         focus: what is imaged onto what.
         aperture_um: diameter; every pillar's centre lies half a pitch inside it.
         cell: unit cell of the pillars.
         proxy: phase and |t| over the diameter.
         limits: of the process; they narrow the proxy's domain.
-        profile: name kept in the lens.
-        provenance: kept in the lens.
+        profile: name in the lens file.
+        provenance: of the lens file.
         accept_partial_turn: take the nearest phase where the pillars cover less than a
             turn; the quality states the loss.
 
@@ -318,10 +318,11 @@ def assign_polarization_multiplexed(
 ) -> tuple[Lens, PolarizationMetrics]:
     """Assign two-size pillars for light polarised along x and along y.
 
-    Where both phases are one, they share a piston: any polarisation stays as it is.
+    Where both phases are equal they share a piston, so that the lens keeps any
+    polarisation.
 
     Args:
-        phases: wanted for light along x and along y; None: one phase for both.
+        phases: targets for light along x and along y; None: one phase for both.
         focuses: what each images onto what.
         library: response over the two sizes; its entries are the candidates.
         aperture_um, limits, profile, provenance: see :func:`make`.
@@ -408,16 +409,16 @@ def assign_geometric_phase(
     profile: str = "map",
     provenance: Provenance | None = None,
 ) -> tuple[Lens, Quality, ConversionMetrics]:
-    """Rotate pillars of one size by half the wanted phase (Pancharatnam-Berry phase).
+    """Rotate pillars of one size by half the target phase (Pancharatnam-Berry phase).
 
     Args:
         phase, focus, aperture_um, limits, profile, provenance: see :func:`make`.
-        library: for circular light, with its proxy; its best size is taken.
+        library: for circular light, with its proxy; all pillars take its best size.
         hand: of the incident light: right is x + iy, left x - iy.
 
     Returns:
-        The lens (rotations in [0, pi), float32), its quality (that of the converted
-        light), and the conversion.
+        The lens (rotations in [0, pi), float32), the quality of the converted light,
+        and the conversion.
 
     Raises:
         LensError: a library that is not for circular light, pillars that the process
@@ -649,8 +650,8 @@ def _make_lens(
         cell: unit cell of the pillars.
         proxy: phase and |t| over the diameter.
         focus: wavelength, distances and films of the design.
-        profile: name kept in the lens.
-        provenance: kept in the lens.
+        profile: name in the lens file.
+        provenance: of the lens file.
         hand: of the incident circular light; empty for other light.
         pairs: table of pillars of two sizes; None for one size.
     """
@@ -672,7 +673,7 @@ def _make_lens(
 def _coverage(
     proxy: Proxy, wavelength_um: float, span_um: tuple[float, float]
 ) -> float:
-    """Phase coverage over 2 pi."""
+    """Phase coverage over 2 pi of the diameters in a range, at a wavelength."""
     return proxy.coverage_rad(wavelength_um, within_um=span_um) / (2 * math.pi)
 
 
@@ -685,7 +686,14 @@ def _printable_sizes_um(cell: Cell, limits: Limits) -> tuple[float, float]:
 def _table_sizes(
     proxy: Proxy, span_um: tuple[float, float], waves_um: Sequence[float]
 ) -> Array:
-    """Evenly spaced diameters, their steps at most ``_STEP_RAD`` at any wavelength."""
+    """Evenly spaced diameters in um, the phase step at most 0.05 rad at all
+    wavelengths.
+
+    Args:
+        proxy: phase over the diameter.
+        span_um: least and largest diameter.
+        waves_um: vacuum wavelengths.
+    """
     probe = np.linspace(*span_um, 513)
     slopes = [np.abs(proxy.dphase_ddiameter(probe, wave)).max() for wave in waves_um]
     count = math.ceil(float(max(slopes)) * (span_um[1] - span_um[0]) / _STEP_RAD) + 1
@@ -740,7 +748,16 @@ def _covered_share(t: Array, *, isotropic: bool) -> float:
 
 
 def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:
-    """Refuse a pillar that the process does not print at every rotation."""
+    """Refuse a pillar that the process does not print at every rotation.
+
+    Args:
+        cell: unit cell of the pillars.
+        rotated: the solved rotated pillar, with its size.
+        limits: of the process.
+
+    Raises:
+        LensError: a gap between rotated neighbours or a width below the limits.
+    """
     outline = cell.outline(rotated.size_um)
     name = f"a {cell.shape.name} of "
     steps = cell.lattice.steps_um(cell.pitch_um)

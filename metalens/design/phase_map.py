@@ -30,11 +30,11 @@ PERIODS = {  # value of a full turn in other units: the setting that states it
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhaseSamples:
-    """A phase map as it was read.
+    """A phase map in the sampling of its file.
 
-    phase_rad: (y, x), +x right, +y down; nan where the file says that there is no data.
-    step_um: between samples along (x, y). centre_um: (x, y) of the middle of the map,
-    seen from the lens axis.
+    phase_rad: (y, x), +x right, +y down; nan without data.
+    step_um: spacing of the samples along (x, y).
+    centre_um: (x, y) of the middle of the map from the lens axis.
     """
 
     phase_rad: Array
@@ -43,14 +43,14 @@ class PhaseSamples:
 
 
 def read_phase_map(shape: PhaseMap) -> PhaseSamples:
-    """Read the file of a phase map, by the ending of its name, in radians.
+    """Phase map of a file in radians; by the ending of its name.
 
-    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named;
-    ``.dat`` (Zemax grid phase, which brings its own spacing); anything else is text.
-    Text is a matrix of numbers, or three columns x (um), y (um, down) and phase.
-    Columns are separated by commas, or by semicolons, tabs or blanks with decimal
-    commas; lines after #, % or // are comments. A first row or column that counts
-    (0, 1, 2 ... of a table) is no phase.
+    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the named one;
+    ``.dat`` (Zemax grid phase, with its own spacing); anything else is text. Text is a
+    matrix of numbers, or three columns x (um), y (um, down) and phase. Columns are
+    separated by commas, or by semicolons, tabs or blanks with decimal commas; lines
+    after #, % or // are comments. A first row or column that counts (0, 1, 2 ... of a
+    table) is no phase.
 
     Args:
         shape: file, spacing and unit.
@@ -91,7 +91,7 @@ def _require_pitch(path: Path, pitch_um: float | None) -> None:
 
 
 def _square(values: Any, path: Path, shape: PhaseMap) -> PhaseSamples:
-    """A matrix with the same stated spacing along x and y."""
+    """Samples of a matrix with the stated spacing along x and y."""
     _require_pitch(path, shape.pitch_um)
     pitch_um = float(shape.pitch_um or 0)
     return PhaseSamples(_checked(values, path, shape), (pitch_um, pitch_um))
@@ -261,8 +261,9 @@ def _interpolated_phasor(
 
 
 def _blend(samples: Array, position: Array) -> Array:
-    """Linear interpolation along the first axis; positions beyond the ends take the end
-    sample.
+    """Linear interpolation of (n, m) samples along the first axis at (k,) positions.
+
+    Positions beyond the ends take the end sample.
     """
     low = np.clip(np.floor(position).astype(int), 0, len(samples) - 2)
     weight = np.clip(position - low, 0, 1)[:, None]
@@ -271,6 +272,11 @@ def _blend(samples: Array, position: Array) -> Array:
 
 def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
     """Samples of a phase map as (y, x) float64.
+
+    Args:
+        values: array of the file.
+        path: of the file, for messages.
+        shape: stated settings of the map.
 
     Raises:
         LensError: complex, not 2-D, smaller than 2 by 2, infinite values, no finite
@@ -460,7 +466,16 @@ def _no_variable(path: Path, variable: str | None) -> None:
 
 
 def _named(path: Path, arrays: dict[str, Array], variable: str | None) -> Array:
-    """The matrix of that name; without one the only matrix."""
+    """The matrix of a name; without a name the only matrix.
+
+    Args:
+        path: of the file, for messages.
+        arrays: arrays of the file by name.
+        variable: name of the matrix; None for the only one.
+
+    Raises:
+        LensError: no such name, or not exactly one matrix.
+    """
     if variable is not None:
         if variable not in arrays:
             raise LensError(

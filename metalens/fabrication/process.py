@@ -158,8 +158,9 @@ class Spread(_Entries):  # type: ignore[misc]
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One lens of a process: amounts by entry of the spread, and the direction that the
-    lens drew for its gradients.
+    """A random lens of a process.
+
+    amounts: by entry of the spread. turn_rad: direction of its gradients.
     """
 
     amounts: dict[str, float]

@@ -85,6 +85,11 @@ class AxialObjective:
 
         With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
         log(mean I), I per mm² of the images, the means over depths.
+
+        Args:
+            phase_rad: (nodes, nodes) phase without its focus, rad.
+            focus_um: source distance of the hyperbolic part, um.
+            generator: of random depths, fields and positions; None for fixed ones.
         """
         settings = self.settings
         depths, fields, positions = self._sample_views(generator)
@@ -360,7 +365,7 @@ def optimize_free_form(
             Eq. 6 on scenes.
 
     Raises:
-        ConfigError: the settings ask for scenes and no such objective is given.
+        ConfigError: scenes in the settings, without their objective.
     """
     if objective is None:
         if settings.objective != "axial":
