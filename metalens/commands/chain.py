@@ -42,6 +42,11 @@ class ChainFiles:
     budget: bool = True
 
     def __post_init__(self) -> None:
+        """Refuse a bench without a lens, and a bench_design next to a run.
+
+        Raises:
+            ConfigError: with what is needed.
+        """
         if self.bench_design is not None and (
             self.bench_truth is None or self.run is not None
         ):

@@ -136,6 +136,11 @@ class DesignSettings:
     wavelengths: tuple[AdditionalWavelength, ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse an aperture out of range and settings that exclude one another.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
         if not 0 < self.aperture_mm <= 10:
             raise ConfigError(
                 f"aperture_mm = {self.aperture_mm}: need a diameter above 0 and up to 10 mm"

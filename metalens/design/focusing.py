@@ -214,6 +214,11 @@ def _variance_along_x(focus: Focus, radius_um: float, angle_rad: float) -> float
     """Wave-front variance in rad² at a field angle along x, piston and tilt removed.
 
     inf where less than half of the illuminated area of angle 0 is left.
+
+    Args:
+        focus: source and sensor distances, films and stop.
+        radius_um: radius of the aperture.
+        angle_rad: field angle.
     """
     tangent = math.tan(angle_rad)
     x, y, area_um2 = _illuminated_places(focus, radius_um, tangent)

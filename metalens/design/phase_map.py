@@ -568,6 +568,11 @@ def _zemax_head(
 def _zemax_point(path: Path, number: int, words: list[str]) -> float:
     """Phase in rad of one point of a grid-phase file; nan where its nodata flag is 1.
 
+    Args:
+        path: of the file, for messages.
+        number: of the line, for messages.
+        words: of the line.
+
     Raises:
         LensError: no number, or a phase that is not finite.
     """

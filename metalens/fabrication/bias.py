@@ -41,6 +41,11 @@ class Bias:
     range_um: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse several sources of the bias, impossible numbers and steep slopes.
+
+        Raises:
+            ProcessError: naming the setting.
+        """
         if sum((bool(self.table_nm), bool(self.curve_nm), self.csv is not None)) > 1:
             raise ProcessError(
                 "bias is given more than once; keep one of table_nm, curve_nm and csv"

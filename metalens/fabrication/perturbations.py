@@ -126,12 +126,12 @@ class Perturbation:
 
 
 def _height_rate(g: Guide) -> Array:
-    """d ln t / d height of (n,) pillars, per um: i k n_eff."""
+    """d ln t / d height of pillars, per um: i k n_eff."""
     return 1j * g.k * g.effective
 
 
 def _index_rate(g: Guide) -> Array:
-    """d ln t / d n of (n,) pillars: i k h (b n + n D b' / 2) / n_eff.
+    """d ln t / d n of pillars: i k h (b n + n D b' / 2) / n_eff.
 
     b = (n_eff² - n_0²) / (n² - n_0²), with n_0 of the surroundings, is a function of
     D sqrt(n² - n_0²).
@@ -144,7 +144,7 @@ def _index_rate(g: Guide) -> Array:
 
 
 def _sidewall_rate(g: Guide) -> Array:
-    """d ln t / d sidewall angle of (n,) pillars, per rad: i k n_eff'' s h³ / 3.
+    """d ln t / d sidewall angle of pillars, per rad: i k n_eff'' s h³ / 3.
 
     The diameter is that at half height, so that the wall acts in second order.
     """
@@ -152,7 +152,7 @@ def _sidewall_rate(g: Guide) -> Array:
 
 
 def _side_rate(g: Guide) -> Array:
-    """d ln t / d width or length of (n,) pillars, per um: i k h n_eff' / 2.
+    """d ln t / d width or length of pillars, per um: i k h n_eff' / 2.
 
     The mean over both polarisations is half of the diameter's derivative.
     """
@@ -160,7 +160,7 @@ def _side_rate(g: Guide) -> Array:
 
 
 def _zero_rate(g: Guide) -> Array:
-    """(n,) zeros: round pillars without films do not depend on a turn or on films."""
+    """Zeros: round pillars without films do not depend on a turn or on films."""
     return np.zeros_like(g.effective, complex)
 
 

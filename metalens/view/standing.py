@@ -91,12 +91,9 @@ def draw_phase(lens: Lens) -> ImagePanel:
         for end in (d.y_um[-1], d.x_um[-1])
     )
     row, column = nearest_site(d, y[:, None], x[None])
-    polarised = [lens] if lens.pairs is None else [lens.seen("x"), lens.seen("y")]
+    devices = [lens] if lens.pairs is None else [lens.seen("x"), lens.seen("y")]
     values = np.stack(
-        [
-            np.mod(lens_of_light.phase_rad()[row, column] / (2 * np.pi), 1)
-            for lens_of_light in polarised
-        ]
+        [np.mod(device.phase_rad()[row, column] / (2 * np.pi), 1) for device in devices]
     )
     values = np.where(d.diameter_um[row, column] > 0, values, 0.0)
     names = [lens.hand or "any"] if lens.pairs is None else ["along x", "along y"]

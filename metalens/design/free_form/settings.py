@@ -66,6 +66,11 @@ class FisherSettings:
     orthogonality: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse settings out of range.
+
+        Raises:
+            ConfigError: naming the setting and what is needed.
+        """
         if self.depths_mm is not None and not 0 < self.depths_mm[0] < self.depths_mm[1]:
             raise ConfigError(f"depths_mm = {self.depths_mm}: need 0 < least < largest")
         if self.focus_mm is not None and not 0 < self.focus_mm[0] <= self.focus_mm[1]:
