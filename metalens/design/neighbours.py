@@ -57,7 +57,7 @@ def estimate_neighbour_coupling(
         if sine < STEEPEST * cover
     ]
     solutions = [
-        [_mean_factor(lens, *row, truncation) for row, _ in propagating]
+        [_mean(lens, *row, truncation) for row, _ in propagating]
         for truncation in (harmonics, harmonics - 1)
     ]
     fine, coarse = ([factor for factor, _ in solution] for solution in solutions)
@@ -72,7 +72,7 @@ def estimate_neighbour_coupling(
     )
 
 
-def _mean_factor(
+def _mean(
     lens: Lens, count: int, diagonal: bool, harmonics: int
 ) -> tuple[Array, float]:
     """Mean factor (2,) and power lost to other orders, over rows with shifted phases.
