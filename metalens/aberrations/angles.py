@@ -140,6 +140,11 @@ def over_field(
 def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -> None:
     """Refuse field angles, depth or frequencies out of range.
 
+    Args:
+        angles_deg: field angles, within 85 degrees.
+        depth_um: of the sources, above 0.
+        frequencies: per mm, above 0.
+
     Raises:
         PropagationError: naming the argument.
     """

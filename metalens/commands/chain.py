@@ -254,7 +254,11 @@ def chain_stages(files: ChainFiles) -> Iterator[ChainStage]:
 
 
 def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
-    """Stages of library, lens, PSFs and mask."""
+    """Stages of library, lens, PSFs and mask.
+
+    Args:
+        files: settings files; PSFs have defaults without one.
+    """
     yield ChainStage(
         "Pillar library",
         "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
@@ -331,7 +335,11 @@ def _mask() -> ChainStage:
 
 
 def _budget(files: ChainFiles) -> ChainStage:
-    """Stage of the error budget, with the gaze error where there is a run."""
+    """Stage of the error budget, with the gaze error where there is a run.
+
+    Args:
+        files: settings files; their run has the network that reads gaze.
+    """
     lens = (
         ("run/lens.h5", "--run", "run")
         if files.run
@@ -354,6 +362,9 @@ def _budget(files: ChainFiles) -> ChainStage:
 def _bench_stages(files: ChainFiles) -> Iterator[ChainStage]:
     """Stages of the virtual bench: its lens where it has its own, captures and their
     fit.
+
+    Args:
+        files: settings files, with ``bench_truth``.
     """
     metrology = ("--metrology", "bench_metrology.toml") if files.bench_metrology else ()
     if files.bench_design:

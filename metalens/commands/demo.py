@@ -235,7 +235,11 @@ def _section(folder: Path, outcome: StageOutcome) -> report.Section:
 
 
 def _tables(outcome: StageOutcome) -> Iterator[report.Table]:
-    """Tables of a result: its rows, its fitted parameters, and its plain values."""
+    """Tables of a result: its rows, its fitted parameters, and its plain values.
+
+    Args:
+        outcome: of a stage, with the result of its command.
+    """
     listed = outcome.values.get("rows")
     if isinstance(listed, list) and listed and isinstance(listed[0], dict):
         head = [k for k, v in listed[0].items() if not isinstance(v, dict | list)]

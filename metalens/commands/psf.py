@@ -744,6 +744,11 @@ def _of_built(path: Path, settings: PsfSettings, built: AsBuiltSource) -> psf.Ps
 def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens:
     """The lens for the polarisation in the settings.
 
+    Args:
+        path: of the lens file, for messages.
+        device: the lens.
+        settings: with ``light``: both, x or y.
+
     Raises:
         ConfigError: light along x or y of a lens that has no such response.
     """
@@ -911,7 +916,11 @@ def psf_text(target: Path, computed: Computed) -> str:
 
 
 def _figures(spot: psf.FocusMetrics) -> str:
-    """Figures of the sharpest depth of one field angle, in words."""
+    """Figures of the sharpest depth of one field angle, in words.
+
+    Args:
+        spot: FWHM, Strehl ratio, MTF50 and efficiency, with errors and limits.
+    """
     where = f"  at {_angle(spot.angle_rad)}, source at {_depth(spot.depth_um)}"
     if not spot.window_share >= DARK:
         return f"{where}: no image, {spot.window_share:.2g} of the light in the window"
@@ -1014,39 +1023,40 @@ def psf_sections(computed: Computed, pictures: dict[str, bytes]) -> list[Section
     """
     stack = computed.stack
     figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]
+    focus_rows = [
+        [
+            *(f"{x:.3g}" for x in np.rad2deg(spot.angle_rad)),
+            "∞" if math.isinf(spot.depth_um) else f"{1e-3 * spot.depth_um:.4g}",
+            f"{spot.fwhm_um:.4g} ± {spot.fwhm_error_um:.2g}",
+            spot.limit.fwhm_um,
+            f"{spot.strehl:.3f} ± {spot.strehl_error:.2g}",
+            *(f"{1e3 * f:.4g}" for f in spot.mtf50_per_um),
+            1e3 * spot.limit.mtf50_per_um,
+            f"{spot.efficiency:.3f} ± {spot.efficiency_error:.2g}",
+            spot.limit.efficiency,
+        ]
+        for spot in computed.figures
+    ]
     focus = Table(
         FIGURES,
-        [
-            [
-                *(f"{x:.3g}" for x in np.rad2deg(one.angle_rad)),
-                "∞" if math.isinf(one.depth_um) else f"{1e-3 * one.depth_um:.4g}",
-                f"{one.fwhm_um:.4g} ± {one.fwhm_error_um:.2g}",
-                one.limit.fwhm_um,
-                f"{one.strehl:.3f} ± {one.strehl_error:.2g}",
-                *(f"{1e3 * f:.4g}" for f in one.mtf50_per_um),
-                1e3 * one.limit.mtf50_per_um,
-                f"{one.efficiency:.3f} ± {one.efficiency_error:.2g}",
-                one.limit.efficiency,
-            ]
-            for one in computed.figures
-        ],
+        focus_rows,
         "The sharpest depth of every field angle; efficiency: power within three FWHM over power on the aperture.",
     )
     energy = np.asarray(stack.energy_um2)
-    rows = [
+    energy_rows = [
         [f"{x:.3g}", f"{y:.3g}", float(e.min()), float(e.max())]
         for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
     ]
-    table = Table(
+    energy_table = Table(
         ("x / deg", "y / deg", "least", "most"),
-        rows,
+        energy_rows,
         "Light in the window for unit irradiance, µm², over depth.",
     )
     return [
         Section("Pictures", items=figures),
         Section("Focus", items=[focus]),
         Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
-        Section("Energy", f"Method: {stack.reason}.", [table]),
+        Section("Energy", f"Method: {stack.reason}.", [energy_table]),
     ]
 
 

@@ -706,6 +706,10 @@ def _is_printable(library: AxesLibrary, limits: Limits) -> Array:
     For upright pillars on a rectangular lattice the gap is the period less the size.
     Otherwise gaps are computed on a coarse grid of sizes; a pair takes the gap of the
     next larger grid point.
+
+    Args:
+        library: m sizes along x, n along y, and the cell.
+        limits: least diameter and gap of the process.
     """
     x, y, cell = library.x_um, library.y_um, library.cell
     wide = np.minimum(x[:, None], y) >= limits.min_diameter_nm * 1e-3 - 1e-9

@@ -62,8 +62,11 @@ class CandidateTable:
         return self._over_sites(phases_rad, _vertices)
 
     def _over_sites(self, phases_rad: Array, choose: Callable[[Array], Array]) -> Array:
-        """(sites,) results of ``choose`` on the sums (1), in threads by blocks of
-        sites.
+        """(sites,) results of ``choose``, in threads by blocks of sites.
+
+        Args:
+            phases_rad: (channels, sites) target phases, pistons included.
+            choose: (sites, n) sums (1) of a block to its (sites,) results.
         """
         out = np.empty(phases_rad.shape[1])
 

@@ -154,7 +154,13 @@ def _illumination(lens: Lens) -> Any:
 
 
 def _case(lens: Lens, step_um: float, shift_um: float) -> PropagationCase:
-    """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
+    """Propagation case of one sample on the axis.
+
+    Args:
+        lens: the lens.
+        step_um: width of the sample.
+        shift_um: of the sensor away from the lens, in the cover.
+    """
     return propagate.make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),

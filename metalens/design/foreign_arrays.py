@@ -72,10 +72,14 @@ def _check_size(size: int) -> None:
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and bytes of the data elements of level 5 in turn.
+    """Type and bytes of the data elements of a MATLAB file of level 5 in turn.
 
     An element is a tag of 8 bytes (type, size), the data, and zeros up to a multiple of
     8 bytes. Small ones have a tag of 4 bytes and 4 bytes of data.
+
+    Args:
+        content: bytes of the elements.
+        order: byte order, "<" or ">".
 
     Raises:
         ValueError: an element longer than the bytes that are left.

@@ -170,7 +170,15 @@ def power_error(lens: Lens) -> float:
 
 
 def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
-    """(m,) sines by which rings of a lens turn light, and their shares of the area."""
+    """(m,) sines by which rings of a lens turn light, and their shares of the area.
+
+    Gauss-Legendre nodes in the squared radius; sine = NA towards the sensor plus
+    r / hypot(r, source distance).
+
+    Args:
+        lens: the lens.
+        radius_um: radius of the aperture, um.
+    """
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
     focus = Focus(

@@ -119,6 +119,10 @@ def _refuse_other_unit(values: Array, path: Path) -> None:
     means: span within 10 % below the period, one step above 3/4 of the span, and a
     median step below 1/4.
 
+    Args:
+        values: (y, x) samples of the file.
+        path: of the file, for messages.
+
     Raises:
         LensError: with the setting that states the unit.
     """
@@ -323,6 +327,10 @@ def _npy(path: Path, variable: str | None) -> Any:
 
 def _text(path: Path, shape: PhaseMap) -> PhaseSamples:
     """A phase map of a text file: a matrix, or rows of x, y and phase.
+
+    Args:
+        path: of the file.
+        shape: stated spacing and unit of the map.
 
     Raises:
         LensError: not text, fewer than two rows, or values that are no numbers.
@@ -537,8 +545,14 @@ def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
 def _zemax_head(
     path: Path, words: list[str]
 ) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
-    """(columns, rows), spacing (x, y) and centre (x, y) in um of a grid-phase head, +y
-    down.
+    """Size, spacing and centre of the grid in the head of a grid-phase file.
+
+    Args:
+        path: of the file, for messages.
+        words: of the first line, ``nx ny delx dely unitflag [xdec ydec]``.
+
+    Returns:
+        Columns and rows, spacing (x, y) and centre (x, y) in um, +y down.
 
     Raises:
         LensError: words that are no head, or a grid below 2 by 2 points.

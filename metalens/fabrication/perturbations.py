@@ -264,7 +264,13 @@ def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
 def _side(
     name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
 ) -> Perturbation:
-    """Row of an error in nm of one side of all rectangles or ellipses."""
+    """Row of an error in nm of one side of all rectangles or ellipses.
+
+    Args:
+        name: of the row.
+        meaning: for reports.
+        numbers: rates of a cell's numbers by that side.
+    """
     acts = ResponseError(_side_rate, numbers)
     return Perturbation(
         name,
@@ -281,7 +287,13 @@ def _side(
 
 
 def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
-    """Row of an error in nm of the film heights under or on the pillar."""
+    """Row of an error in nm of the film heights under or on the pillar.
+
+    Args:
+        name: of the row.
+        meaning: for reports.
+        under: films under the pillar's own material in place of those on it.
+    """
     acts = ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=under))
     return Perturbation(
         name,

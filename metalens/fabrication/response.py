@@ -353,10 +353,13 @@ def designed_transmission(
 def _phase_and_level(
     proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float
 ) -> tuple[Array, Array]:
-    """Phase in rad and |T| of pillars, along their tangents beyond the proxy's
-    diameters.
+    """Phase in rad and |T| of pillars, along tangents beyond the proxy's diameters.
 
-    The wavelength lies within the proxy's range.
+    Args:
+        proxy: phase and |T| over the diameter.
+        d_um: diameters of any shape, um.
+        wavelength_um: within the proxy's range, um.
+        angle_rad: angle of incidence in air, rad.
     """
     at = wavelength_um, angle_rad
     inside = np.clip(d_um, *proxy.domain_um)

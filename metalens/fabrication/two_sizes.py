@@ -119,6 +119,11 @@ class Kinds:
     ) -> Array:
         """(y, x) int32 kind of each site, from 0; the number of kinds where no pillar
         stands.
+
+        Args:
+            diameters: map of pillars of these kinds.
+            rows: of the map.
+            columns: of the map.
         """
         keys = _keys(diameters, rows, columns)
         return np.where(
@@ -131,6 +136,11 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
     pillar.
 
     The width is in the upper 32 bits, the length in the lower (0 for one size).
+
+    Args:
+        diameters: map of the pillars.
+        rows: of the map.
+        columns: of the map.
     """
     width = np.rint(
         np.asarray(diameters.diameter_um[rows])[:, columns] / _ENTRY_UM

@@ -296,6 +296,10 @@ def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
     """Table of the relative L2 error of the PSFs by cause, one column for every stack.
 
     A dash where the error by a cause is not known.
+
+    Args:
+        stacks: with their error budgets.
+        names: of the columns.
     """
     budgets = [dataclasses.asdict(stack.budget) for stack in stacks]
     rows = [

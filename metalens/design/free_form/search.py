@@ -458,8 +458,11 @@ class _Best:
         self.score: DesignScore | None = None
 
     def update(self, controls: Tensor, phase: Tensor) -> float:
-        """Judge an iterate and keep it if best; least encircled energy minus the
-        bound.
+        """Judge an iterate and keep it if best; least encircled energy minus the bound.
+
+        Args:
+            controls: of the last grid.
+            phase: (nodes, nodes) phase of these, rad.
         """
         score = self.objective.judge(phase.detach(), self.focus_um)
         margin = float(score.encircled.min()) - self.settings.encircled
