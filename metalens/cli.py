@@ -144,8 +144,8 @@ _LARGEST = 1e9  # size of a number among options, in its unit
 _PARTED = re.compile(
     r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+"
 )  # numbers of an option, with commas
-_AGAIN_S = 0.02  # after which a dropped interrupt comes again
-_OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
+_AGAIN_S = 0.02  # delay after which a dropped interrupt is raised again
+_PREVIOUS_HOOK: list[Any] = []  # the hook for dropped exceptions before this one
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -167,25 +167,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Streams that were closed lead nowhere: the next file would take their number, and
-    what libraries say with it.
+    """Open closed standard streams on the null device.
+
+    Otherwise the next file would take their number, and the output of libraries with
+    it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            nowhere = os.open(os.devnull, os.O_RDWR)
-            if nowhere != number:
-                os.dup2(nowhere, number)
-                os.close(nowhere)
-            setattr(
-                sys,
-                name,
-                os.fdopen(
-                    number, "w" if number else "r", encoding="utf-8", closefd=False
-                ),
-            )
+            null = os.open(os.devnull, os.O_RDWR)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            mode = "w" if number else "r"
+            stream = os.fdopen(number, mode, encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
 
 
 def _main(arguments: Sequence[str] | None) -> int:
+    """Handle help, version and unknown commands, else run the verb; the exit status.
+
+    Args:
+        arguments: words of the command line; None for those of the process.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -213,43 +216,45 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _prepare() -> None:
-    """What a command needs of the process that it runs in."""
-    for name in (
-        "SIGTERM",
-        "SIGHUP",
-    ):  # a lost terminal ends a command as Ctrl-C does, unless under nohup
+    """Set signals, hooks and the environment of the process for a command."""
+    # a lost terminal ends a command as Ctrl-C does, unless under nohup
+    for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _stop)
-    if sys.unraisablehook is not _not_lost:
-        _OTHERWISE[:] = [sys.unraisablehook]
-        sys.unraisablehook = _not_lost
-    # Threads of OpenMP that wait give their core away early: beside another busy
-    # program training is ten times slower
-    # where they spin as long as they do by default; alone it is a tenth slower so.
+    if sys.unraisablehook is not _raise_again:
+        _PREVIOUS_HOOK[:] = [sys.unraisablehook]
+        sys.unraisablehook = _raise_again
+    # Waiting threads of OpenMP release their core early: spinning by default makes
+    # training ten times slower next to another busy program, and alone a tenth faster.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     _numba_cache()
 
 
 def _guarded(words: list[str], *, debug: bool) -> int:
-    """Run the command; its exit status, with one line for whatever stopped it."""
+    """Run the command; its exit status, with one line on stderr for any error.
+
+    Args:
+        words: of the command line.
+        debug: show the traceback too.
+    """
     from metalens.core import store
 
     token = store.COMMAND.set(" ".join(words))
     try:
-        return _shown(words) if debug else _dispatch(words[0], words[1:])
+        return _with_traceback(words) if debug else _dispatch(words[0], words[1:])
     except FitRefused as error:
-        return _refuse(_said(error), FAILED_CHECK)
+        return _refuse(_message(error), FAILED_CHECK)
     except (MetalensError, OSError) as error:
-        return _refuse(_said(error))
+        return _refuse(_message(error))
     except ModuleNotFoundError as error:
-        told_of = missing_extra(error)
-        if told_of is None:
+        hint = missing_extra(error)
+        if hint is None:
             raise
-        return _refuse(told_of)
+        return _refuse(hint)
     except KeyboardInterrupt as error:
         return _refuse(
-            _said(
+            _message(
                 error,
                 "interrupted; the output is as it was before, or new if it was finished",
             ),
@@ -257,17 +262,16 @@ def _guarded(words: list[str], *, debug: bool) -> int:
         )
     except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
         return _refuse(
-            f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}"
+            f"{type(error).__name__}: {_line(error)}; not foreseen: {_write_report(words)}"
         )
     finally:
         if hasattr(signal, "setitimer"):
-            signal.setitimer(
-                signal.ITIMER_REAL, 0
-            )  # an interrupt that was dropped and came otherwise comes no more
+            # a dropped interrupt that came by another way is not raised again
+            signal.setitimer(signal.ITIMER_REAL, 0)
         store.COMMAND.reset(token)
 
 
-def _shown(words: list[str]) -> int:
+def _with_traceback(words: list[str]) -> int:
     """Run with --debug: the traceback of any error is shown before its one line."""
     try:
         return _dispatch(words[0], words[1:])
@@ -280,10 +284,8 @@ def _line(error: BaseException) -> str:
     return " ".join(str(error).split())[:300] or "no words"
 
 
-def _reported(words: list[str]) -> str:
-    """Write what a maintainer needs to a file in the folder for temporary files; where
-    it lies.
-    """
+def _write_report(words: list[str]) -> str:
+    """Write command and traceback to a temporary file; a sentence with its name."""
     try:
         handle, name = tempfile.mkstemp(prefix="metalens-error-", suffix=".txt")
         with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
@@ -296,8 +298,8 @@ def _reported(words: list[str]) -> str:
 
 
 def _numba_cache() -> None:
-    """Where neither the installation nor the home can be written, compiled loops are
-    kept among temporary files.
+    """Set a temporary cache of compiled loops where neither package nor home is
+    writable.
     """
     here, home = os.path.dirname(__file__), os.path.expanduser("~")
     if (
@@ -310,12 +312,18 @@ def _numba_cache() -> None:
     atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
 
 
-def _said(error: BaseException, words: str = "") -> str:
-    """The words of an error, with what was noted on its way up."""
+def _message(error: BaseException, words: str = "") -> str:
+    """The text of an error, or ``words``, with the notes added on its way up."""
     return "; ".join([words or str(error), *getattr(error, "__notes__", ())])
 
 
 def _dispatch(verb: str, words: list[str]) -> int:
+    """Parse the options of a verb and run it; the exit status.
+
+    Args:
+        verb: name of the verb.
+        words: of the command line after it.
+    """
     import tyro
 
     module = importlib.import_module(VERBS[verb][0])
@@ -324,13 +332,13 @@ def _dispatch(verb: str, words: list[str]) -> int:
         if not words or words[0] in ("-h", "--help"):
             report.flush_output(_help(parts, f"metalens {verb}"))
             return SUCCESS if words else BAD_INPUT
-        meant = words[0] if words[0] in parts else module.part_of(words[0])
-        if meant is None:
+        part = words[0] if words[0] in parts else module.part_of(words[0])
+        if part is None:
             return _refuse(
                 f"unknown command {verb} {words[0]!r}{nearest_name_hint(words[0], parts)}"
             )
-        module = importlib.import_module(parts[meant][0])
-        verb, words = f"{verb} {meant}", words[words[0] in parts :]
+        module = importlib.import_module(parts[part][0])
+        verb, words = f"{verb} {part}", words[words[0] in parts :]
     if verb == "psf":
         module.SOURCES.update(PSF_SOURCES)
     try:
@@ -350,26 +358,29 @@ def _dispatch(verb: str, words: list[str]) -> int:
                 f"{parted}: part the numbers of a list by blanks, as {separated}; a decimal has a point"
             )
         raise
-    _refuse_beyond_reach(options)
+    _check_numbers(options)
     for name, where in WHOLE.get(verb, {}).items():
         if getattr(options, name) is not None:
-            place, _, load = where.partition(":")
-            getattr(importlib.import_module(place), load)(getattr(options, name))
+            source, _, function = where.partition(":")
+            load = getattr(importlib.import_module(source), function)
+            load(getattr(options, name))
     work = importlib.import_module(getattr(module, "WORK", module.__name__))
     return int(work.run(options))
 
 
-def _refuse_beyond_reach(options: Any) -> None:
-    """The rule of settings files (:func:`metalens.core.config.load`) for the numbers
-    among options.
+def _check_numbers(options: Any) -> None:
+    """Refuse numbers among the options that are not finite or above 1e9.
+
+    As :func:`metalens.core.config.load` does for settings files; infinity stays where
+    the option allows it.
 
     Raises:
-        ConfigError: one that is not finite, or too large to mean anything.
+        ConfigError: naming the option.
     """
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         if dataclasses.is_dataclass(value):
-            _refuse_beyond_reach(value)
+            _check_numbers(value)
         if repr(value) == repr(field.default):
             continue
         for number in value if isinstance(value, tuple) else (value,):
@@ -413,12 +424,14 @@ def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _not_lost(dropped: Any) -> None:
-    """An interrupt that came where Python drops every exception (a callback of an
-    import, a finaliser) comes again.
+def _raise_again(dropped: Any) -> None:
+    """Raise an interrupt again that Python dropped (in a callback of an import, a
+    finaliser).
+
+    Other dropped exceptions go to the previous hook.
     """
     if issubclass(dropped.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _stop)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     else:
-        _OTHERWISE[0](dropped)
+        _PREVIOUS_HOOK[0](dropped)

@@ -22,40 +22,38 @@ from metalens.optics import media
 from metalens.psf import passed_um2
 
 SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are given
-# depths of focus on either side of the foci of close rays where the sharpest line is
-# looked for
-BEYOND = 4.0
-STEPS = 2.0  # of a depth of focus, wavelength index / NA²
-MOST_STEPS = 400
-CONVERGED = 1e-3  # of a depth of focus
-PATCHES = 512  # along an axis, over what a stop lights
+BEYOND = 4.0  # depths of focus scanned on either side of the foci of close rays
+STEPS = 2.0  # of the scan in a depth of focus, wavelength index / NA²
+MOST_STEPS = 400  # of the scan
+CONVERGED = 1e-3  # of a depth of focus: tolerance of the sharpest plane
+PATCHES = 512  # along an axis, over the light of a stop in the pillars' plane
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OverField:
-    """Aberrations of a lens at its design wavelength; NaN where ``left_out`` says why
-    there is no number.
+    """Aberrations of a lens at its design wavelength, over n field angles.
 
-    angles_deg: (n,) field angles along x. depth_um: of the source. sensor_distance_um:
-    of the lens.
+    Numbers that do not exist are nan; ``left_out`` says why.
+
+    angles_deg: (n,) field angles along x.
+    depth_um: of the source.
+    sensor_distance_um: of the lens.
     chief_um: (n, 2) where the chief ray meets the sensor, [x, y] from the axis.
-    distortion: (n,) by how much farther it lies from that of angle 0 than the linear
-    image about angle 0 has it, along
-        the latter: (X - X0)·u / |M s| - 1, u = M s / |M s|, s the source from the one at angle 0.
+    distortion: (n,) (X - X0)·u / |M s| - 1 against the linear image around angle 0:
+        u = M s / |M s|, s the source from that of angle 0.
     close_um: (n, 2) tangential and sagittal focus of rays close to the chief ray,
-    behind the sensor (+) or before it.
+        behind the sensor (+) or before it.
     close_error_um: (n, 2) one sigma of these.
     sharpest_um: (n, 2) the same of the whole aperture: where the line image along x
-    (tangential) and along y
-        (sagittal) is sharpest, largest ∫ L² / (∫ L)².
+        (tangential) and along y (sagittal) is sharpest, largest ∫ L² / (∫ L)².
     vignetting: (n,) share of the light through the stop's hole that misses the pillars;
-    0 where the lens is its own.
+        0 without a stop.
     illumination: (n,) irradiance in the image of an evenly bright (Lambertian) plane,
-    over that at angle 0.
-    frequencies_per_mm: (m,). mtf: (n, 2, m) modulation along x (tangential) and y
-    (sagittal), of all light that passes
-        the lens. held: (n,) share of it in the waves about the rays, beyond which is
-        light without detail.
+        over that at angle 0.
+    frequencies_per_mm: (m,) of the MTF.
+    mtf: (n, 2, m) modulation along x (tangential) and y (sagittal), of all light that
+        passes the lens.
+    held: (n,) share of it in the waves about the rays; the other light has no detail.
     left_out: what has no number, and why; one line each.
     """
 
@@ -76,8 +74,11 @@ class OverField:
 
 
 def frequencies_per_mm(lens: Lens) -> tuple[float, ...]:
-    """An eighth, a quarter and a half of where a perfect lens of this aperture ends, 2
-    NA / wavelength; 2 digits.
+    """Default frequencies: 1/8, 1/4 and 1/2 of the cut-off 2 NA / wavelength, to 2
+    digits.
+
+    Args:
+        lens: the lens.
     """
     return tuple(
         float(f"{2e3 * share / reach.diffraction_um(lens):.2g}") for share in SHARES
@@ -91,54 +92,62 @@ def over_field(
     depth_um: float | None = None,
     frequencies: tuple[float, ...] | None = None,
 ) -> OverField:
-    """Distortion, field curvature, vignetting, relative illumination and MTF of a lens
-    over field angles along x.
+    """Distortion, field curvature, vignetting, illumination and MTF over field angles.
 
     Args:
-        angles_deg: of the rays to the middle of the lens, in air; either sign.
-        depth_um: of the sources, a plane; left out, the depth of best focus that the
-            lens was made for.
-        frequencies: in periods per mm on the sensor; left out,
+        lens: the lens.
+        angles_deg: of the rays to the middle of the lens along x, in air; either sign.
+        depth_um: of the sources, a plane; by default the depth of best focus of the
+            lens.
+        frequencies: (m,) in periods per mm on the sensor; by default
             :func:`frequencies_per_mm`.
 
     Raises:
         PropagationError: no angle, one of 85 degrees or more, a frequency or depth that
-            is not above 0, a source behind
-            the stop or in the films, light beyond a critical angle; DomainError: an
-            angle outside the lens's library.
+            is not above 0, a source behind the stop or in the films, light beyond a
+            critical angle.
+        DomainError: an angle outside the lens's library.
 
     Accuracy: MTF 1e-3 (waves beyond those in the directions of the rays); the sharpest
-    line to a thousandth of a depth
-        of focus, wavelength / NA²; vignetting 1e-4; rays as in
-        :func:`metalens.aberrations.chief_ray`.
+        line to a thousandth of a depth of focus, wavelength / NA²; vignetting 1e-4;
+        rays as in :func:`metalens.aberrations.chief_ray`.
     """
     depth = lens.source_distance_um if depth_um is None else float(depth_um)
-    wanted = np.array(
+    per_mm = np.array(
         frequencies_per_mm(lens) if frequencies is None else frequencies, float
     )
-    _check(angles_deg, depth, wanted)
+    _check(angles_deg, depth, per_mm)
     failures: list[str] = []
-    origin = _chief(lens, 0.0, depth, failures)
+    origin = _chief_or_note(lens, 0.0, depth, failures)
     base = math.nan
     if origin is not None:
-        base = _brightness(lens, 0.0, depth, origin) * float(
-            passed_um2(lens, (0.0, 0.0), (depth,))[0]
-        )
+        passed = float(passed_um2(lens, (0.0, 0.0), (depth,))[0])
+        base = _brightness(lens, 0.0, depth, origin) * passed
     rows = []
     for angle in angles_deg:
-        chief = origin if angle == 0 else _chief(lens, angle, depth, failures)
-        rows.append(_aberrations_at(lens, angle, depth, (origin, chief), wanted / 1e3))
+        chief = origin if angle == 0 else _chief_or_note(lens, angle, depth, failures)
+        rows.append(_aberrations_at(lens, angle, depth, (origin, chief), per_mm / 1e3))
         rows[-1]["illumination"] = rows[-1]["illumination"] / base
         if np.isnan(rows[-1]["sharpest_um"]).any():
             failures.append(f"no sharpest line about the sensor at {angle:g} degrees")
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return OverField(
-        np.array(angles_deg, float), depth, lens.sensor_distance_um, frequencies_per_mm=wanted,
+        np.array(angles_deg, float), depth, lens.sensor_distance_um, frequencies_per_mm=per_mm,
         left_out=tuple(dict.fromkeys(failures)), **columns,
     )  # fmt: skip
 
 
 def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -> None:
+    """Refuse field angles, depth or frequencies out of range.
+
+    Args:
+        angles_deg: field angles, within 85 degrees.
+        depth_um: of the sources, above 0.
+        frequencies: per mm, above 0.
+
+    Raises:
+        PropagationError: naming the argument.
+    """
     if not angles_deg or not np.all(np.abs(angles_deg) < 85):
         raise PropagationError(
             f"angles_deg = {tuple(angles_deg)}: need one field angle or more, between -85 and 85"
@@ -155,9 +164,10 @@ def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -
         )
 
 
-def _chief(
+def _chief_or_note(
     lens: Lens, angle_deg: float, depth_um: float, failures: list[str]
 ) -> ChiefRay | None:
+    """Chief ray of a field angle along x; None with a note in ``failures`` if none."""
     try:
         return chief_ray(lens, (math.radians(angle_deg), 0.0), depth_um)
     except PropagationError as error:
@@ -182,47 +192,62 @@ def _aberrations_at(
         per_um: (m,) frequencies of the MTF.
     """
     angle, chief = (math.radians(angle_deg), 0.0), rays[1]
-    none = np.full(2, math.nan)
+    unknown = np.full(2, math.nan)
     light = plane_waves_of_source(lens, angle, depth_um)
-    here = light.at(lens.sensor_distance_um)
-    close = none if chief is None else chief.focus_um - lens.sensor_distance_um
+    at_sensor = light.at(lens.sensor_distance_um)
+    close = unknown
+    illumination = math.nan
+    if chief is not None:
+        close = chief.focus_um - lens.sensor_distance_um
+        brightness = _brightness(lens, angle_deg, depth_um, chief)
+        illumination = light.passed_um2 * brightness
+    sharpest = _sharpest(lens, light, angle[0], close)
     return {
-        "chief_um": none if chief is None else chief.meets_um,
+        "chief_um": unknown if chief is None else chief.meets_um,
         "distortion": _distortion(*rays),
         "close_um": close,
-        "close_error_um": none if chief is None else chief.focus_error_um,
-        "sharpest_um": _sharpest(lens, light, angle[0], close)
-        - lens.sensor_distance_um,
-        "illumination": math.nan
-        if chief is None
-        else light.passed_um2 * _brightness(lens, angle_deg, depth_um, chief),
+        "close_error_um": unknown if chief is None else chief.focus_error_um,
+        "sharpest_um": sharpest - lens.sensor_distance_um,
+        "illumination": illumination,
         "vignetting": vignetted_share(lens, angle, depth_um),
-        "mtf": np.stack([line_mtf(light, here, axis, per_um) for axis in (0, 1)]),
+        "mtf": np.stack([line_mtf(light, at_sensor, axis, per_um) for axis in (0, 1)]),
         "held": min(light.held, 1.0),
     }
 
 
 def _distortion(origin: ChiefRay | None, chief: ChiefRay | None) -> float:
+    """Distortion (X - X0)·u / |M s| - 1 of a chief ray against the linear image.
+
+    u = M s / |M s|, s the source from that of angle 0, M = ∂X / ∂source at angle 0. nan
+    without a ray, 0 at angle 0.
+
+    Args:
+        origin: chief ray of angle 0.
+        chief: chief ray of the field angle.
+    """
     if origin is None or chief is None:
         return math.nan
     linear = origin.moves @ (chief.source - origin.source)
     size2 = float(linear @ linear)
-    return (
-        float((chief.meets_um - origin.meets_um) @ linear / size2 - 1)
-        if size2 > 0
-        else 0.0
-    )
+    if not size2 > 0:
+        return 0.0
+    return float((chief.meets_um - origin.meets_um) @ linear / size2 - 1)
 
 
 def _brightness(
     lens: Lens, angle_deg: float, depth_um: float, chief: ChiefRay
 ) -> float:
-    """Irradiance in the image of a Lambertian plane, over the light through the lens
-    for unit irradiance on it.
+    """Irradiance in the image of a Lambertian plane, over the light through the lens.
 
-    Irradiance on the lens by an element of the plane (by its tangents at infinity),
-    cos⁴ or 1 / spread of the media
-    before, over the area of the element's image; of an arbitrary unit.
+    The light is that for unit irradiance on the lens. Irradiance on the lens by an
+    element of the plane (cos⁴, or 1 / spread of the media before) over the area of the
+    element's image |det M|; of an arbitrary unit.
+
+    Args:
+        lens: the lens.
+        angle_deg: field angle along x.
+        depth_um: of the plane; at infinity elements are those of the tangents.
+        chief: chief ray of the angle.
     """
     tangents = np.array([math.tan(math.radians(angle_deg)), 0.0])
     slope = float(
@@ -230,27 +255,28 @@ def _brightness(
     )
     p = slope / math.hypot(1, slope)
     if math.isinf(depth_um):
-        falls = (1 - p * p) ** 2
+        irradiance = (1 - p * p) ** 2
     else:
-        falls = 1 / float(
+        irradiance = 1 / float(
             media.area_spreading(lens.layers.before(depth_um, lens.wavelength_um), p)
         )
-    return falls / abs(float(np.linalg.det(chief.moves)))
+    return irradiance / abs(float(np.linalg.det(chief.moves)))
 
 
 def vignetted_share(
     lens: Lens, angle_rad: tuple[float, float], depth_um: float
 ) -> float:
-    """Share of the light through the stop's hole that misses the pillars; 0
-    without a stop.
+    """Share of the light through the stop's hole that misses the pillars; 0 without a
+    stop.
 
-    Shares of patches of the pillars' plane that the hole lights
-    (:meth:`metalens.optics.Layers.stop_share`); the light is taken
-    as even there, as PSFs take it.
+    1 - sum over pillars of (share of the site in the light × its area) / area of the
+    light in the pillars' plane. Shares come from
+    :meth:`metalens.optics.Layers.stop_share`; the light is even there, as PSFs take it.
 
     Accuracy: 1e-4, and that of sites at the rim of the lens.
 
     Args:
+        lens: the lens.
         angle_rad: field angles along x and y, rad.
         depth_um: source depth from the lens, um.
     """
@@ -264,58 +290,80 @@ def vignetted_share(
         lens.layers.footprint_um(depth_um, wave), lens.layers.stop.radius_um
     )
     place, step = np.linspace(-half, half, PATCHES, retstep=True)
-    there = middle[0] + place, (middle[1] + place)[:, None]
-    hole = (
-        float(
-            np.sum(lens.layers.stop_share(tangents, depth_um, wave, there, float(step)))
-        )
-        * float(step) ** 2
-    )
+    patches = middle[0] + place, (middle[1] + place)[:, None]
+    shares = lens.layers.stop_share(tangents, depth_um, wave, patches, float(step))
+    hole_um2 = float(np.sum(shares)) * float(step) ** 2
     sites = d.x_um, d.y_um[:, None]
     share = lens.layers.stop_share(
         tangents, depth_um, wave, sites, math.sqrt(d.site_um2)
     ) * (np.asarray(d.diameter_um) > 0)
-    return max(0.0, 1 - float(share.sum()) * d.site_um2 / hole)
+    return max(0.0, 1 - float(share.sum()) * d.site_um2 / hole_um2)
 
 
 def _sharpest(
     lens: Lens, light: FieldPlaneWaves, angle_rad: float, close_um: Array
 ) -> Array:
-    """(2,) distance behind the pillars where the line images along x and along y are
-    sharpest; NaN at an end.
+    """(2,) distance in um behind the pillars of the sharpest line image along x and y.
+
+    A scan around the foci of close rays, the sensor, and the sensor times cos³ of the
+    angle; then a bounded minimisation. nan where the best plane ends the scan.
+
+    Args:
+        lens: the lens.
+        light: plane waves of the field angle.
+        angle_rad: field angle along x, rad.
+        close_um: (2,) foci of close rays from the sensor, um; nan where not known.
     """
     sensor = lens.sensor_distance_um
-    flat = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    media_after = lens.layers.after(sensor, lens.wavelength_um)
     aperture = max(min(light.aperture), 1e-6)
-    deep = lens.wavelength_um * flat.index[0] / aperture**2
+    depth_of_focus = lens.wavelength_um * media_after.index[0] / aperture**2
     close = sensor + close_um[np.abs(close_um) < sensor]
-    known = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
-    films = sum(flat.thickness_um[1:])
-    low = max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films))
-    high = max(known) + BEYOND * deep
-    count = min(max(math.ceil((high - low) / deep * STEPS), 8), MOST_STEPS)
+    candidates = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
+    films = sum(media_after.thickness_um[1:])
+    low = max(
+        min(candidates) - BEYOND * depth_of_focus, films + 0.05 * (sensor - films)
+    )
+    high = max(candidates) + BEYOND * depth_of_focus
+    count = min(max(math.ceil((high - low) / depth_of_focus * STEPS), 8), MOST_STEPS)
     places, step = np.linspace(low, high, count, retstep=True)
     field = light.at(float(places[0]))
-    ahead = light.at(float(step), np.ones_like(field))
-    found = np.empty((count, 2))
-    for row in found:
-        row[:] = [sharpness_per_um(light, field, axis) for axis in (0, 1)]
-        field = field * ahead
+    step_factor = light.at(float(step), np.ones_like(field))
+    sharpness = np.empty((count, 2))
+    for at_plane in sharpness:
+        at_plane[:] = [sharpness_per_um(light, field, axis) for axis in (0, 1)]
+        field = field * step_factor
     return np.array(
-        [_refine_maximum(light, places, found[:, axis], axis, deep) for axis in (0, 1)]
+        [
+            _refine_maximum(light, places, sharpness[:, axis], axis, depth_of_focus)
+            for axis in (0, 1)
+        ]
     )
 
 
 def _refine_maximum(
-    light: FieldPlaneWaves, places: Array, sharp: Array, axis: int, deep: float
+    light: FieldPlaneWaves,
+    places: Array,
+    sharp: Array,
+    axis: int,
+    depth_of_focus: float,
 ) -> float:
-    """The best of a scan, refined between its neighbours."""
+    """Distance in um of largest sharpness, refined between the neighbours of the best
+    scan.
+
+    Args:
+        light: plane waves of the field angle.
+        places: (n,) scanned distances behind the pillars, um.
+        sharp: (n,) sharpness there, per um.
+        axis: 0 or 1, line image along x or y.
+        depth_of_focus: um; the result is exact to a thousandth of it.
+    """
     best = int(np.argmax(sharp))
     if best in (0, len(places) - 1):
         return math.nan
     ends = float(places[best - 1]), float(places[best + 1])
-    less = minimize_scalar(
+    minimum = minimize_scalar(
         lambda z: -sharpness_per_um(light, light.at(float(z)), axis),
-        bounds=ends, method="bounded", options={"xatol": CONVERGED * deep},
+        bounds=ends, method="bounded", options={"xatol": CONVERGED * depth_of_focus},
     )  # fmt: skip
-    return float(less.x)
+    return float(minimum.x)

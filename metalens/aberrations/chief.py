@@ -15,36 +15,33 @@ from metalens.optics import media
 from metalens.optics.media import Media
 from metalens.psf import library_incidence
 
-ZONES = 2.0  # radius of the pillars that are looked at, in √(wavelength focal length)
-LEAST = 60  # pillars, for 15 terms
-SPARSE = 0.3  # of the sites about the ray: with fewer pillars it has missed the lens
-# rad rms of the phase about its polynomial, beyond which there is no wave front; 1.81
-# is that of any phase
+ZONES = 2.0  # radius of the fitted patch of pillars, in √(wavelength focal length)
+LEAST = 60  # pillars of a patch at least, for 15 terms
+SPARSE = 0.3  # least share of occupied sites; with fewer the ray misses the lens
+# rad rms of the phase about its polynomial above which there is no wave front; a
+# uniformly random phase has 1.81
 ROUGH = 0.6
-POWERS = [(i, j) for i in range(5) for j in range(5 - i)]
-TURNS = 4  # of the polynomial, each taken off the phase before the next
-FAR = 5  # of the width of what is looked at: how far apart slopes are compared
-# squared change of where rays meet over the distance, below which they are parallel to
-# rounding
-PARALLEL = 1e-16
+POWERS = [(i, j) for i in range(5) for j in range(5 - i)]  # terms x^i y^j
+TURNS = 4  # iterations of the polynomial fit
+FAR = 5  # slopes are compared over 1/FAR of the width of the patch
+PARALLEL = 1e-16  # (d lateral shift / d distance)² below which rays are parallel
 STEP = 1e-4  # of differences, in tangents or depths
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChiefRay:
-    """Where the ray through the middle of the stop goes, and the rays close to it;
-    vectors are [x, y].
+    """The chief ray of a source, and the rays close to it; vectors are [x, y].
 
-    at_um: (2,) on the pillars. p: (2,) n sin θ behind them. meets_um: (2,) on the
-    sensor.
+    at_um: (2,) on the pillars.
+    p: (2,) n sin θ behind them.
+    meets_um: (2,) on the sensor.
     focus_um: (2,) distance behind the pillars where close rays spread least along x and
-    along y of the sensor, the
-        films behind kept and the gap before them changed; below 0 for a virtual focus,
-        inf for parallel rays.
-    focus_error_um: (2,) one sigma of it, by how the pillars' phases scatter about their
-    polynomial.
-    source: (2,) where the source lies from the axis, in um; for collimated light its
-    tangents.
+        along y of the sensor, films fixed and the gap before them changed. Below 0 for
+        a virtual focus, inf for parallel rays.
+    focus_error_um: (2,) one sigma of it, by the scatter of the pillars' phases about
+        their polynomial.
+    source: (2,) place of the source from the axis, um; its tangents for collimated
+        light.
     moves: (2, 2) ∂ meets_um / ∂ source.
     """
 
@@ -60,66 +57,54 @@ class ChiefRay:
 def chief_ray(
     lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um: float = math.inf
 ) -> ChiefRay:
-    """The chief ray at the design wavelength: through the middle of the stop, or of the
-    pillars where there is none.
+    """Chief ray of a field angle at the design wavelength, with the foci of close rays.
+
+    It passes through the middle of the stop, or of the pillars without one. The pillars
+    deflect it by the local grating equation: p = p_incident + grad(phase) / k.
 
     Args:
+        lens: the lens.
         angle_rad: (x, y) field angle, arctangents of the slopes in air of the ray to
             the middle of the lens.
         depth_um: of the source, inf for collimated light.
 
     Raises:
         PropagationError: the ray misses the pillars, or is totally reflected; the phase
-            about it is no wave front (a
-            vortex, a hologram); DomainError: an angle outside the lens's library.
+            about it is no wave front (a vortex, a hologram).
+        DomainError: an angle outside the lens's library.
 
     Accuracy: landing and foci to ``focus_error_um`` where pillars err at random; of a
-    smooth phase 2e-6 of the distance
-        and a twentieth of a wavelength. The factor of non-identical neighbours
-        (``lens.neighbours``) is left out.
+        smooth phase 2e-6 of the distance and a twentieth of a wavelength. The factor of
+        non-identical neighbours (``lens.neighbours``) is left out.
     """
     source = source_at(lens, angle_rad, depth_um)
     at = middle_um(lens, source, depth_um)
     slope, curvature, deviations = _wave_front(lens, at, angle_rad)
     p = _incident_direction(lens, at, source, depth_um) + slope
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    w = float(p @ p)
-    if w >= 0.999 * after.layers[0][0] ** 2:
-        raise PropagationError(
-            _failure_text(
-                lens,
-                angle_rad,
-                f"leaves with n sin θ = {math.sqrt(w):.3f}, beyond the media",
-            )
-        )
+    p_square = float(p @ p)
+    if p_square >= 0.999 * after.layers[0][0] ** 2:
+        why = f"leaves with n sin θ = {math.sqrt(p_square):.3f}, beyond the media"
+        raise PropagationError(_failure_text(lens, angle_rad, why))
     q = curvature + _jacobian(
         lambda x: _incident_direction(lens, x, source, depth_um), at, 1.0
     )
     focus = _foci(after, p, q)
-    real = np.isfinite(focus)
-    error = np.where(
-        real,
-        np.sqrt(
-            sum(
-                (_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2
-                for d in deviations
-            )
-        ),
-        np.inf,
-    )
+    finite = np.isfinite(focus)
+    about = np.where(finite, focus, 0)
+    variance = sum((_foci(after, p, q + d) - about) ** 2 for d in deviations)
+    error = np.where(finite, np.sqrt(variance), np.inf)
     step = STEP if math.isinf(depth_um) else STEP * depth_um
-    moved = _jacobian(
+    p_by_source = _jacobian(
         lambda s: _incident_direction(lens, at, s, depth_um), source, step
     )
-    walks = _jacobian(lambda s: middle_um(lens, s, depth_um), source, step)
-    moves = (
-        _reach_derivative(after, p) @ moved
-        + (np.eye(2) + _reach_derivative(after, p) @ q) @ walks
-    )
+    place_by_source = _jacobian(lambda s: middle_um(lens, s, depth_um), source, step)
+    reach_by_p = _reach_derivative(after, p)
+    moves = reach_by_p @ p_by_source + (np.eye(2) + reach_by_p @ q) @ place_by_source
     return ChiefRay(
         at,
         p,
-        at + media.reach_per_direction(after.layers, w) * p,
+        at + media.reach_per_direction(after.layers, p_square) * p,
         focus,
         np.asarray(error),
         source,
@@ -134,8 +119,8 @@ def _failure_text(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
 
 
 def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Array:
-    """(2,) where the source of a field angle lies from the axis, in um; the tangents of
-    collimated light.
+    """(2,) place of the source of a field angle from the axis in um; its tangents at
+    infinity.
 
     Args:
         lens: the lens.
@@ -155,33 +140,41 @@ def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Ar
 
 
 def _incident_direction(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
-    """(2,) n sin θ of the source's light at a place of the pillars."""
+    """(2,) n sin θ of the light of a source at a place of the pillars.
+
+    Args:
+        lens: the lens.
+        x: (2,) place on the pillars, um.
+        source: (2,) place of the source in um; its tangents for collimated light.
+        depth_um: source depth from the lens, um; inf for collimated light.
+    """
     if math.isinf(depth_um):
         return np.asarray(source / math.sqrt(1 + float(source @ source)))
     layers = lens.layers.before(depth_um, lens.wavelength_um).layers
-    away = x - source
+    offset = x - source
     return np.asarray(
-        away
+        offset
         / media.reach_per_direction(
-            layers, media.solve_direction_square(layers, away @ away)
+            layers, media.solve_direction_square(layers, offset @ offset)
         )
     )
 
 
 def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
-    """(2,) where the ray through the middle of the stop meets the pillars; the middle
-    of these without a stop.
+    """(2,) place in um where the ray through the middle of the stop meets the pillars.
+
+    Without a stop it is the centre of mass of the pillars.
 
     Args:
         lens: the lens.
-        source: place of the source, um.
+        source: (2,) place of the source in um; its tangents for collimated light.
         depth_um: source depth from the lens, um.
     """
     stop = lens.layers.stop
     between = lens.layers.from_stop(lens.wavelength_um)
     if stop is None:
-        there = lens.diameters.diameter_um > 0
-        weights = there.sum(0), there.sum(1)
+        occupied = lens.diameters.diameter_um > 0
+        weights = occupied.sum(0), occupied.sum(1)
         axes = lens.diameters.x_um, lens.diameters.y_um
         return np.array([a @ w / w.sum() for a, w in zip(axes, weights, strict=True)])
     if between is None:
@@ -217,15 +210,18 @@ def _reach_derivative(after: Media, p: Array) -> Array:
 
 def _foci(after: Media, p: Array, q: Array) -> Array:
     """(2,) distances behind the pillars where close rays spread least along x and along
-    y: of a bundle that spreads by S + z C, at z = -sum(S C) / sum(C²) behind the sensor.
+    y.
+
+    A bundle spreads by S + z C, with S the identity plus the lateral shift by place; it
+    is least at z = -sum(S C) / sum(C²) behind the sensor. inf for parallel rays.
 
     Args:
         after: media behind the pillars.
-        p: (2,) direction of the chief ray.
+        p: (2,) n sin θ of the chief ray.
         q: (2, 2) ∂p / ∂ place on the pillars, per um.
     """
-    rest = after.index[0] ** 2 - float(p @ p)
-    slopes = np.eye(2) / rest**0.5 + np.outer(p, p) / rest**1.5
+    p_z_square = after.index[0] ** 2 - float(p @ p)
+    slopes = np.eye(2) / p_z_square**0.5 + np.outer(p, p) / p_z_square**1.5
     spread = np.eye(2) + _reach_derivative(after, p) @ q
     change = slopes @ q
     power = (change**2).sum(1)
@@ -241,88 +237,107 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
 def _wave_front(
     lens: Lens, at: Array, angle_rad: tuple[float, float]
 ) -> tuple[Array, Array, list[Array]]:
-    """Slope (2,) and curvature (2, 2) of the pillars' phase over k about a place, and
-    changes of the curvature whose
-    squares add up to its variance."""
+    """Slope and curvature of the pillars' phase over k around a place, with errors.
+
+    A polynomial of 4th order is fitted to the phases of a patch of pillars. Its scatter
+    and the fit's covariance give the errors.
+
+    Args:
+        lens: the lens.
+        at: (2,) place on the pillars, um.
+        angle_rad: (x, y) field angle, rad.
+
+    Returns:
+        (2,) slope, (2, 2) curvature per um, and changes of the curvature whose squares
+        add up to its variance.
+
+    Raises:
+        PropagationError: too few pillars around the place, or a phase that is no wave
+            front.
+    """
     focal = 1 / (1 / lens.reduced_um + 1 / lens.source_distance_um)
-    k, site = 2 * math.pi / lens.wavelength_um, lens.diameters.site_um2
+    k = 2 * math.pi / lens.wavelength_um
+    site = lens.diameters.site_um2
     radius = max(
         ZONES * math.sqrt(lens.wavelength_um * focal),
         math.sqrt(2 * LEAST * site / math.pi),
     )
-    x, y, phase, near = _pillars_near(
-        lens, at, radius, library_incidence(lens, angle_rad)
-    )
+    x, y, phase, inside = _patch(lens, at, radius, library_incidence(lens, angle_rad))
     sites = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
-    wanted, count = max(sites, LEAST), np.count_nonzero(near)
-    if count < wanted:
+    least = max(sites, LEAST)
+    count = np.count_nonzero(inside)
+    if count < least:
         why = (
             f"comes to the pillars' plane at ({at[0]:.1f}, {at[1]:.1f}) um, where the "
-            f"lens has {count} pillars; need {wanted:.0f} about it"
+            f"lens has {count} pillars; need {least:.0f} about it"
         )
         raise PropagationError(_failure_text(lens, angle_rad, why))
-    turn = np.where(near, np.exp(1j * phase), 0.0)
-    first = _initial_polynomial(
-        turn,
+    phasors = np.where(inside, np.exp(1j * phase), 0.0)
+    guess = _initial_polynomial(
+        phasors,
         (x[0] + x[-1], y[0] + y[-1]),
         lens.diameters.steps_um,
         lens.diameters.lattice.centred,
     )
     terms = np.stack(
         [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
-    )[near]
-    series, scatter = _fit_polynomial(
-        terms,
-        turn[near],
-        {(i, j): c * radius ** (i + j) for (i, j), c in first.items()},
-    )
+    )[inside]
+    scaled = {(i, j): c * radius ** (i + j) for (i, j), c in guess.items()}
+    series, scatter = _fit_polynomial(terms, phasors[inside], scaled)
     if scatter > ROUGH:
-        raise PropagationError(
-            _failure_text(
-                lens,
-                angle_rad,
-                f"meets no wave front: phases scatter by {scatter:.2f} rad rms",
-            )
-        )
-    named = dict(zip(POWERS, series / k, strict=True))
-    slope = np.array([named[1, 0], named[0, 1]]) / radius
-    inverse = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
+        why = f"meets no wave front: phases scatter by {scatter:.2f} rad rms"
+        raise PropagationError(_failure_text(lens, angle_rad, why))
+    by_power = dict(zip(POWERS, series / k, strict=True))
+    slope = np.array([by_power[1, 0], by_power[0, 1]]) / radius
+    deviation_columns = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
     deviations = [
         _curvature(dict(zip(POWERS, column, strict=True)), radius)
-        for column in inverse.T
+        for column in deviation_columns.T
     ]
-    return slope, _curvature(named, radius), deviations
+    return slope, _curvature(by_power, radius), deviations
 
 
-def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
-    both = named[1, 1]
-    return np.array([[2 * named[2, 0], both], [both, 2 * named[0, 2]]]) / radius**2
+def _curvature(by_power: dict[tuple[int, int], float], radius: float) -> Array:
+    """(2, 2) second derivatives at 0 of a polynomial in place / radius, per um²."""
+    mixed = by_power[1, 1]
+    return (
+        np.array([[2 * by_power[2, 0], mixed], [mixed, 2 * by_power[0, 2]]]) / radius**2
+    )
 
 
-def _pillars_near(
+def _patch(
     lens: Lens, at: Array, radius: float, tilt_rad: float
 ) -> tuple[Array, Array, Array, Array]:
-    """x (x,) and y (y,) from a place, phase of the pillars (y, x), and which of them
-    lie within a radius.
+    """Pillars within a radius of a place: coordinates, phases, and a mask.
+
+    Args:
+        lens: the lens.
+        at: (2,) place, um.
+        radius: um.
+        tilt_rad: angle of incidence for the library.
+
+    Returns:
+        x (x,) and y (y,) from the place in um, phase (y, x) in rad, and (y, x) which
+        sites hold a pillar inside the radius.
     """
-    d = lens.diameters
+    diameters = lens.diameters
     columns, rows = (
         np.flatnonzero(abs(a - c) <= radius)
-        for a, c in zip((d.x_um, d.y_um), at, strict=True)
+        for a, c in zip((diameters.x_um, diameters.y_um), at, strict=True)
     )
     if not (columns.size and rows.size):
         return np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0), bool)
     across = slice(columns[0], columns[-1] + 1)
     down = slice(rows[0], rows[-1] + 1)
-    x, y = d.x_um[across] - at[0], d.y_um[down] - at[1]
-    near = (x * x + y[:, None] ** 2 <= radius**2) & (
-        np.asarray(d.diameter_um[down, across]) > 0
+    x, y = diameters.x_um[across] - at[0], diameters.y_um[down] - at[1]
+    inside = (x * x + y[:, None] ** 2 <= radius**2) & (
+        np.asarray(diameters.diameter_um[down, across]) > 0
     )
     return (
         x,
         y,
         lens.rows_phase_rad(down, lens.wavelength_um, tilt_rad)[:, across],
-        near,
+        inside,
     )
 
 
@@ -332,48 +347,65 @@ def _initial_polynomial(
     steps: tuple[float, float],
     centred: bool,
 ) -> dict[tuple[int, int], float]:
-    """Slopes and halves of curvatures, by power of x and y, of the phase of (y, x) unit
-    numbers: of neighbours, and of
-    how that differs some pillars on. twice_um: twice the middle (x, y) of the map from
-    where the slopes are wanted."""
-    hop, found = 2 if centred else 1, {}
+    """First guess of a quadratic phase from differences of unit phasors.
+
+    Slopes come from the mean phasor step between neighbours. Curvatures come from the
+    mean change of these steps over a fifth of the patch.
+
+    Args:
+        turn: (y, x) phasors exp(i phase), 0 where there is no pillar.
+        twice_um: twice the middle (x, y) of the map from the place of the slopes, um.
+        steps: spacing of the sites along (x, y), um.
+        centred: whether the lattice has sites on every other place only.
+
+    Returns:
+        Coefficients by power (i, j) of x^i y^j, rad per um^(i + j).
+    """
+    hop = 2 if centred else 1
     next_x = turn[:, hop:] * turn[:, :-hop].conj()
     next_y = turn[hop:] * turn[:-hop].conj()
-    far = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
-    across = next_x[:, far[0] :] * next_x[:, : -far[0]].conj()
-    down = next_y[far[1] :] * next_y[: -far[1]].conj()
-    mixed = next_x[far[1] :] * next_x[: -far[1]].conj()
-    bent = [
-        np.angle(across.sum()) / (hop * far[0] * steps[0] ** 2),
-        np.angle(down.sum()) / (hop * far[1] * steps[1] ** 2),
+    lags = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
+    across = next_x[:, lags[0] :] * next_x[:, : -lags[0]].conj()
+    down = next_y[lags[1] :] * next_y[: -lags[1]].conj()
+    mixed = next_x[lags[1] :] * next_x[: -lags[1]].conj()
+    curvature = [
+        np.angle(across.sum()) / (hop * lags[0] * steps[0] ** 2),
+        np.angle(down.sum()) / (hop * lags[1] * steps[1] ** 2),
     ]
-    twist = np.angle(mixed.sum()) / (hop * far[1] * steps[0] * steps[1])
-    found = {(2, 0): bent[0] / 2, (1, 1): twist, (0, 2): bent[1] / 2}
-    found[1, 0] = (
+    twist = np.angle(mixed.sum()) / (hop * lags[1] * steps[0] * steps[1])
+    series = {(2, 0): curvature[0] / 2, (1, 1): twist, (0, 2): curvature[1] / 2}
+    series[1, 0] = (
         np.angle(next_x.sum()) / (hop * steps[0])
-        - bent[0] * twice_um[0] / 2
+        - curvature[0] * twice_um[0] / 2
         - twist * twice_um[1] / 2
     )
-    found[0, 1] = (
+    series[0, 1] = (
         np.angle(next_y.sum()) / (hop * steps[1])
-        - bent[1] * twice_um[1] / 2
+        - curvature[1] * twice_um[1] / 2
         - twist * twice_um[0] / 2
     )
-    return found
+    return series
 
 
 def _fit_polynomial(
     terms: Array, turn: Array, first: dict[tuple[int, int], float]
 ) -> tuple[Array, float]:
-    """(terms,) polynomial of the phase of (pillars,) unit numbers from a guess of some
-    of its terms, and the rms of
-    what it leaves, rad."""
+    """Least-squares polynomial of a wrapped phase, by iterated wrapped residuals.
+
+    Args:
+        terms: (pillars, terms) powers of the place.
+        turn: (pillars,) phasors exp(i phase).
+        first: guess of some coefficients by power; 0 for the others.
+
+    Returns:
+        (terms,) coefficients in rad, and the rms residual in rad.
+    """
     series = np.array([first.get(power, 0.0) for power in POWERS])
-    solve = np.linalg.pinv(terms)
+    inverse = np.linalg.pinv(terms)
     for _ in range(TURNS):
-        left = turn * np.exp(-1j * (terms @ series))
-        middle = np.angle(left.sum())
+        residual = turn * np.exp(-1j * (terms @ series))
+        middle = np.angle(residual.sum())
         series[0] += middle
-        series += solve @ np.angle(left * np.exp(-1j * middle))
-    left = np.angle(turn * np.exp(-1j * (terms @ series)))
-    return series, float(np.sqrt((left**2).sum() / max(len(turn) - len(POWERS), 1)))
+        series += inverse @ np.angle(residual * np.exp(-1j * middle))
+    residual = np.angle(turn * np.exp(-1j * (terms @ series)))
+    return series, float(np.sqrt((residual**2).sum() / max(len(turn) - len(POWERS), 1)))

@@ -18,32 +18,30 @@ from metalens.optics.media import Media
 from metalens.propagate import paths
 from metalens.psf import SpectralNodes, all_maps
 
-BAND = 1.05  # of the directions of the rays, with FRINGES of diffraction on either side
-FRINGES = 14
-ROOM, MOST_ROOM = (
-    1.05,
-    8.0,
-)  # period of the field over the width of the map; AIRY wavelengths over NA at least
-AIRY = 80.0
+BAND = 1.05  # half width of the computed directions over that of the rays
+FRINGES = 14  # diffraction fringes of the aperture on either side of that band
+ROOM = 1.05  # least period of the field over the width of the map
+MOST_ROOM = 8.0  # largest such period
+AIRY = 80.0  # period of the field in wavelength / NA, within these two bounds
 ROWS = 256  # of the map at a time
-PIECES = 48  # of the map along an axis, whose slopes tell the directions of the rays
-TOGETHER, DARK = (
-    0.5,
-    0.05,
-)  # of a piece's light that has one slope, and of the brightest piece
-STEEPEST = 0.999
+PIECES = 48  # of the map along an axis, whose phase slopes are ray directions
+TOGETHER = 0.5  # least coherence |sum| / sum|.| of a piece with one slope
+DARK = 0.05  # least power of a piece over the brightest piece
+STEEPEST = 0.999  # largest sine over the index
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FieldPlaneWaves:
-    """Plane waves of one field angle at the design wavelength.
+    """Plane waves of one field angle behind a lens at the design wavelength.
 
-    amplitude: (y, x) complex128, √T A. p_x, p_y: (x,), (y,) n sin θ along each axis.
-    spacing: (x, y) of them.
-    light: what leaves the pillars and passes the faces, on the scale of Σ |amplitude|²;
-    passed_um2: the same for unit
-        irradiance on the lens. aperture: half the width (x, y) of the directions of the
-        rim's rays, the NA on axis.
+    amplitude: (y, x) complex128, √T A.
+    p_x, p_y: (x,), (y,) n sin θ along each axis.
+    spacing: (x, y) steps of them.
+    light: power behind the pillars that passes the faces, on the scale of Σ
+        |amplitude|².
+    passed_um2: the same power for unit irradiance on the lens.
+    aperture: half the width (x, y) of the directions of the rim's rays, the NA on axis.
+    wavelength_um: vacuum wavelength.
     after: media behind the pillars, at the lens's own sensor.
     """
 
@@ -63,80 +61,103 @@ class FieldPlaneWaves:
         return float((np.abs(self.amplitude) ** 2).sum()) / self.light
 
     def at(self, distance_um: float, like: Array | None = None) -> Array:
-        """The waves at a distance behind the pillars, the films kept; or ``like`` (y,
-        x) moved so much farther.
+        """Plane-wave amplitudes (y, x) at a distance behind the pillars.
+
+        amplitude exp(i k sum_layers t sqrt(n² - p_x² - p_y²)), films as they are and
+        the gap before them changed.
+
+        Args:
+            distance_um: from the pillars; with ``like`` a further distance in the
+                cover.
+            like: (y, x) amplitudes that are propagated in place of those at the
+                pillars.
         """
         cover = self.after.index[0]
         films = list(
             zip(self.after.index[1:], self.after.thickness_um[1:], strict=True)
         )
-        gap = distance_um - (sum(t for _, t in films) if like is None else 0.0)
-        w = self.p_x**2 + self.p_y[:, None] ** 2
-        pairs = [(cover, gap), *(films if like is None else [])]
-        way = sum(t * np.sqrt(np.maximum(n * n - w, 0.0)) for n, t in pairs if t)
-        return np.asarray(
-            (self.amplitude if like is None else like)
-            * np.exp(2j * np.pi / self.wavelength_um * way)
+        p_square = self.p_x**2 + self.p_y[:, None] ** 2
+        if like is None:
+            amplitude = self.amplitude
+            pairs = [(cover, distance_um - sum(t for _, t in films)), *films]
+        else:
+            amplitude = like
+            pairs = [(cover, distance_um)]
+        path = sum(
+            t * np.sqrt(np.maximum(n * n - p_square, 0.0)) for n, t in pairs if t
         )
+        return np.asarray(amplitude * np.exp(2j * np.pi / self.wavelength_um * path))
 
 
 def plane_waves_of_source(
     lens: Lens, angle_rad: tuple[float, float], depth_um: float
 ) -> FieldPlaneWaves:
-    """Plane waves of a source's light at the design wavelength.
+    """Plane waves behind the pillars of a source's light at the design wavelength.
+
+    The field at the pillars is transformed to n sin θ in the band of the rays'
+    directions, with margins for diffraction. Amplitudes include the transmission of the
+    faces.
 
     Args:
-        angle_rad, depth_um: of the source, as in :func:`metalens.psf.psf_stack`.
+        lens: the lens.
+        angle_rad: field angles along x and y, as in :func:`metalens.psf.psf_stack`.
+        depth_um: source depth from the lens, um.
 
     Raises:
-        DomainError: an angle outside the lens's library; PropagationError: films
-            thicker than their gap, a source
-            behind the stop.
+        DomainError: an angle outside the lens's library.
+        PropagationError: films thicker than their gap, a source behind the stop.
     """
-    wave, d = lens.wavelength_um, lens.diameters
+    wave = lens.wavelength_um
+    d = lens.diameters
     after = lens.layers.after(lens.sensor_distance_um, wave)
-    light_rows = _lighting(lens, angle_rad, depth_um)
+    light_rows = _field_at_pillars(lens, angle_rad, depth_um)
     low, high = _directions(lens, light_rows)
-    found = []
-    for n, step, ends in zip(
-        d.diameter_um.shape[::-1], d.steps_um, zip(low, high, strict=True), strict=True
+    grids = []  # along x and y: length of the transform, step of p, indices of p
+    for n, step, least_p, largest_p in zip(
+        d.diameter_um.shape[::-1], d.steps_um, low, high, strict=True
     ):
-        centre, wide = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
-        least = max(
-            ROOM * n * step, min(AIRY * wave / max(wide, 1e-9), MOST_ROOM * n * step)
+        centre = (least_p + largest_p) / 2
+        half = (largest_p - least_p) / 2
+        period = max(
+            ROOM * n * step, min(AIRY * wave / max(half, 1e-9), MOST_ROOM * n * step)
         )
-        count = scipy.fft.next_fast_len(math.ceil(least / step))
+        count = scipy.fft.next_fast_len(math.ceil(period / step))
         spacing = wave / (count * step)
         reach = min(
-            math.ceil(BAND * wide / spacing + FRINGES * count / n), (count - 1) // 2
+            math.ceil(BAND * half / spacing + FRINGES * count / n), (count - 1) // 2
         )
-        found.append(
-            (count, spacing, round(centre / spacing) + np.arange(-reach, reach + 1))
-        )
-    (nx, dx, at_x), (ny, dy, at_y) = found
-    rows, power = _rows(light_rows, d.diameter_um.shape[0], nx, at_x % nx)
-    amplitude = scipy.fft.fft(rows, ny, axis=0)[at_y % ny]
-    p_x, p_y = at_x * dx, at_y * dy
-    w = p_x**2 + p_y[:, None] ** 2
-    goes = w < (STEEPEST * min(after.order)) ** 2
-    amplitude = amplitude * np.sqrt(
-        np.where(goes, media.passed_at(after.order, np.where(goes, w, 0.0)), 0.0)
-    )
-    faces = float(
-        media.passed_at(
-            after.order, min(float(((low + high) ** 2).sum()) / 4, STEEPEST**2)
-        )
-    )
-    light = nx * ny * power * faces, d.site_um2 * power * faces
+        orders = round(centre / spacing) + np.arange(-reach, reach + 1)
+        grids.append((count, spacing, orders))
+    (nx, dx, orders_x), (ny, dy, orders_y) = grids
+    rows, power = _row_transforms(light_rows, d.diameter_um.shape[0], nx, orders_x % nx)
+    amplitude = scipy.fft.fft(rows, ny, axis=0)[orders_y % ny]
+    p_x = orders_x * dx
+    p_y = orders_y * dy
+    p_square = p_x**2 + p_y[:, None] ** 2
+    travels = p_square < (STEEPEST * min(after.order)) ** 2
+    passed = media.passed_at(after.order, np.where(travels, p_square, 0.0))
+    amplitude = amplitude * np.sqrt(np.where(travels, passed, 0.0))
+    middle_square = min(float(((low + high) ** 2).sum()) / 4, STEEPEST**2)
+    faces = float(media.passed_at(after.order, middle_square))
+    light = nx * ny * power * faces
+    passed_um2 = d.site_um2 * power * faces
     aperture = float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2
-    return FieldPlaneWaves(amplitude, p_x, p_y, (dx, dy), *light, aperture, wave, after)
+    return FieldPlaneWaves(
+        amplitude, p_x, p_y, (dx, dy), light, passed_um2, aperture, wave, after
+    )
 
 
-def _lighting(
+def _field_at_pillars(
     lens: Lens, angle_rad: tuple[float, float], depth_um: float
 ) -> Callable[[Array], Array]:
-    """(rows, x) complex light behind the pillars of some rows of the map, as a function
-    of their numbers.
+    """The complex field behind the pillars, as a function of row numbers to (rows, x).
+
+    |t| exp(i (phase + k path from the source)) times the shadow of the stop.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
     """
     d = lens.diameters
     wave = lens.wavelength_um
@@ -147,14 +168,17 @@ def _lighting(
         d.diameter_um.shape, **d.grid._asdict(), wavelength_um=wave, sensor_distance_um=lens.sensor_distance_um,
         depths_um=depth_um, angle_rad=angle_rad, window_um=1.0, samples=1, layers=lens.layers.open,
     )  # fmt: skip
-    k, width, y = 2 * np.pi / wave, math.sqrt(d.site_um2), d.y_um
+    k = 2 * np.pi / wave
+    width = math.sqrt(d.site_um2)
+    y = d.y_um
 
     def light(rows: Array) -> Array:
         places = d.x_um[None, :], y[rows, None]
-        way = paths.from_source(
+        path = paths.from_source(
             case, *places, case.tangents, case.inverse_depths_per_um[0]
         )
-        field = level[0].numpy()[rows] * np.exp(1j * (phase[0].numpy()[rows] + k * way))
+        total = phase[0].numpy()[rows] + k * path
+        field = level[0].numpy()[rows] * np.exp(1j * total)
         return np.asarray(
             field * lens.layers.shadow(tangents, depth_um, wave, places, width)
         )
@@ -165,57 +189,67 @@ def _lighting(
 def _directions(
     lens: Lens, light_rows: Callable[[Array], Array]
 ) -> tuple[Array, Array]:
-    """Least and largest n sin θ along x and y behind the pillars, (2,) each: slopes of
-    the phase over short pieces of
-    some rows; pieces where pillars do not go together, and those in the dark, are
-    passed over."""
-    d, hop = lens.diameters, 2 if lens.diameters.lattice.centred else 1
+    """(2,) least and (2,) largest n sin θ along x and y behind the pillars.
+
+    They are slopes of the phase, phase steps between neighbours averaged over short
+    pieces of 48 rows. Pieces that are dark or whose pillars have no common slope are
+    left out.
+
+    Args:
+        lens: the lens.
+        light_rows: light of some rows, see :func:`_field_at_pillars`.
+    """
+    d = lens.diameters
+    hop = 2 if d.lattice.centred else 1
     ny, nx = d.diameter_um.shape
     rows = np.unique(np.linspace(0, max(ny - 1 - hop, 0), PIECES).astype(int))
-    near = light_rows(rows)
-    far = light_rows(np.minimum(rows + hop, ny - 1))
-    first = np.arange(0, nx, max(1, nx // PIECES))
+    field = light_rows(rows)
+    next_y = light_rows(np.minimum(rows + hop, ny - 1))
+    starts = np.arange(0, nx, max(1, nx // PIECES))
     low, high = np.zeros(2), np.zeros(2)
-    next_x = np.concatenate([near[:, hop:], np.zeros((len(rows), hop))], axis=1)
-    for axis, other in enumerate((next_x, far)):
-        product = other * near.conj()
-        total = np.add.reduceat(product, first, axis=1)
-        power = np.add.reduceat(np.abs(product), first, axis=1)
-        kept = (np.abs(total) > TOGETHER * power) & (power > DARK * power.max())
-        slope = (
-            np.angle(total[kept])
-            * lens.wavelength_um
-            / (2 * np.pi * hop * d.steps_um[axis])
-        )
-        low[axis], high[axis] = (
-            (slope.min(), slope.max()) if slope.size else (-STEEPEST, STEEPEST)
-        )
+    next_x = np.concatenate([field[:, hop:], np.zeros((len(rows), hop))], axis=1)
+    for axis, other in enumerate((next_x, next_y)):
+        product = other * field.conj()
+        total = np.add.reduceat(product, starts, axis=1)
+        power = np.add.reduceat(np.abs(product), starts, axis=1)
+        bright = (np.abs(total) > TOGETHER * power) & (power > DARK * power.max())
+        step_rad = np.angle(total[bright])
+        slope = step_rad * lens.wavelength_um / (2 * np.pi * hop * d.steps_um[axis])
+        low[axis] = slope.min() if slope.size else -STEEPEST
+        high[axis] = slope.max() if slope.size else STEEPEST
     return low, high
 
 
-def _rows(
-    light_rows: Callable[[Array], Array], ny: int, count: int, kept: Array
+def _row_transforms(
+    light_rows: Callable[[Array], Array], ny: int, count: int, orders: Array
 ) -> tuple[Array, float]:
-    """(y, kept) transforms of the rows of the light behind the pillars, and Σ |light|²
-    over the map.
+    """(y, orders) transforms along x of the light behind the pillars, and sum |light|².
+
+    Args:
+        light_rows: light of some rows, see :func:`_field_at_pillars`.
+        ny: rows of the map.
+        count: length of the transforms, padded with zeros.
+        orders: indices of the frequencies that are returned.
     """
-    out, power = np.empty((ny, len(kept)), complex), 0.0
+    out = np.empty((ny, len(orders)), complex)
+    power = 0.0
     for start in range(0, ny, ROWS):
         rows = np.arange(start, min(start + ROWS, ny))
         light = light_rows(rows)
         power += float((np.abs(light) ** 2).sum())
-        out[rows] = scipy.fft.fft(light, count, axis=1)[:, kept]
+        out[rows] = scipy.fft.fft(light, count, axis=1)[:, orders]
     return out, power
 
 
 def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
-    """Line image along x (0) or y (1) of waves on a plane (:meth:`Waves.at`), of sum 1
-    where all light is in it, and
-    the step of its samples in um; it repeats beyond its ends.
+    """Line image along x (0) or y (1) of waves on a plane, and its sample step in um.
+
+    The sum is 1 where all light is in it. It repeats beyond its ends.
 
     Args:
-        field: sampled field or PSFs.
-        axis: 0: lines along y; 1: along x.
+        waves: plane waves behind the lens.
+        field: (y, x) amplitudes on the plane (:meth:`FieldPlaneWaves.at`).
+        axis: 0: image over x, summed over y; 1: over y.
     """
     along = field if axis == 0 else field.T
     count = scipy.fft.next_fast_len(2 * along.shape[1])
@@ -226,12 +260,13 @@ def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, 
 
 
 def sharpness_per_um(waves: FieldPlaneWaves, field: Array, axis: int) -> float:
-    """∫ L² over (∫ L)² of the line image along an axis: one over how wide it is; a bar
-    of width b gives 1 / b.
+    """Sharpness ∫ L² / (∫ L)² of the line image L along an axis; 1 / b for a bar of
+    width b.
 
     Args:
         waves: plane waves behind the lens.
-        field: sampled field or PSFs.
+        field: (y, x) amplitudes on the plane.
+        axis: 0: along x; 1: along y.
     """
     line, step = line_image(waves, field, axis)
     return float((line**2).sum() / line.sum() ** 2 / step)
@@ -240,13 +275,15 @@ def sharpness_per_um(waves: FieldPlaneWaves, field: Array, axis: int) -> float:
 def line_mtf(
     waves: FieldPlaneWaves, field: Array, axis: int, frequencies_per_um: Array
 ) -> Array:
-    """(frequencies,) modulation transfer along an axis, of all light through the lens:
-    its value just above frequency 0
-    is :attr:`Waves.held`.
+    """(frequencies,) modulation transfer along an axis, of all light through the lens.
+
+    |sum L exp(-2 pi i f x)| of the line image L. Just above frequency 0 it is
+    :attr:`FieldPlaneWaves.held`.
 
     Args:
         waves: plane waves behind the lens.
-        field: sampled field or PSFs.
+        field: (y, x) amplitudes on the plane.
+        axis: 0: along x; 1: along y.
         frequencies_per_um: spatial frequencies, cycles per um.
     """
     line, step = line_image(waves, field, axis)

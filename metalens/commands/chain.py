@@ -42,6 +42,11 @@ class ChainFiles:
     budget: bool = True
 
     def __post_init__(self) -> None:
+        """Refuse a bench without a lens, and a bench_design next to a run.
+
+        Raises:
+            ConfigError: with what is needed.
+        """
         if self.bench_design is not None and (
             self.bench_truth is None or self.run is not None
         ):
@@ -92,21 +97,23 @@ class ChainInputs:
             store.write_bytes(folder / name, content)
 
     def stands_in(self, folder: Path) -> bool:
-        """Whether a folder holds these settings, no others, and the same tables and
-        maps.
+        """Whether a folder holds exactly these settings, and the same tables and maps.
+
+        Args:
+            folder: of a chain.
         """
         settings = {
             name for name in self.contents if "/" not in name and name.endswith(".toml")
         }
-        paths = [(folder / name, content) for name, content in self.contents.items()]
+        files = [(folder / name, content) for name, content in self.contents.items()]
         return settings == {path.name for path in folder.glob("*.toml")} and all(
-            path.is_file() and path.read_bytes() == content for path, content in paths
+            path.is_file() and path.read_bytes() == content for path, content in files
         )
 
 
 def shipped_settings() -> ChainFiles:
     """The demo's own settings, as names of files that :func:`lay_out_inputs` gives."""
-    return _named(
+    return _chain_files(
         SHIPPED, budget=False
     )  # a minute more: asked for with a CHAIN.toml, or metalens budget
 
@@ -115,36 +122,39 @@ def load_chain(path: Path) -> ChainFiles:
     """Read CHAIN.toml.
 
     Args:
-        path: file to read or write.
+        path: of CHAIN.toml.
 
     Raises:
-        ConfigError: see :func:`metalens.core.config.load`; a settings file that is
-            not there.
+        ConfigError: see :func:`metalens.core.config.load`; a settings file that does
+        not
+            exist.
     """
-    found = config.load(path, ChainFiles)
-    for name, value in _given(found):
+    files = config.load(path, ChainFiles)
+    for name, value in _settings_files(files):
         if not (path.parent / value).is_file():
             raise ConfigError(
                 f"{path}: {name} = {str(value)!r}: no such file beside it"
             )
-    return found
+    return files
 
 
 def lay_out_inputs(
     files: ChainFiles, source: Path | None, *, aperture_mm: float | None
 ) -> ChainInputs:
-    """The settings under plain names, and the tables and maps that they name.
+    """Settings files under plain names, with the tables and maps that they name.
 
     Args:
-        source: folder that the files lie in; None for the shipped ones.
-        aperture_mm: put in place of the aperture of the design.
+        files: settings files of the stages.
+        source: folder of the files; None for the shipped ones.
+        aperture_mm: in place of the aperture of the design; None leaves it.
 
     Raises:
         ConfigError: a file that is named lies above its settings file, or two files
-            have one name.
+        have
+            one name.
     """
     contents: dict[str, bytes] = {}
-    for name, value in _given(files):
+    for name, value in _settings_files(files):
         if source is None:
             text = (
                 resources.files("metalens")
@@ -152,7 +162,9 @@ def lay_out_inputs(
                 .read_text(encoding="utf-8")
             )
         else:
-            _bring(contents, source / value)  # refuses what is no settings file
+            _add_named_files(
+                contents, source / value
+            )  # refuses what is no settings file
             text = reading.read_text(source / value)
         if name == "design" and aperture_mm is not None:
             lines = [
@@ -161,53 +173,63 @@ def lay_out_inputs(
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
         contents[f"{name}.toml"] = text.encode()
     return ChainInputs(
-        _named(tuple(name for name, _ in _given(files)), budget=files.budget), contents
+        _chain_files(
+            tuple(name for name, _ in _settings_files(files)), budget=files.budget
+        ),
+        contents,
     )
 
 
-def _bring(contents: dict[str, bytes], settings: Path) -> None:
-    """Take along what a settings file names beside or below it, or in the current
-    folder.
+def _add_named_files(contents: dict[str, bytes], settings: Path) -> None:
+    """Add the files that a settings file names to ``contents``, by their relative
+    names.
 
-    Whole paths are left as they are, and files that the chain makes.
+    They lie in its folder, below it, or in the current folder. Absolute paths and files
+    that the chain makes are left out.
+
+    Args:
+        contents: bytes by name.
+        settings: the settings file.
+
+    Raises:
+        ConfigError: a name with "..", or two files of one name.
     """
-    for word in sorted(set(_words(config.read(settings, ChainFiles)))):
-        found = [
-            place / word
-            for place in (settings.parent, Path())
-            if (place / word).is_file()
+    for name in sorted(set(_file_names(config.read(settings, ChainFiles)))):
+        matches = [
+            folder / name
+            for folder in (settings.parent, Path())
+            if (folder / name).is_file()
         ]
-        if Path(word).is_absolute() or word in MADE or not found:
+        if Path(name).is_absolute() or name in MADE or not matches:
             continue
-        if ".." in Path(word).parts:
+        if ".." in Path(name).parts:
             raise ConfigError(
-                f"{settings}: {word!r} lies above it; put it beside it, or give its whole path"
+                f"{settings}: {name!r} lies above it; put it beside it, or give its whole path"
             )
-        content = found[0].read_bytes()
-        if contents.setdefault(Path(word).as_posix(), content) != content:
+        content = matches[0].read_bytes()
+        if contents.setdefault(Path(name).as_posix(), content) != content:
             raise ConfigError(
-                f"{settings}: {word!r} is not the file of that name beside other settings; rename it"
+                f"{settings}: {name!r} is not the file of that name beside other settings; rename it"
             )
 
 
-def _words(value: Any) -> Iterator[str]:
-    """Texts anywhere in a table that may be the name of a file: with an ending, of one
-    line.
-    """
+def _file_names(value: Any) -> Iterator[str]:
+    """Strings anywhere in a table that may name a file: with an ending, of one line."""
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
-            yield from _words(part)
+            yield from _file_names(part)
     elif isinstance(value, str) and Path(value).suffix and value.isprintable():
         yield value
 
 
-def _named(names: tuple[str, ...], *, budget: bool = True) -> ChainFiles:
-    """Files under plain names."""
+def _chain_files(names: tuple[str, ...], *, budget: bool = True) -> ChainFiles:
+    """Settings files of the chain under plain names, ``NAME.toml``."""
     entries: dict[str, Any] = {name: Path(f"{name}.toml") for name in names}
     return ChainFiles(**entries, budget=budget)
 
 
-def _given(files: ChainFiles) -> Iterator[tuple[str, Path]]:
+def _settings_files(files: ChainFiles) -> Iterator[tuple[str, Path]]:
+    """Name and path of every settings file of a chain."""
     for field in fields(files):
         value = getattr(files, field.name)
         if isinstance(value, Path):
@@ -220,18 +242,23 @@ def chain_stages(files: ChainFiles) -> Iterator[ChainStage]:
     Args:
         files: settings files of the stages.
     """
-    yield from _making(files)
+    yield from _design_stages(files)
     if files.run:
         yield _codesign()
     if files.budget:
         yield _budget(files)
     if files.bench_truth:
-        yield from _bench(files)
+        yield from _bench_stages(files)
         if files.run:
             yield _retrain()
 
 
-def _making(files: ChainFiles) -> Iterator[ChainStage]:
+def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
+    """Stages of library, lens, PSFs and mask.
+
+    Args:
+        files: settings files; PSFs have defaults without one.
+    """
     yield ChainStage(
         "Pillar library",
         "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
@@ -283,6 +310,7 @@ def _making(files: ChainFiles) -> Iterator[ChainStage]:
 
 
 def _mask() -> ChainStage:
+    """Stage of the mask."""
     return ChainStage(
         "Mask",
         "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
@@ -307,26 +335,37 @@ def _mask() -> ChainStage:
 
 
 def _budget(files: ChainFiles) -> ChainStage:
+    """Stage of the error budget, with the gaze error where there is a run.
+
+    Args:
+        files: settings files; their run has the network that reads gaze.
+    """
     lens = (
         ("run/lens.h5", "--run", "run")
         if files.run
         else ("lens.h5", "--library", "library.h5")
     )
-    total = ("gaze_error_deg", "deg of gaze from all links together")
+    error = ("gaze_error_deg", "deg of gaze from all links together")
     if not files.run:
-        total = ("psf_error", "relative error of the PSFs from all links together")
+        error = ("psf_error", "relative error of the PSFs from all links together")
     return ChainStage(
         "Error budget",
         "Every link from pillar to answered gaze, each changed or switched off alone on the frames of the virtual "
         "experiment, and their sum beside the error that the experiment measures there. Without a network nothing reads "
         "gaze: phase and PSF alone have errors.",
         ("budget", *lens, "--process", "process.toml", "-o", "budget.h5"),
-        total,
+        error,
         (("budget.png", "Gaze error of each link, log scale."),),
     )
 
 
-def _bench(files: ChainFiles) -> Iterator[ChainStage]:
+def _bench_stages(files: ChainFiles) -> Iterator[ChainStage]:
+    """Stages of the virtual bench: its lens where it has its own, captures and their
+    fit.
+
+    Args:
+        files: settings files, with ``bench_truth``.
+    """
     metrology = ("--metrology", "bench_metrology.toml") if files.bench_metrology else ()
     if files.bench_design:
         yield ChainStage(
@@ -376,6 +415,7 @@ def _bench(files: ChainFiles) -> Iterator[ChainStage]:
 
 
 def _codesign() -> ChainStage:
+    """Stage of the co-design run."""
     return ChainStage(
         "Co-design",
         "A small network trained through the lens on rendered eyes: pupil, depth of every part of the image from its "
@@ -387,6 +427,7 @@ def _codesign() -> ChainStage:
 
 
 def _retrain() -> ChainStage:
+    """Stage of retraining for the fitted lens."""
     words = (
         "retrain",
         "run",

@@ -50,10 +50,12 @@ class CommonOptions:
         inputs: Sequence[Path] = (),
         room: int = transaction.ROOM,
     ) -> contextlib.AbstractContextManager[OutputDraft]:
-        """Claim a file and its companions before the work; they appear together at the
-        end of the block, or not at all.
+        """Context that claims a file and its companions before the work.
+
+        They appear together at the end of the block, or not at all.
 
         Args:
+            target: file to write.
             companions: endings of the companions, as ``_xz.png``.
             inputs: files that are read, in addition to those that the options name.
             room: bytes that the output needs.
@@ -68,8 +70,14 @@ class CommonOptions:
     def claim_folder(
         self, target: Path, *, inputs: Sequence[Path] = (), room: int = transaction.ROOM
     ) -> contextlib.AbstractContextManager[OutputDraft]:
-        """Claim a folder before the work; it appears whole with its manifest at the end
-        of the block, or not at all.
+        """Context that claims a folder before the work.
+
+        It appears whole with its manifest at the end of the block, or not at all.
+
+        Args:
+            target: folder to write.
+            inputs: files that are read, in addition to those that the options name.
+            room: bytes that the output needs.
 
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_folder`.
@@ -84,7 +92,14 @@ class CommonOptions:
         resume: bool = False,
         grow: bool = False,
     ) -> contextlib.AbstractContextManager[OutputDraft]:
-        """Claim a folder for long work that an interruption leaves resumable.
+        """Context that claims a folder for long work, which can be resumed when
+        interrupted.
+
+        Args:
+            target: folder to write.
+            keep: names of files that survive an interruption.
+            resume: continue the work in the folder.
+            grow: add to a finished folder.
 
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_long_work`.
@@ -102,11 +117,8 @@ class CommonOptions:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name != "output":
-                yield from (
-                    v
-                    for v in (value if isinstance(value, tuple) else (value,))
-                    if isinstance(v, Path)
-                )
+                values = value if isinstance(value, tuple) else (value,)
+                yield from (v for v in values if isinstance(v, Path))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,35 +53,38 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Run the chain; exit 0 when every stage passed its own check, else the status of
-    the first that did not.
+    """Run the chain of commands and write its report.
+
+    Exit status 0 when every stage passed its own check, else that of the first that did
+    not.
 
     Args:
         options: of the command line.
+
+    Raises:
+        ConfigError: an aperture out of range, or a folder of other settings.
     """
     if options.aperture_mm is not None and not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
-    wanted = (
+    files = (
         chain.shipped_settings()
         if options.config is None
         else chain.load_chain(options.config)
     )
     source = None if options.config is None else options.config.parent
-    laid = chain.lay_out_inputs(wanted, source, aperture_mm=options.aperture_mm)
-    whole = (
-        options.output.absolute()
-    )  # stages run in another folder, also as an interrupt finds them
-    with options.claim_work(whole, keep=(OUTCOMES,), resume=options.resume) as draft:
+    inputs = chain.lay_out_inputs(files, source, aperture_mm=options.aperture_mm)
+    target = options.output.absolute()  # stages run in another folder
+    with options.claim_work(target, keep=(OUTCOMES,), resume=options.resume) as draft:
         folder = draft.path
-        if not laid.stands_in(folder):  # of other settings nothing gets beside it
+        if not inputs.stands_in(folder):  # results of other settings are not mixed in
             if (folder / OUTCOMES).is_file():
                 raise ConfigError(
                     f"{options.output} was begun with other settings; start over with --force"
                 )
             transaction.empty_folder(folder)
-            laid.write(folder)
+            inputs.write(folder)
         outcomes: list[StageOutcome] = []
-        for outcome in _chain(folder, laid.files):
+        for outcome in _run_stages(folder, inputs.files):
             outcomes.append(outcome)
             words = " ".join(outcome.stage.words)
             verdict = "ok" if outcome.status == 0 else "FAILED"
@@ -99,17 +102,21 @@ def run(options: Options) -> int:
 
 
 def _name(stage: ChainStage) -> str:
-    """The verb, and what it works on where the chain has it twice."""
-    return (
-        "bench_design"
-        if "bench_design.toml" in stage.words and stage.words[0] == "design"
-        else stage.words[0]
-    )
+    """The verb of a stage; ``bench_design`` for the second design of the chain."""
+    verb = stage.words[0]
+    of_bench = verb == "design" and "bench_design.toml" in stage.words
+    return "bench_design" if of_bench else verb
 
 
-def _chain(folder: Path, files: ChainFiles) -> Iterator[StageOutcome]:
-    """Run the verbs in the chain's folder until one refuses its input; what an earlier
-    run did is not done again.
+def _run_stages(folder: Path, files: ChainFiles) -> Iterator[StageOutcome]:
+    """Outcome of every stage in order; stages of an earlier run are not repeated.
+
+    Args:
+        folder: of the chain, which becomes the current folder.
+        files: settings files of the stages.
+
+    Raises:
+        MetalensError: a stage that refused its input.
     """
     done = dict(_done(folder / OUTCOMES))
     with contextlib.chdir(folder):
@@ -117,10 +124,13 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[StageOutcome]:
             if stage.words in done:
                 yield StageOutcome(stage, *done[stage.words])
                 continue
-            start, shown = time.perf_counter(), io.StringIO()
-            with contextlib.redirect_stdout(shown):
+            start = time.perf_counter()
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
                 status = run_verb([*stage.words, "--json", "--force"])
-            values = json.loads(shown.getvalue()) if shown.getvalue().strip() else {}
+            values = (
+                json.loads(printed.getvalue()) if printed.getvalue().strip() else {}
+            )
             seconds = time.perf_counter() - start
             if status in (0, 1):
                 store.append_line(
@@ -138,8 +148,9 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[StageOutcome]:
 def _done(
     path: Path,
 ) -> Iterator[tuple[tuple[str, ...], tuple[int, dict[str, Any], float]]]:
-    """Stages that an earlier run finished, by their words; one whose line is damaged is
-    done again.
+    """Words and (status, result, seconds) of the stages that an earlier run finished.
+
+    Damaged lines are left out, so that their stages run again.
     """
     for line in store.whole_lines(path):
         with contextlib.suppress(ValueError, TypeError, RecursionError):
@@ -149,19 +160,25 @@ def _done(
 
 def _share(design: dict[str, Any]) -> str:
     """Focusing efficiency of a design, or that it has none."""
-    found = design.get("efficiency")
-    return "not known" if found is None else f"{found:.1%}"
+    efficiency = design.get("efficiency")
+    return "not known" if efficiency is None else f"{efficiency:.1%}"
 
 
 def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
+    """Write report.html: key figures, a table of the stages, and a section for each.
+
+    Args:
+        folder: of the chain.
+        outcomes: of the stages that ran.
+    """
     total = sum(o.seconds for o in outcomes)
-    made = {_name(o.stage): o.values for o in outcomes}
+    values = {_name(o.stage): o.values for o in outcomes}
     keys = [
-        report.KeyFigure("pillars", f"{made['design'].get('pillars', 0):,}"),
+        report.KeyFigure("pillars", f"{values['design'].get('pillars', 0):,}"),
         report.KeyFigure(
-            "numerical aperture", f"{made['design'].get('numerical_aperture', 0):.3f}"
+            "numerical aperture", f"{values['design'].get('numerical_aperture', 0):.3f}"
         ),
-        report.KeyFigure("focusing efficiency", _share(made["design"])),
+        report.KeyFigure("focusing efficiency", _share(values["design"])),
         report.KeyFigure(
             "every stage passed its check",
             _verdict(outcomes),
@@ -169,11 +186,11 @@ def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
         ),
         report.KeyFigure("from first solve to this page", f"{total:.0f} s"),
     ]
-    if "budget" in made:
+    if "budget" in values:
         keys.insert(
             3,
             report.KeyFigure(
-                "gaze error of all links", f"{made['budget']['gaze_error_deg']:.2g}°"
+                "gaze error of all links", f"{values['budget']['gaze_error_deg']:.2g}°"
             ),
         )
     rows = [
@@ -218,8 +235,10 @@ def _section(folder: Path, outcome: StageOutcome) -> report.Section:
 
 
 def _tables(outcome: StageOutcome) -> Iterator[report.Table]:
-    """Rows and parameters of a result as tables of their own, its plain numbers as the
-    last.
+    """Tables of a result: its rows, its fitted parameters, and its plain values.
+
+    Args:
+        outcome: of a stage, with the result of its command.
     """
     listed = outcome.values.get("rows")
     if isinstance(listed, list) and listed and isinstance(listed[0], dict):
@@ -252,15 +271,14 @@ def _tables(outcome: StageOutcome) -> Iterator[report.Table]:
 
 
 def _error(outcome: StageOutcome) -> str:
+    """Error of a stage in figures with its meaning; the meaning alone if unknown."""
     key, meaning = outcome.stage.error
-    found = outcome.values.get(key)
-    if isinstance(found, dict):
-        found = sum(len(differences) for differences in found.values())
-    return (
-        f"{report.in_figures(float(found), 2)} {meaning}"
-        if isinstance(found, int | float)
-        else meaning
-    )
+    value = outcome.values.get(key)
+    if isinstance(value, dict):
+        value = sum(len(differences) for differences in value.values())
+    if not isinstance(value, int | float):
+        return meaning
+    return f"{report.in_figures(float(value), 2)} {meaning}"
 
 
 def _verdict(outcomes: list[StageOutcome]) -> str:

@@ -136,6 +136,11 @@ class DesignSettings:
     wavelengths: tuple[AdditionalWavelength, ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse an aperture out of range and settings that exclude one another.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
         if not 0 < self.aperture_mm <= 10:
             raise ConfigError(
                 f"aperture_mm = {self.aperture_mm}: need a diameter above 0 and up to 10 mm"
@@ -166,13 +171,23 @@ class DesignSettings:
         )
 
     def at(self, held_um: Iterable[float]) -> "DesignSettings":
-        """The same, its wavelength filled in from those that the library holds."""
-        only = {round(1e3 * wave, 6) for wave in held_um}
-        default = only.pop() if len(only) == 1 else _WAVELENGTH_NM
+        """Settings with the wavelength filled in from those that the library holds.
+
+        That of a library of one wavelength, else 850 nm; a stated wavelength stays.
+
+        Args:
+            held_um: wavelengths of the library, um.
+        """
+        held_nm = {round(1e3 * wave, 6) for wave in held_um}
+        default = held_nm.pop() if len(held_nm) == 1 else _WAVELENGTH_NM
         return replace(self, wavelength_nm=self.wavelength_nm or default)
 
     def phase(self, folder: Path) -> PhaseOf:
-        """Wanted phase of a profile that needs no search; files lie below ``folder``."""
+        """Target phase of a profile that needs no search, as a function of position.
+
+        Args:
+            folder: that file names are relative to.
+        """
         shapes: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
             "double-helix": self.double_helix,
             "cubic": self.cubic,
@@ -184,8 +199,8 @@ class DesignSettings:
 
     def along(self, target: "YPolarizationTarget") -> "DesignSettings":
         """The same lens with the target of light along y."""
-        given = {f.name: getattr(target, f.name) for f in fields(target)}
-        return replace(self, **given, along_y=None)
+        values = {f.name: getattr(target, f.name) for f in fields(target)}
+        return replace(self, **values, along_y=None)
 
     def at_wavelength(self, light: "AdditionalWavelength") -> "DesignSettings":
         """The same lens with the target of another wavelength."""
@@ -223,39 +238,46 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Design the lens, check its focus, write it; exit 1 where light does not focus as
-    it should or the pillars' own errors are large.
+    """Design the lens, check its focus and write it.
+
+    Exit status 1 where light does not focus as it should or the pillars' own errors are
+    large.
 
     Args:
         options: of the command line.
+
+    Raises:
+        ConfigError: settings that need another library.
     """
-    wanted = config.load(options.config, DesignSettings, empty=False)
+    settings = config.load(options.config, DesignSettings, empty=False)
     folder, target = options.config.parent, options.output
-    path = None if wanted.library is None else folder / wanted.library
-    two_sizes = path is not None and _is_two_size_library(path)
-    maps = [one.map for one in (wanted, wanted.along_y) if one and one.map]
-    read = [*([path] if path else []), *(folder / one.file for one in maps)]
-    if two_sizes and (options.own_cell or wanted.wavelengths):
+    path = None if settings.library is None else folder / settings.library
+    two_size = path is not None and _is_two_size_library(path)
+    maps = [one.map for one in (settings, settings.along_y) if one and one.map]
+    inputs = [*([path] if path else []), *(folder / shape.file for shape in maps)]
+    if two_size and (options.own_cell or settings.wavelengths):
         raise ConfigError(
             "own_cell: rows of pillars of two sizes are not solved; leave --own-cell out"
             if options.own_cell
             else "wavelengths: need a library of pillars of one size; this one is over "
             "two (lengths_um)"
         )
-    if wanted.along_y is not None and not two_sizes:
+    if settings.along_y is not None and not two_size:
         raise ConfigError(
             "along_y: one phase for x and one for y need a library over two sizes "
             "(lengths_um); give it"
         )
-    ends = (".png",) if two_sizes else (".png", "_fisher.png")
-    with options.claim(target, companions=ends, inputs=read) as draft:
-        make = _design_two_sizes if two_sizes else _design_one_size
-        made, wanted, values, notes, checks = make(wanted, options, draft.path)
-        lens.save(draft.path, made)
-        write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(made))
+    ends = (".png",) if two_size else (".png", "_fisher.png")
+    with options.claim(target, companions=ends, inputs=inputs) as draft:
+        design_lens = _design_two_sizes if two_size else _design_one_size
+        designed, settings, values, notes, checks = design_lens(
+            settings, options, draft.path
+        )
+        lens.save(draft.path, designed)
+        write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(designed))
     title = (
-        f"{target}: {wanted.profile} lens of {values['pillars']:,} pillars, "
-        f"{wanted.aperture_mm} mm, {1e3 * made.wavelength_um:g} nm"
+        f"{target}: {settings.profile} lens of {values['pillars']:,} pillars, "
+        f"{settings.aperture_mm} mm, {1e3 * designed.wavelength_um:g} nm"
     )
     failures = [
         f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a "
@@ -263,138 +285,173 @@ def run(options: Options) -> int:
         for check in checks
         if check is not None and not check.passed
     ]
-    doubt = "" if two_sizes else made.proxy.doubt
+    doubt = "" if two_size else designed.proxy.doubt
     return options.console.report(
         title, values, notes=notes, failures=[*failures, doubt]
     )
 
 
+# lens, settings as filled in, values for JSON, notes, and checks of the foci
 _Outcome = tuple[
     Lens, DesignSettings, dict[str, Any], list[str], Sequence[FocusCheck | None]
-]  # with the settings as filled in, the values, notes and checks of the foci
+]
 
 
 def _design_two_sizes(
-    wanted: DesignSettings, options: Options, draft: Path
+    settings: DesignSettings, options: Options, draft: Path
 ) -> _Outcome:
-    """A lens of pillars of two sizes, for light along x and along y."""
-    path = options.config.parent / (wanted.library or "")
-    pillars, inputs = axes.load(path), {path.name: store.sha256(path)}
-    wanted = wanted.at(pillars.wavelength_um.tolist())
-    pillars.at(wanted.focus.wavelength_um)
-    wanted = _fill_limits(wanted, options, pillars.cell, inputs)
-    phase, focus, _ = _find_phase(wanted, options, draft)
-    other: tuple[PhaseOf | None, Focus] = None, focus
-    if wanted.along_y is not None:
-        target = wanted.along(wanted.along_y)
-        other = target.phase(options.config.parent), target.focus
-    made, split = design.assign_polarization_multiplexed(
-        (phase, other[0]), (focus, other[1]), library=pillars, **_common(wanted, inputs)
+    """Design a lens of pillars of two sizes, for light along x and along y.
+
+    Args:
+        settings: of the design.
+        options: of the command line.
+        draft: file that will be written, for pictures beside it.
+
+    Returns:
+        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+    """
+    path = options.config.parent / (settings.library or "")
+    pillars = axes.load(path)
+    inputs = {path.name: store.sha256(path)}
+    settings = settings.at(pillars.wavelength_um.tolist())
+    pillars.at(settings.focus.wavelength_um)
+    settings = _fill_limits(settings, options, pillars.cell, inputs)
+    phase, focus, _ = _find_phase(settings, options, draft)
+    phase_y: PhaseOf | None = None
+    focus_y = focus
+    if settings.along_y is not None:
+        target = settings.along(settings.along_y)
+        phase_y = target.phase(options.config.parent)
+        focus_y = target.focus
+    designed, metrics = design.assign_polarization_multiplexed(
+        (phase, phase_y), (focus, focus_y), library=pillars, **_common(settings, inputs)
     )
     values: dict[str, Any] = {
-        "pillars": split.x.pillars,
-        "pairs_of_sizes": split.pairs,
-        "multiplexed": split.multiplexed,
-        "covered": split.covered,
+        "pillars": metrics.x.pillars,
+        "pairs_of_sizes": metrics.pairs,
+        "multiplexed": metrics.multiplexed,
+        "covered": metrics.covered,
     }
     checks: list[FocusCheck | None] = []
     lights: tuple[Literal["x", "y"], ...] = ("x", "y")
-    profiles = wanted.profile, (wanted.along_y or wanted).profile
-    for place, light in enumerate(lights):
-        quality, seen = (split.x, split.y)[place], made.seen(light)
-        hyperbolic = profiles[place] == "hyperbolic"
-        check = _check(seen, quality, options, wanted=hyperbolic)
+    profiles = settings.profile, (settings.along_y or settings).profile
+    for i, light in enumerate(lights):
+        quality = (metrics.x, metrics.y)[i]
+        polarised = designed.seen(light)
+        hyperbolic = profiles[i] == "hyperbolic"
+        check = _check(polarised, quality, options, wanted=hyperbolic)
         checks.append(check)
-        own = _summarize(seen, quality, check)
+        own = _summarize(polarised, quality, check)
         del own["turns"]  # of a single diameter
         values[f"along_{light}"] = own | {
-            "wavefront_efficiency_error": split.wavefront_efficiency_error[place],
-            "leaked": split.leaked[place],
+            "wavefront_efficiency_error": metrics.wavefront_efficiency_error[i],
+            "leaked": metrics.leaked[i],
         }
-    lost = describe_order_loss(pillars.cell, wanted.focus.wavelength_um)
-    return made, wanted, values, [lost], checks
+    lost = describe_order_loss(pillars.cell, settings.focus.wavelength_um)
+    return designed, settings, values, [lost], checks
 
 
-def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _Outcome:
-    """A lens of pillars of one size: at one wavelength or several, or rotated."""
-    pillars, inputs = _pillars(wanted, options.config.parent, options.console)
+def _design_one_size(
+    settings: DesignSettings, options: Options, draft: Path
+) -> _Outcome:
+    """Design a lens of pillars of one size: at one wavelength or several, or rotated.
+
+    Args:
+        settings: of the design.
+        options: of the command line.
+        draft: file that will be written, for pictures beside it.
+
+    Returns:
+        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+
+    Raises:
+        ConfigError: several wavelengths of rotated pillars.
+    """
+    pillars, inputs = _pillars(settings, options.config.parent, options.console)
     cell = pillars.cell
     proxy = library.proxy_of(pillars)
     folder = options.config.parent
-    sites = int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2)
+    sites = int(math.pi * (1e3 * settings.aperture_mm / cell.pitch_um) ** 2)
     transaction.check_room(options.output, sites)  # 4 bytes each
-    wanted = wanted.at(proxy.wavelengths_um)
-    proxy.at(wanted.focus.wavelength_um)  # refused here, not after the search
-    wanted = _fill_limits(wanted, options, cell, inputs)
-    if wanted.profile == "map" and wanted.map and (folder / wanted.map.file).is_file():
-        inputs[wanted.map.file.name] = store.sha256(folder / wanted.map.file)
-    phase, focus, values = _find_phase(wanted, options, draft)
-    about = _common(wanted, inputs)
+    settings = settings.at(proxy.wavelengths_um)
+    proxy.at(settings.focus.wavelength_um)  # refused here, not after the search
+    settings = _fill_limits(settings, options, cell, inputs)
+    if (
+        settings.profile == "map"
+        and settings.map
+        and (folder / settings.map.file).is_file()
+    ):
+        inputs[settings.map.file.name] = store.sha256(folder / settings.map.file)
+    phase, focus, values = _find_phase(settings, options, draft)
+    common = _common(settings, inputs)
     rotated = pillars.turned is not None
     targets: list[DesignSettings] = []
     others: list[Quality] = []
-    if wanted.wavelengths:
+    if settings.wavelengths:
         if rotated:
             raise ConfigError(
                 "wavelengths: turned pillars make one phase at all of them; need a "
                 "library for any light"
             )
-        targets = [wanted.at_wavelength(one) for one in wanted.wavelengths]
-        weights = [one.weight for one in wanted.wavelengths]
+        targets = [settings.at_wavelength(light) for light in settings.wavelengths]
+        weights = [light.weight for light in settings.wavelengths]
         lights = [
-            design.WavelengthTarget(one.phase(folder), one.focus, weight)
-            for one, weight in zip([wanted, *targets], [1.0, *weights], strict=True)
+            design.WavelengthTarget(at.phase(folder), at.focus, weight)
+            for at, weight in zip([settings, *targets], [1.0, *weights], strict=True)
         ]
-        made, (quality, *others) = design.assign_multi_wavelength(
-            lights, cell=cell, proxy=proxy, **about
+        designed, (quality, *others) = design.assign_multi_wavelength(
+            lights, cell=cell, proxy=proxy, **common
         )
     elif rotated:
-        made, quality, conversion = design.assign_geometric_phase(
-            phase, focus, library=pillars, hand=wanted.hand, **about
+        designed, quality, conversion = design.assign_geometric_phase(
+            phase, focus, library=pillars, hand=settings.hand, **common
         )
-        values["circular"] = {"hand": wanted.hand, **asdict(conversion)}
+        values["circular"] = {"hand": settings.hand, **asdict(conversion)}
     else:
         partial = options.accept_partial_turn
-        made, quality = design.make(
-            phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about
+        designed, quality = design.make(
+            phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **common
         )
-    radius_um = wanted.aperture_mm * 500
+    radius_um = settings.aperture_mm * 500
     notes = [describe_order_loss(cell, focus.wavelength_um)]
-    if wanted.profile == "map":
+    if settings.profile == "map":
         meets = design.has_focus(
             phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um
         )
         quality = replace(quality, focuses=meets)
         if not meets:
             notes.append(_meeting_note(phase, focus, radius_um, cell))
-    if made.one_light:
+    if designed.one_light:
         notes.append(
-            f"for {made.one_light} only: {cell.described} has another response for x "
+            f"for {designed.one_light} only: {cell.described} has another response for x "
             "and y (lengths_um in [sweep] makes a library for both)"
         )
-    made, coupling = _couple(made, quality, radius_um, options, rotated=rotated)
-    checkable = wanted.profile == "hyperbolic"
+    designed, coupling = _couple(designed, quality, radius_um, options, rotated=rotated)
+    checkable = settings.profile == "hyperbolic"
     expected = quality.strehl if others else 1.0
-    check = _check(made, quality, options, wanted=checkable, expected=expected)
-    values = _summarize(made, quality, check) | values
+    check = _check(designed, quality, options, wanted=checkable, expected=expected)
+    values = _summarize(designed, quality, check) | values
     if coupling is not None:
         values["neighbours"] = asdict(coupling)
-    checks, several = [check], []
-    for light, target, one in zip(wanted.wavelengths, targets, others, strict=True):
-        seen = replace(
-            made,
+    checks = [check]
+    by_wavelength = []
+    for light, target, other in zip(settings.wavelengths, targets, others, strict=True):
+        at_wavelength = replace(
+            designed,
             wavelength_um=target.focus.wavelength_um,
             sensor_distance_um=target.focus.sensor_distance_um,
             source_distance_um=target.focus.source_distance_um,
         )
-        check = _check(seen, one, options, wanted=checkable, expected=one.strehl)
+        check = _check(
+            at_wavelength, other, options, wanted=checkable, expected=other.strehl
+        )
         checks.append(check)
         named = {"wavelength_nm": light.wavelength_nm, "weight": light.weight}
-        several.append(named | _summarize(seen, one, check))
-    if several:
-        values["wavelengths"] = several
+        by_wavelength.append(named | _summarize(at_wavelength, other, check))
+    if by_wavelength:
+        values["wavelengths"] = by_wavelength
     elif quality.turns < 1:
-        hint = design.phase_coverage_hint(proxy, cell, wanted.limits, quality.turns)
+        hint = design.phase_coverage_hint(proxy, cell, settings.limits, quality.turns)
         notes.append(f"for a whole turn: {hint}")
     if quality.steepest > quality.sampled_aperture:
         notes.append(
@@ -405,94 +462,121 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
         "proxy_phase_error_rad": proxy.max_phase_error_rad,
         "proxy_transmission_error": proxy.max_transmission_error,
         "entry_error": proxy.entry_error,
-        "loss": pillars.mean_loss(made.diameters.diameter_um, focus.wavelength_um),
+        "loss": pillars.mean_loss(designed.diameters.diameter_um, focus.wavelength_um),
     }
-    return made, wanted, values, notes, checks
+    return designed, settings, values, notes, checks
 
 
 def _is_two_size_library(path: Path) -> bool:
     return path.is_file() and store.load(path).kind == axes.KIND
 
 
-def _common(wanted: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
-    """Arguments of every assignment."""
+def _common(settings: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
+    """Arguments that all assignments of pillars share."""
     return {
-        "aperture_um": wanted.aperture_mm * 1e3,
-        "limits": wanted.limits,
-        "profile": wanted.profile,
-        "provenance": store.Provenance(config=config.dumps(wanted), inputs=inputs),
+        "aperture_um": settings.aperture_mm * 1e3,
+        "limits": settings.limits,
+        "profile": settings.profile,
+        "provenance": store.Provenance(config=config.dumps(settings), inputs=inputs),
     }
 
 
 def _fill_limits(
-    wanted: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
+    settings: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
 ) -> DesignSettings:
-    """The limits of a process file (by a package above this one that the command line
-    names), the gap behind the pillars filled by the cover; notes the files read.
+    """Settings with the limits of a process file, and the cell's cover behind the
+    pillars.
+
+    The process file is read by a package above this one. Hashes of the files that are
+    read are added to ``inputs``.
+
+    Args:
+        settings: of the design.
+        options: of the command line.
+        cell: unit cell of the pillars.
+        inputs: SHA-256 by file name.
     """
     inputs[options.config.name] = store.sha256(options.config)
-    layers = wanted.layers.covered_by(cell.cover)
+    layers = settings.layers.covered_by(cell.cover)
     if options.process is None:
-        return replace(wanted, layers=layers)
+        return replace(settings, layers=layers)
     inputs[options.process.name] = store.sha256(options.process)
     thinnest, gap = load_above("process").printable_limits(
         options.process, pitch_um=cell.pitch_um, height_um=cell.height_um
     )
-    limits = replace(wanted.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
-    return replace(wanted, layers=layers, limits=limits)
+    limits = replace(settings.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
+    return replace(settings, layers=layers, limits=limits)
 
 
 def _pillars(
-    wanted: DesignSettings, folder: Path, console: Console
+    settings: DesignSettings, folder: Path, console: Console
 ) -> tuple[PillarLibrary, dict[str, str]]:
-    """The library of the pillars, and the hash of its file if there is one."""
-    if wanted.library is not None:
-        path = folder / wanted.library
+    """The library of the pillars, and the SHA-256 of its file by name.
+
+    Without a library file the cell is swept at the wavelengths of the design.
+
+    Args:
+        settings: of the design.
+        folder: that file names are relative to.
+        console: for the progress of the sweep.
+    """
+    if settings.library is not None:
+        path = folder / settings.library
         return library.load(path), {path.name: store.sha256(path)}
-    others = (1e-3 * one.wavelength_nm for one in wanted.wavelengths)
-    waves = tuple(sorted((wanted.focus.wavelength_um, *others)))
-    cell = wanted.cell or library.DEFAULT_CELL
+    others = (1e-3 * light.wavelength_nm for light in settings.wavelengths)
+    waves = tuple(sorted((settings.focus.wavelength_um, *others)))
+    cell = settings.cell or library.DEFAULT_CELL
     return library.sweep(cell, wavelengths_um=waves, console=console), {}
 
 
 def _find_phase(
-    wanted: DesignSettings, options: Options, draft: Path
+    settings: DesignSettings, options: Options, draft: Path
 ) -> tuple[PhaseOf, Focus, dict[str, Any]]:
-    """The phase of the profile, what it images onto what, and for a free form made for
-    axial information the comparison with simple lenses, whose picture it writes.
+    """Target phase of the profile, its focus, and the comparison of a free form.
+
+    A free form for axial information is compared with simple lenses; the comparison is
+    returned for JSON and its picture is written.
+
+    Args:
+        settings: of the design.
+        options: of the command line.
+        draft: lens file that will be written; the picture is NAME_fisher.png.
     """
-    if wanted.profile != "fisher":
-        return wanted.phase(options.config.parent), wanted.focus, {}
+    if settings.profile != "fisher":
+        return settings.phase(options.config.parent), settings.focus, {}
     from metalens.design.free_form import design_pupil, fisher_profile
     from metalens.design.free_form import report as reports
 
-    radius_um, console = wanted.aperture_mm * 500, options.console
-    settings = wanted.fisher.about(wanted.focus, radius_um)
-    pupil = design_pupil(wanted.focus, radius_um, settings)
-    scenes = settings.objective == "scenes"
-    objective = load_above("scenes").SceneObjective(pupil, settings) if scenes else None
-    console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
-    phase, found = fisher_profile(
-        wanted.focus, radius_um=radius_um, settings=settings, objective=objective
+    radius_um = settings.aperture_mm * 500
+    console = options.console
+    search = settings.fisher.about(settings.focus, radius_um)
+    pupil = design_pupil(settings.focus, radius_um, search)
+    scenes = search.objective == "scenes"
+    objective = load_above("scenes").SceneObjective(pupil, search) if scenes else None
+    console.say(f"free form: {search.starts} starts of {search.iterations} steps")
+    phase, free_form = fisher_profile(
+        settings.focus, radius_um=radius_um, settings=search, objective=objective
     )
-    mean = float(found.score.information.mean())
+    mean = float(free_form.score.information.mean())
     goal = f"Eq. 6 {-mean:.3f} (0 without blur)" if scenes else f"I(z) {mean:.3f} /mm²"
-    least = float(found.score.encircled.min())
+    least = float(free_form.score.encircled.min())
     console.say(
-        f"free form: {goal}, encircled energy {least:.2f} or more; {found.reason}"
+        f"free form: {goal}, encircled energy {least:.2f} or more; {free_form.reason}"
     )
-    focus = replace(wanted.focus, source_distance_um=found.focus_um)
+    focus = replace(settings.focus, source_distance_um=free_form.focus_um)
     if scenes:
         return phase, focus, {}
     console.say("tuning a hyperbolic lens and a double helix for the same task")
-    lenses = reports.judge_designs(found, pupil, settings)
-    picture = reports.report_picture(lenses, pupil, settings)
+    lenses = reports.judge_designs(free_form, pupil, search)
+    picture = reports.report_picture(lenses, pupil, search)
     write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
-    return phase, focus, {"fisher": reports.report_values(lenses, settings)}
+    return phase, focus, {"fisher": reports.report_values(lenses, search)}
 
 
 def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:
-    """Where the rays of a map that does not focus on the sensor meet."""
+    """Where the rays of a map meet, in words, for a map without a focus on the
+    sensor.
+    """
     meets = design.meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
     sensor, source = focus.sensor_distance_um, focus.source_distance_um
     if meets is None or abs(meets[2] / sensor - 1) <= 0.01:
@@ -504,7 +588,7 @@ def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) ->
 
 
 def format_place(at_um: tuple[float, float, float]) -> str:
-    """Words for a place behind the lens.
+    """A place behind the lens in words: x and y in um, z in mm.
 
     Args:
         at_um: x, y and z.
@@ -514,10 +598,26 @@ def format_place(at_um: tuple[float, float, float]) -> str:
 
 
 def _couple(
-    made: Lens, quality: Quality, radius_um: float, options: Options, *, rotated: bool
+    designed: Lens,
+    quality: Quality,
+    radius_um: float,
+    options: Options,
+    *,
+    rotated: bool,
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
-    """The lens, with its rows solved where asked for, and the loss by neighbour
-    coupling; None where there is no such number.
+    """The lens, with solved rows under ``--own-cell``, and its neighbour coupling loss.
+
+    The loss is None for rotated pillars and phases without a focus.
+
+    Args:
+        designed: the lens.
+        quality: of its pillars.
+        radius_um: radius of the aperture.
+        options: of the command line.
+        rotated: whether its phase is geometric.
+
+    Raises:
+        ConfigError: ``--own-cell`` for such pillars or phases.
     """
     if rotated or not quality.focuses:
         if options.own_cell:
@@ -525,38 +625,53 @@ def _couple(
             raise ConfigError(
                 f"own_cell: {why}: no rows are solved for it; leave --own-cell out"
             )
-        return made, None
+        return designed, None
     if not options.own_cell:
-        return made, design.estimate_neighbour_coupling_loss(made, radius_um=radius_um)
-    rows = design.solve_coupling_rows(made, radius_um=radius_um)
-    made = replace(made, neighbours=rows)
-    return made, design.neighbour_coupling_loss(made, radius_um=radius_um)
+        return designed, design.estimate_neighbour_coupling_loss(
+            designed, radius_um=radius_um
+        )
+    rows = design.solve_coupling_rows(designed, radius_um=radius_um)
+    designed = replace(designed, neighbours=rows)
+    return designed, design.neighbour_coupling_loss(designed, radius_um=radius_um)
 
 
 def _check(
-    made: Lens,
+    designed: Lens,
     quality: Quality,
     options: Options,
     *,
     wanted: bool,
     expected: float = 1.0,
 ) -> FocusCheck | None:
-    """The exact sum around the focus, where the profile has one and it is asked for."""
+    """Exact diffraction sum around the focus; None where it is left out.
+
+    Args:
+        designed: the lens.
+        quality: of its pillars.
+        options: of the command line.
+        wanted: whether the profile has a focus that can be checked.
+        expected: Strehl ratio that the phase errors leave.
+    """
     if options.skip_focus_check or not wanted:
         return None
     if quality.pillars > MOST_SUMMED:
         options.console.say(f"more than {MOST_SUMMED:,} pillars: no exact focus check")
         return None
-    return design.check_focus(made, expected=expected)
+    return design.check_focus(designed, expected=expected)
 
 
 def _summarize(
-    made: Lens, quality: Quality, check: FocusCheck | None
+    designed: Lens, quality: Quality, check: FocusCheck | None
 ) -> dict[str, Any]:
-    """Quality of a lens, its PSF and its focus; None for what JSON does not know.
+    """Quality of a lens, of its PSF and of its focus, for JSON; None for nan.
 
     The PSF is left out of a phase without a focus, of a lens of more pillars than fit
     in memory at once, and where torch is not installed.
+
+    Args:
+        designed: the lens.
+        quality: of its pillars.
+        check: of its focus; None without.
     """
     values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
     if quality.focuses:
@@ -567,7 +682,7 @@ def _summarize(
         }
         if quality.pillars <= MOST_SUMMED:
             try:
-                values |= _of_psf(design.focus_figures(made))
+                values |= _of_psf(design.focus_figures(designed))
             except ModuleNotFoundError as error:
                 if error.name != "torch":
                     raise
@@ -594,12 +709,12 @@ def _summarize(
 
 
 def _of_psf(figures: Any) -> dict[str, Any]:
-    """Focusing efficiency and widths of the PSF of the design source."""
+    """Figures of the PSF of the design source for JSON; None for nan."""
     names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
-    found = {name: getattr(figures, name) for name in names}
-    found |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
+    values = {name: getattr(figures, name) for name in names}
+    values |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
     plain = {
         name: None if isinstance(v, float) and math.isnan(v) else v
-        for name, v in found.items()
+        for name, v in values.items()
     }
     return plain | {"diffraction_limit": asdict(figures.limit)}

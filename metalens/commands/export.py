@@ -47,13 +47,13 @@ def run(options: Options) -> int:
             f"--samples {options.samples}: counts the points of a .dat; arrays hold every pillar"
         )
     with options.claim(options.output) as draft:
-        made = lens.load(options.lens)
+        device = lens.load(options.lens)
         grid = options.output.suffix.lower() == export.GRID
-        rows, columns = made.diameters.diameter_um.shape
+        rows, columns = device.diameters.diameter_um.shape
         transaction.check_room(
             options.output, 12 * options.samples**2 if grid else 4 * rows * columns
         )
-        error = export.export_lens(draft.path, made, samples=options.samples)
+        error = export.export_lens(draft.path, device, samples=options.samples)
     how = ""
     if grid:
         how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"

@@ -41,10 +41,10 @@ HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FarFieldRequest:
-    """What a far field is computed for, kept in the file.
+    """What a far field is computed for; stored in the file.
 
     angles_deg: (x, y) of every direction of incidence. source_mm: inf for plane waves.
-    samples: across.
+    wavelength_nm: in vacuum. samples: across the direction cosines.
     """
 
     angles_deg: tuple[tuple[float, float], ...]
@@ -54,10 +54,11 @@ class FarFieldRequest:
 
 
 def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
-    """Of the options of ``metalens psf``.
+    """The request of the options of ``metalens psf --far-field``.
 
     Args:
-        made: what was designed or computed.
+        options: of the command line.
+        made: the lens, whose wavelength is the default.
 
     Raises:
         ConfigError: an option that says nothing of a far field, or more than one depth
@@ -69,17 +70,19 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
             raise ConfigError(
                 f"{field.name}: not for a far field, which takes {', '.join(TAKES[:5])}"
             )
-    (source, *sources) = options.sources_mm or (math.inf,)
-    (wave, *waves) = options.wavelengths_nm or (1e3 * made.wavelength_um,)
+    sources = options.sources_mm or (math.inf,)
+    waves = options.wavelengths_nm or (1e3 * made.wavelength_um,)
     along_x = options.angles_deg or (0.0,)
     along_y = options.angles_y_deg or (0.0,) * len(along_x)
-    if sources or waves or len(along_x) != len(along_y):
+    if len(sources) > 1 or len(waves) > 1 or len(along_x) != len(along_y):
         raise ConfigError(
             f"sources_mm = {options.sources_mm}, wavelengths_nm = "
             f"{options.wavelengths_nm}, {len(along_x)} angles along x, {len(along_y)} "
             "along y: a far field takes one depth, one wavelength, and as many angles "
             "along y as along x"
         )
+    source = sources[0]
+    wave = waves[0]
     tilted = max(map(abs, (*along_x, *along_y)))
     if not (source > 0 and 0 < wave < math.inf and tilted < 90):
         raise ConfigError(
@@ -96,12 +99,13 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
 def compute_far_fields(
     made: lens.Lens, wanted: FarFieldRequest, console: Console
 ) -> list["FarField"]:
-    """One far field a direction of incidence; of pillars of two sizes the light along x
-    that the lens is for.
+    """One far field for each direction of incidence.
+
+    Of pillars of two sizes for the polarisation along x.
 
     Args:
-        made: what was designed or computed.
-        wanted: what the command asks for.
+        made: the lens.
+        wanted: directions, source distance, wavelength and samples.
         console: of the command.
     """
     directions = console.track(
@@ -127,31 +131,29 @@ def save_far_fields(
     inputs: dict[str, str],
     page: bool,
 ) -> None:
-    """The file of kind ``far-field``, its picture beside it, and with ``page`` its
-    report.
+    """Write the file of kind ``far-field``, its picture, and with ``page`` its report.
 
     Args:
-        path: file to read or write.
-        wanted: what the command asks for.
-        found: what was computed.
+        path: file to write.
+        wanted: the request, stored in the file.
+        found: far field of each direction.
         inputs: SHA-256 of each input file.
+        page: whether to write NAME.html.
     """
+    beams = [
+        (i, b.sine_x, b.sine_y, b.share)
+        for i, field in enumerate(found)
+        for b in field.beams
+    ]
     arrays = {
-        "share": np.stack([one.share for one in found]).astype(np.float32),
+        "share": np.stack([field.share for field in found]).astype(np.float32),
         "sine": found[0].sines,
-        "rings": np.stack([one.rings for one in found]),
+        "rings": np.stack([field.rings for field in found]),
         "angles_deg": np.array(wanted.angles_deg),
-        "beams": np.array(
-            [
-                (i, b.sine_x, b.sine_y, b.share)
-                for i, one in enumerate(found)
-                for b in one.beams
-            ],
-            float,
-        ).reshape(-1, 4),
-        "beyond": np.array([one.beyond for one in found]),
-        "transmitted": np.array([one.transmitted for one in found]),
-        "error": np.array([one.error for one in found]),
+        "beams": np.array(beams, float).reshape(-1, 4),
+        "beyond": np.array([field.beyond for field in found]),
+        "transmitted": np.array([field.transmitted for field in found]),
+        "error": np.array([field.error for field in found]),
     }
     about = {
         "wavelength_um": 1e-3 * wanted.wavelength_nm,
@@ -174,27 +176,27 @@ def save_far_fields(
 def far_field_values(
     wanted: FarFieldRequest, found: list["FarField"]
 ) -> dict[str, Any]:
-    """Numbers for programs.
+    """Result of the command as a dictionary for JSON.
 
     Args:
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     fields = [
         {
             "angle_x_deg": x,
             "angle_y_deg": y,
-            "transmitted": one.transmitted,
-            "beyond": one.beyond,
-            "within_deg": {f"{part:g}": _cone(one, part) for part in PARTS},
+            "transmitted": field.transmitted,
+            "beyond": field.beyond,
+            "within_deg": {f"{part:g}": _cone(field, part) for part in PARTS},
             "beams": [
                 dataclasses.asdict(beam)
                 | {"angle_deg": beam.angle_deg, "azimuth_deg": beam.azimuth_deg}
-                for beam in one.beams
+                for beam in field.beams
             ],
-            "error": one.error,
+            "error": field.error,
         }
-        for (x, y), one in zip(wanted.angles_deg, found, strict=True)
+        for (x, y), field in zip(wanted.angles_deg, found, strict=True)
     ]
     common = ("beam_sine", "beam_holds", "steepest")
     return {name: getattr(found[0], name) for name in common} | {"fields": fields}
@@ -203,66 +205,70 @@ def far_field_values(
 def far_field_text(
     target: Path, wanted: FarFieldRequest, found: list["FarField"]
 ) -> str:
-    """Lines for people.
+    """Result of the command in words: light that passes, cones and beams of each
+    direction.
 
     Args:
         target: output file.
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     source = (
         "plane waves"
         if math.isinf(wanted.source_mm)
         else f"a source at {wanted.source_mm:g} mm"
     )
-    worst = max(one.error for one in found)
+    worst = max(field.error for field in found)
     lines = [
         f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {worst:.1g}"
     ]
-    for (x, y), one in zip(wanted.angles_deg, found, strict=True):
-        cones = ((part, _cone(one, part)) for part in PARTS)
+    for (x, y), field in zip(wanted.angles_deg, found, strict=True):
+        cones = ((part, _cone(field, part)) for part in PARTS)
         shares = ", ".join(f"{p:.0%} within {a:.3g}" for p, a in cones if a is not None)
-        lost = f", {one.beyond:.2g} does not leave into air"
+        lost = f", {field.beyond:.2g} does not leave into air"
         lines.append(
-            f"  from ({x:g}, {y:g}) deg: {one.transmitted:.3f} of the light on the "
+            f"  from ({x:g}, {y:g}) deg: {field.transmitted:.3f} of the light on the "
             f"pillars passes, of that {shares} deg of the axis"
-            f"{lost if one.beyond > 1e-4 else ''}"
+            f"{lost if field.beyond > 1e-4 else ''}"
         )
         lines += [
             f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, "
             f"{b.sine_y:+.5f})"
-            for b in one.beams
+            for b in field.beams
         ] or ["    no direction holds 1 % of it"]
-    return "\n".join([*lines, f"  {_counted(found[0])}"])
+    return "\n".join([*lines, f"  {_beam_note(found[0])}"])
 
 
-def _counted(one: "FarField") -> str:
+def _beam_note(field: "FarField") -> str:
+    """What a beam is in words, and the largest sine that the lattice samples."""
     limit = (
         ""
-        if one.steepest >= 1
-        else f"; the lattice tells directions up to a sine of {one.steepest:.3f}"
+        if field.steepest >= 1
+        else f"; the lattice tells directions up to a sine of {field.steepest:.3f}"
     )
     return (
-        f"a beam is the light within a sine of {one.beam_sine:.2g} of its middle ({one.beam_holds:.0%} of an ideal "
+        f"a beam is the light within a sine of {field.beam_sine:.2g} of its middle ({field.beam_holds:.0%} of an ideal "
         f"round one){limit}"
     )
 
 
-def _cone(one: "FarField", part: float) -> float | None:
-    """Angle about the axis in deg that holds a part of the transmitted light; None
-    where none does.
+def _cone(field: "FarField", part: float) -> float | None:
+    """Half angle in deg of the cone about the axis with a share of the transmitted
+    light.
+
+    None where no cone has it.
     """
-    sine = one.within_sine(part)
+    sine = field.within_sine(part)
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
 def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes:
-    """Light over direction cosines on a logarithmic scale (above), and within cones
-    about the axis (below).
+    """PNG of the light over direction cosines (log scale), and within cones about the
+    axis.
 
     Args:
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: far field of each direction.
     """
     from matplotlib.colors import LogNorm
 
@@ -270,14 +276,16 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
     figure, panels = make_figure(
         2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
     )
-    for column, ((x, y), one) in enumerate(zip(wanted.angles_deg, found, strict=True)):
-        step = float(one.sines[1] - one.sines[0])
-        edge = float(one.sines[-1]) + step / 2
-        top = float(one.share.max())
+    for column, ((x, y), field) in enumerate(
+        zip(wanted.angles_deg, found, strict=True)
+    ):
+        step = float(field.sines[1] - field.sines[0])
+        edge = float(field.sines[-1]) + step / 2
+        top = float(field.share.max())
         panel = panels[0, column]
         low = max(1e-6 * top, 1e-300)
         shown = panel.imshow(
-            np.maximum(one.share, low),
+            np.maximum(field.share, low),
             norm=LogNorm(low, top),
             extent=(-edge, edge, edge, -edge),
         )
@@ -288,9 +296,9 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
         figure.colorbar(
             shown, ax=panel, label="share of the light in a square", shrink=0.85
         )
-        sines = step * np.arange(1, len(one.rings) + 1)
+        sines = step * np.arange(1, len(field.rings) + 1)
         angles = np.degrees(np.arcsin(np.minimum(sines, 1.0)))
-        panels[1, column].plot(angles, np.cumsum(one.rings))
+        panels[1, column].plot(angles, np.cumsum(field.rings))
         panels[1, column].set(
             xlabel="angle from the axis / deg",
             ylabel="share within",
@@ -301,19 +309,27 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
 
 
 def _report(
-    path: Path, wanted: FarFieldRequest, found: list["FarField"], image: bytes
+    path: Path, request: FarFieldRequest, fields: list["FarField"], image: bytes
 ) -> None:
+    """Write the report: the picture of directions and the table of beams.
+
+    Args:
+        path: of the report.
+        request: directions, source distance, wavelength and samples.
+        fields: far field of each direction.
+        image: PNG of the picture.
+    """
     rows = [
         [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
-        for (x, y), one in zip(wanted.angles_deg, found, strict=True)
-        for b in one.beams
+        for (x, y), field in zip(request.angles_deg, fields, strict=True)
+        for b in field.beams
     ]
     words = "Light far behind the lens over direction cosines, +x right and +y down; below, what cones hold."
-    caption = (
-        f"Shares are of the light that the pillars let through; {_counted(found[0])}."
-    )
-    keys = [KeyFigure("relative error", f"{max(one.error for one in found):.1g}", True)]
-    keys += [KeyFigure("of the light passes", f"{found[0].transmitted:.3f}")]
+    caption = f"Shares are of the light that the pillars let through; {_beam_note(fields[0])}."
+    keys = [
+        KeyFigure("relative error", f"{max(field.error for field in fields):.1g}", True)
+    ]
+    keys += [KeyFigure("of the light passes", f"{fields[0].transmitted:.3f}")]
     sections = [Section("Directions", items=[Figure(image, words, wide=True)])]
     sections.append(
         Section(

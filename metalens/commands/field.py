@@ -21,10 +21,10 @@ from metalens.library import workers
 from metalens.rcwa import FieldGrid, NearField, near_fields
 
 CUTS = {"xz": "y = 0", "yz": "x = 0"}
-SOUGHT = 0.1  # of the error of a field, where no tolerance is stated
-UNKNOWN = 0.5  # error above which a field is none, and the largest tolerance
-MOST_SAMPLES = 400
-NM = 1e3
+SOUGHT = 0.1  # relative error of a field that is aimed at without a tolerance
+UNKNOWN = 0.5  # largest relative error of a field, and largest tolerance
+MOST_SAMPLES = 400  # along the pitch
+NM = 1e3  # nm in a um
 
 
 @dataclass(frozen=True)
@@ -83,33 +83,32 @@ class NearFieldRequest:
     @property
     def light(self) -> Incidence:
         """The plane wave."""
-        turns = math.radians(self.angle_deg), math.radians(self.azimuth_deg)
-        return Incidence(self.wavelength_um, turns[0], self.polarization, turns[1])
+        angle_rad = math.radians(self.angle_deg)
+        azimuth_rad = math.radians(self.azimuth_deg)
+        return Incidence(self.wavelength_um, angle_rad, self.polarization, azimuth_rad)
 
     @property
     def step_um(self) -> float:
-        """Between points."""
+        """Spacing of the points."""
         return self.cell.pitch_um / self.samples
 
     def grids(self) -> list[FieldGrid]:
-        """Cuts along x and z, along y and z, and maps along x and y: middles of square
-        pixels over a period.
+        """Grids of the cuts (x, z) at y = 0 and (y, z) at x = 0, and of the maps (x,
+        y).
+
+        Points are the middles of square pixels over a period. z is 0 at the foot of the
+        pillar; the cuts reach ``around_um`` beyond pillar and films.
         """
+        step = self.step_um
         x, y = (
-            (np.arange(n) - (n - 1) / 2) * (edge / n)
-            for edge in self.cell.lattice.periods_um(self.cell.pitch_um)
-            for n in [max(2, round(edge / self.step_um))]
+            (np.arange(n) - (n - 1) / 2) * (period / n)
+            for period in self.cell.lattice.periods_um(self.cell.pitch_um)
+            for n in [max(2, round(period / step))]
         )
+        over = sum(film.thickness_um for film in self.cell.over)
         low = -sum(film.thickness_um for film in self.cell.under) - self.around_um
-        high = (
-            self.cell.height_um
-            + sum(film.thickness_um for film in self.cell.over)
-            + self.around_um
-        )
-        z = (
-            low
-            + (np.arange(math.ceil((high - low) / self.step_um)) + 0.5) * self.step_um
-        )
+        high = self.cell.height_um + over + self.around_um
+        z = low + (np.arange(math.ceil((high - low) / step)) + 0.5) * step
         return [
             FieldGrid(x, [0.0], z),
             FieldGrid([0.0], y, z),
@@ -118,21 +117,27 @@ class NearFieldRequest:
 
 
 def near_field_request(options: Options) -> NearFieldRequest:
-    """Of the options, and of CELL.toml where they leave something out.
+    """The request of the options, with what they leave out from CELL.toml.
+
+    Defaults: the first wavelength of the sweep, maps at a quarter, half and three
+    quarters of the height, and half a wavelength around pillar and films.
+
+    Args:
+        options: of the command line.
 
     Raises:
-        ConfigError: samples, heights or lengths that are none.
+        ConfigError: samples, heights or lengths out of range.
     """
-    wanted = config.load(options.config, CellFile, empty=False)
-    cell = wanted.cell
+    settings = config.load(options.config, CellFile, empty=False)
+    cell = settings.cell
     wavelength = (
-        wanted.sweep.wavelengths_um[0]
+        settings.sweep.wavelengths_um[0]
         if options.wavelength_nm is None
         else options.wavelength_nm / NM
     )
     around = wavelength / 2 if options.around_um is None else options.around_um
-    parts = tuple(part * cell.height_um for part in (0.25, 0.5, 0.75))
-    heights = parts if options.heights_um is None else options.heights_um
+    quarters = tuple(part * cell.height_um for part in (0.25, 0.5, 0.75))
+    heights = quarters if options.heights_um is None else options.heights_um
     if not 8 <= options.samples <= MOST_SAMPLES:
         raise ConfigError(
             f"samples = {options.samples}: need 8 to {MOST_SAMPLES} points along the pitch"
@@ -164,45 +169,50 @@ def near_field_request(options: Options) -> NearFieldRequest:
 
 
 def run(options: Options) -> int:
-    """Compute, write, draw; exit 1 where an error estimate stays above the tolerance
-    that is stated, or above 0.5.
+    """Compute near fields, write and draw them.
+
+    Exit status 1 where an error estimate stays above the stated tolerance, or above 0.5
+    without one.
 
     Args:
         options: of the command line.
     """
-    wanted = near_field_request(options)
+    request = near_field_request(options)
     with options.claim(options.output, companions=(".png",)) as draft:
-        found = near_fields(
-            wanted.cell,
-            wanted.diameter_um,
-            wanted.light,
-            wanted.grids(),
-            tolerance=wanted.tolerance,
+        fields = near_fields(
+            request.cell,
+            request.diameter_um,
+            request.light,
+            request.grids(),
+            tolerance=request.tolerance,
         )
-        files = (options.config, *workers.material_files(wanted.cell))
+        files = (options.config, *workers.material_files(request.cell))
         save_near_field(
-            draft.path, wanted, found, {file.name: store.sha256(file) for file in files}
+            draft.path,
+            request,
+            fields,
+            {file.name: store.sha256(file) for file in files},
         )
         store.write_bytes(
-            draft.path.with_suffix(".png"), near_field_picture(wanted, found)
+            draft.path.with_suffix(".png"), near_field_picture(request, fields)
         )
-    names = (*CUTS, "xy")
+    by_cut = dict(zip((*CUTS, "xy"), fields, strict=True))
     values: dict[str, Any] = {
-        name: {"error": one.error, "largest_e": _largest(one)}
-        for name, one in zip(names, found, strict=True)
+        name: {"error": cut.error, "largest_e": _largest(cut)}
+        for name, cut in by_cut.items()
     }
     failures: list[str] = []
-    missed = [name for name, one in zip(names, found, strict=True) if not one.converged]
+    missed = [name for name, cut in by_cut.items() if not cut.converged]
     words = [
-        f"  {name}: |E| up to {_largest(one):.2f} of the light that comes, within {one.error:.1g} (rms)"
-        for name, one in zip(names, found, strict=True)
+        f"  {name}: |E| up to {_largest(cut):.2f} of the light that comes, within {cut.error:.1g} (rms)"
+        for name, cut in by_cut.items()
     ]
-    failed = any(one.error > (options.tolerance or UNKNOWN) for one in found)
+    failed = any(cut.error > (options.tolerance or UNKNOWN) for cut in fields)
     if missed:
-        above = f"{', '.join(missed)} above the tolerance {wanted.tolerance:g} at {found[0].orders} orders: "
+        above = f"{', '.join(missed)} above the tolerance {request.tolerance:g} at {fields[0].orders} orders: "
         cure = (
             "allow a larger one; "
-            if failed and all(one.error <= UNKNOWN for one in found)
+            if failed and all(cut.error <= UNKNOWN for cut in fields)
             else ""
         )
         text = f"{above}{cure}fields at edges converge slowly"
@@ -210,20 +220,25 @@ def run(options: Options) -> int:
             failures.append(text)
         else:
             words.append(f"  {text}")
-    title = f"{options.output}: field of {wanted.cell.described}, {NM * wanted.wavelength_um:g} nm"
-    numbers = {"orders": found[0].orders, "tolerance": wanted.tolerance, "cuts": values}
+    title = f"{options.output}: field of {request.cell.described}, {NM * request.wavelength_um:g} nm"
+    numbers = {
+        "orders": fields[0].orders,
+        "tolerance": request.tolerance,
+        "cuts": values,
+    }
     return options.console.judged(numbers, "\n".join([title, *words]), failures)
 
 
-def _largest(one: NearField) -> float:
-    return float(field_magnitude(one.e).max())
+def _largest(field: NearField) -> float:
+    """Largest |E| of a field over that of the incident light."""
+    return float(field_magnitude(field.e).max())
 
 
 def field_magnitude(field: Array) -> Array:
-    """(…) |E| = sqrt(|Ex|² + |Ey|² + |Ez|²) of (3, …).
+    """(…) |E| = sqrt(|Ex|² + |Ey|² + |Ez|²).
 
     Args:
-        field: sampled field or PSFs.
+        field: (3, …) complex components.
     """
     return np.asarray(np.sqrt((np.abs(field) ** 2).sum(axis=0)))
 
@@ -231,13 +246,14 @@ def field_magnitude(field: Array) -> Array:
 def save_near_field(
     path: Path, wanted: NearFieldRequest, found: list[NearField], inputs: dict[str, str]
 ) -> None:
-    """The file of kind ``near-field``: E and H (3, rows, columns) of the cuts, (3,
-    height, y, x) of the maps.
+    """Write the file of kind ``near-field``: E, H and index of both cuts and the maps.
+
+    Cuts have shape (3, rows, columns), maps (3, height, y, x), the index no first axis.
 
     Args:
-        path: file to read or write.
-        wanted: what the command asks for.
-        found: what was computed.
+        path: file to write.
+        wanted: the request, stored in the file.
+        found: fields on the cuts xz and yz, and on the maps.
         inputs: SHA-256 of each input file.
     """
     xz, yz, xy = found
@@ -247,47 +263,47 @@ def save_near_field(
         "z_um": np.asarray(xz.grid.z_um),
     }
     arrays["heights_um"] = np.array(wanted.heights_um)
-    for name, one, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
-        for part, field in (("e", one.e), ("h", one.h), ("index", one.index)):
-            arrays[f"{name}/{part}"] = (
-                field if flat is None else field.squeeze(axis=flat)
-            )
+    for name, near, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
+        for part, field in (("e", near.e), ("h", near.h), ("index", near.index)):
+            squeezed = field if flat is None else field.squeeze(axis=flat)
+            arrays[f"{name}/{part}"] = squeezed
     about: dict[str, store.Attribute] = {
         "wavelength_um": wanted.wavelength_um,
         "step_um": wanted.step_um,
     }
     about |= {
-        f"error_{name}": one.error
-        for name, one in zip((*CUTS, "xy"), found, strict=True)
+        f"error_{name}": near.error
+        for name, near in zip((*CUTS, "xy"), found, strict=True)
     }
     provenance = store.Provenance(config.dumps(wanted), inputs)
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
 
 
 def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> bytes:
-    """|E| on both cuts (light goes upwards) and on the maps, with the boundaries of the
-    materials.
+    """PNG of |E| on both cuts (light goes upwards) and on the maps, with material
+    edges.
 
     Args:
-        wanted: what the command asks for.
-        found: what was computed.
+        wanted: the request.
+        found: fields on the cuts xz and yz, and on the maps.
     """
-    cuts, maps = found[:2], found[2]
+    cuts = found[:2]
+    maps = found[2]
     columns = max(2, len(wanted.heights_um))
     figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
-    top = max(_largest(one) for one in found)
-    shown = None
-    for panel, one, name in zip(panels[0], cuts, CUTS, strict=False):
-        across = np.asarray(one.grid.x_um if name == "xz" else one.grid.y_um)
-        e = field_magnitude(one.e).squeeze()
-        index = one.index.squeeze().real
-        shown = _map(panel, across, np.asarray(one.grid.z_um), e, index, top)
+    top = max(_largest(near) for near in found)
+    image = None
+    for panel, near, name in zip(panels[0], cuts, CUTS, strict=False):
+        across = np.asarray(near.grid.x_um if name == "xz" else near.grid.y_um)
+        e = field_magnitude(near.e).squeeze()
+        index = near.index.squeeze().real
+        image = _map(panel, across, np.asarray(near.grid.z_um), e, index, top)
         panel.set(
             title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
         )
     for i, height in enumerate(wanted.heights_um):
         x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
-        shown = _map(
+        image = _map(
             panels[1, i], x, y, field_magnitude(maps.e)[i], maps.index[i].real, top
         )
         panels[1, i].invert_yaxis()
@@ -296,11 +312,20 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
         )
     for panel in (*panels[0, 2:], *panels[1, len(wanted.heights_um) :]):
         panel.set_axis_off()
-    figure.colorbar(shown, ax=panels, label="|E| of the light that comes", shrink=0.6)
+    figure.colorbar(image, ax=panels, label="|E| of the light that comes", shrink=0.6)
     return figure_png(figure)
 
 
 def _map(panel: Any, x: Array, y: Array, e: Array, index: Array, top: float) -> Any:
+    """Draw |E| on a panel with the boundaries of the materials; returns the image.
+
+    Args:
+        panel: of the figure.
+        x, y: (columns,) and (rows,) coordinates, um.
+        e: (rows, columns) |E|.
+        index: (rows, columns) real refractive index.
+        top: |E| at the end of the colour scale.
+    """
     edges = [
         axis[k] + step * (axis[1] - axis[0]) / 2
         for axis in (x, y)

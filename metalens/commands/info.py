@@ -77,6 +77,7 @@ def _array_lines(values: dict[str, Any], settings: str) -> list[str]:
 
 
 def _stored_values(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
+    """Content of an HDF5 artefact as a dictionary for JSON."""
     arrays = {name: f"{a.dtype} {tuple(a.shape)}" for name, a in stored.arrays.items()}
     return {
         "file": name,
@@ -89,34 +90,42 @@ def _stored_values(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
 
 
 def _stored_text(values: dict[str, Any]) -> str:
-    made = values["provenance"]
+    """Kind, version, attributes, provenance and arrays of a file, in words."""
+    provenance = values["provenance"]
     attributes = values["attributes"].items()
     return "\n".join(
         [
             f"{values['kind']} version {values['version']}",
             *(f"  {name} = {_short(value)}" for name, value in attributes),
-            _versions_line(made),
-            *(f"  from {n} (SHA-256 {h[:16]}…)" for n, h in made["inputs"].items()),
-            *_array_lines(values, made["config"]),
+            _versions_line(provenance),
+            *(
+                f"  from {n} (SHA-256 {h[:16]}…)"
+                for n, h in provenance["inputs"].items()
+            ),
+            *_array_lines(values, provenance["config"]),
         ]
     )
 
 
 def _short(value: object) -> str:
-    """One line; of a float the digits that arithmetic leaves right: 0.94 for
-    0.9400000000000001.
+    """A value on one line of at most 100 characters; floats to 12 digits.
+
+    Rounding to 12 digits drops the errors of arithmetic: 0.94 for 0.9400000000000001.
     """
-    text = (
-        repr(float(f"{value:.12g}"))
-        if isinstance(value, float)
-        else str(value).strip().replace("\n", "; ")
-    )
+    text = str(value).strip().replace("\n", "; ")
+    if isinstance(value, float):
+        text = repr(float(f"{value:.12g}"))
     return text if len(text) <= 100 else text[:97] + "..."
 
 
 def _sketch_largest(stored: store.StoredArtefact) -> list[str]:
-    """Lines of characters that show the first image of the largest (…, y, x) array,
-    darkest for the largest value.
+    """Character picture of the largest array, at most 48 columns by about 24 rows.
+
+    Its first (y, x) image, the densest character for the largest value; empty for files
+    without such an array.
+
+    Args:
+        stored: the artefact.
     """
     arrays = [a for a in stored.arrays.values() if a.ndim >= 2]
     largest = max(arrays, key=lambda array: array.size, default=np.zeros((0, 0), bool))
@@ -133,70 +142,72 @@ def _sketch_largest(stored: store.StoredArtefact) -> list[str]:
 
 
 def manifest_entry(path: Path) -> dict[str, Any] | None:
-    """A file that is no HDF5, as the manifest of its folder lists it: command and
-    versions; None where none does.
+    """Entry of a file in the manifest of its folder, with command and versions.
+
+    None for HDF5 files, and where no manifest lists the file.
 
     Args:
-        path: file to read or write.
+        path: of the file.
 
     Raises:
         StoreError: it is not as it was written.
     """
-    found = transaction.read_manifest(path.parent) if path.is_file() else None
-    listed = (found or {}).get("files", {}).get(path.name)
-    if found is None or listed is None:
+    manifest = transaction.read_manifest(path.parent) if path.is_file() else None
+    listed = (manifest or {}).get("files", {}).get(path.name)
+    if manifest is None or listed is None:
         return None
     with open(path, "rb") as file:
         if file.read(len(_HDF5)) == _HDF5:
             return None
     if store.sha256(path) != listed["sha256"]:
         raise StoreError(
-            f"{path}: not as `metalens {found['command']}` wrote it; make it again"
+            f"{path}: not as `metalens {manifest['command']}` wrote it; make it again"
         )
     return {
         "file": path.name,
-        "command": found["command"],
-        "versions": found["versions"],
+        "command": manifest["command"],
+        "versions": manifest["versions"],
         **listed,
     }
 
 
 def folder_manifest(path: Path) -> dict[str, Any]:
-    """The manifest of a folder, after its files were compared with it.
+    """Manifest of a folder, compared with its files.
 
     Args:
-        path: file to read or write.
+        path: of the folder.
 
     Raises:
         StoreError: no manifest, unfinished, or a file that is missing or differs.
     """
-    found = transaction.read_manifest(path)
-    if found is None:
+    manifest = transaction.read_manifest(path)
+    if manifest is None:
         raise StoreError(
             f"{path}: no {transaction.NAME} in it, not made by this toolchain; give a file, or a folder of ours"
         )
     transaction.check_manifest(path)
-    return {"folder": str(path), **found}
+    return {"folder": str(path), **manifest}
 
 
-def _folder_text(found: dict[str, Any]) -> str:
+def _folder_text(manifest: dict[str, Any]) -> str:
     lines = [
-        f"{found['folder']}: {len(found['files'])} files, each as it was written",
-        f"  metalens {found['command']}",
+        f"{manifest['folder']}: {len(manifest['files'])} files, each as it was written",
+        f"  metalens {manifest['command']}",
     ]
     lines += [
         f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…"
-        for name, e in found["files"].items()
+        for name, e in manifest["files"].items()
     ]
-    return "\n".join([*lines, _versions_line(found)])
+    return "\n".join([*lines, _versions_line(manifest)])
 
 
 def safetensors_head(path: Path) -> dict[str, Any]:
-    """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of
-    its length, then JSON).
+    """Kind, version, settings and tensors of a safetensors file, by its head.
+
+    The head is 8 bytes of its length, then JSON.
 
     Args:
-        path: file to read or write.
+        path: of the file.
 
     Raises:
         StoreError: missing, cut short, or no such file.

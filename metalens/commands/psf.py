@@ -117,7 +117,11 @@ class PsfSettings:
         self._check_light()
 
     def _check_sources(self) -> None:
-        """Depths, angles and the size of a source."""
+        """Check depths, angles and the size of the source.
+
+        Raises:
+            ConfigError: naming the setting and what is needed.
+        """
         near, far, step = self.depths_mm or (1.0, 1.0, 1.0)
         if not (0 < near <= far < np.inf and step > 0):
             raise ConfigError(
@@ -127,9 +131,8 @@ class PsfSettings:
             raise ConfigError(
                 f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave"
             )
-        if (far - near) / step > MOST_DEPTHS or max(
-            map(abs, (*(self.angles_deg or ()), *self.angles_y_deg, 0.0))
-        ) >= 90:
+        angles = (*(self.angles_deg or ()), *self.angles_y_deg, 0.0)
+        if (far - near) / step > MOST_DEPTHS or max(map(abs, angles)) >= 90:
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
                 "angles within 90 degrees"
@@ -152,6 +155,11 @@ class PsfSettings:
             )
 
     def _check_window(self) -> None:
+        """Check width, height and samples of the window.
+
+        Raises:
+            ConfigError: naming the setting and what is needed.
+        """
         width = 1.0 if self.window_um is None else self.window_um
         if not (2 <= self.samples <= MOST_SAMPLES and 0 < width < np.inf):
             raise ConfigError(
@@ -161,20 +169,24 @@ class PsfSettings:
             if self.height_um:
                 raise ConfigError(f"height_um = {self.height_um}: need window_um too")
             return
-        down = self.samples_y
-        if not (self.height_um >= 0 and 1 <= down <= MOST_SAMPLES):
+        rows = self.samples_y
+        if not (self.height_um >= 0 and 1 <= rows <= MOST_SAMPLES):
             raise ConfigError(
                 f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples"
             )
         step = self.window_um / self.samples
-        if self.height_um and abs(self.height_um / step - down) > 1e-6 * down:
+        if self.height_um and abs(self.height_um / step - rows) > 1e-6 * rows:
             raise ConfigError(
                 f"height_um = {self.height_um}: need a whole number of samples of window_um / samples = {step:g} "
-                f"um, as {down * step:g}"
+                f"um, as {rows * step:g}"
             )
 
     def _check_light(self) -> None:
-        """Tolerance and spectrum."""
+        """Check tolerance, spectrum and weights.
+
+        Raises:
+            ConfigError: naming the setting and what is needed.
+        """
         if not (0 < self.tolerance < 1 and self.led_fwhm_nm >= 0):
             raise ConfigError(
                 f"tolerance = {self.tolerance}, led_fwhm_nm = {self.led_fwhm_nm}: need 0 < tolerance < 1, width >= 0"
@@ -196,11 +208,9 @@ class PsfSettings:
     @property
     def samples_y(self) -> int:
         """Samples along y."""
-        return (
-            round(self.height_um / self.width_um * self.samples)
-            if self.height_um
-            else self.samples
-        )
+        if not self.height_um:
+            return self.samples
+        return round(self.height_um / self.width_um * self.samples)
 
     @property
     def width_um(self) -> float:
@@ -216,23 +226,29 @@ class PsfSettings:
     def about(
         self, device: lens.Lens, angles_rad: Array | None = None
     ) -> "PsfSettings":
-        """These with depths, angles and window of this lens where they were left out.
+        """Settings for one lens, with its depths, angles and window where they were
+        left out.
 
-        angles_rad: (n, 2) angles that it was measured at, in place of its field's.
+        Depths: infinity for a lens for collimated light, else 21 even ones over
+        :func:`metalens.lens.reach.depth_range_um`, of which the nearest in 1/z is moved
+        into focus.
+
+        Args:
+            device: the lens.
+            angles_rad: (n, 2) angles at which it was measured, in place of its field's.
         """
         filled = self
         if self.angles_deg is None:
             x, y = _angles_deg(device, angles_rad)
             filled = replace(filled, angles_deg=x, angles_y_deg=y)
-        collimated = math.isinf(device.source_distance_um)
         if not self.sources_mm and self.depths_mm is None:
-            if collimated:
+            if math.isinf(device.source_distance_um):
                 filled = replace(filled, sources_mm=(math.inf,))
             else:
                 near, far = (depth * 1e-3 for depth in reach.depth_range_um(device))
                 depths = np.linspace(near, far, 21)
                 focus_mm = device.source_distance_um * 1e-3
-                if near < focus_mm < far:  # one of them lies in focus
+                if near < focus_mm < far:
                     depths[np.abs(1 / depths - 1 / focus_mm).argmin()] = focus_mm
                 filled = replace(
                     filled,
@@ -250,7 +266,8 @@ class PsfSettings:
         """Depths, angles, window and source in um and rad.
 
         Raises:
-            ConfigError: depths or window are those of a lens, and no lens was named
+            ConfigError: depths, angles or window are left to the lens, and no lens was
+            named
                 (:meth:`about`).
         """
         if self.sources_mm:
@@ -259,10 +276,8 @@ class PsfSettings:
             raise ConfigError("depths_mm are left to the lens, and there is none")
         else:
             near, far, step = self.depths_mm
-            depths = (
-                np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
-                * 1e3
-            )
+            intervals = int(np.ceil((far - near) / step - 1e-9))
+            depths = np.linspace(near, far, intervals + 1) * 1e3
         if self.angles_deg is None:
             raise ConfigError("angles_deg are left to the lens, and there is none")
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
@@ -295,8 +310,13 @@ class PsfSettings:
     def spectrum_of(
         self, device: lens.Lens
     ) -> spectra.SpectralNodes | spectra.Source | spectra.MeasuredSpectrum | None:
-        """Wavelengths with weights, a diode or measured curves; None for the design
-        wavelength alone.
+        """The spectrum for a lens: wavelengths with weights, a diode or measured
+        curves.
+
+        None for the design wavelength alone.
+
+        Args:
+            device: the lens; a diode is centred at its wavelength.
         """
         if self.wavelengths_nm:
             share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
@@ -307,17 +327,21 @@ class PsfSettings:
             return spectra.read_measured_spectrum(
                 self.spectrum, within_um=device.proxy.wavelengths_um
             )
-        return (
-            spectra.Source(device.wavelength_um * 1e3, self.led_fwhm_nm)
-            if self.led_fwhm_nm
-            else None
-        )
+        if not self.led_fwhm_nm:
+            return None
+        return spectra.Source(device.wavelength_um * 1e3, self.led_fwhm_nm)
 
 
 def _angles_deg(
     device: lens.Lens, angles_rad: Array | None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """(x, y) field angles that a lens was measured at, or of its field."""
+    """(x, y) field angles in deg: those of the captures, else 0 and the half field
+    along x.
+
+    Args:
+        device: the lens.
+        angles_rad: (n, 2) angles at which it was measured; None for a design.
+    """
     if angles_rad is not None and len(angles_rad):
         x, y = np.rad2deg(np.unique(angles_rad, axis=0)).T
         return tuple(x.tolist()), tuple(y.tolist())
@@ -329,24 +353,23 @@ def _angles_deg(
 
 
 def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
-    """Settings of a file (None: those of the record) with what was given on the command
-    line in their place.
+    """Settings of a PSF.toml, replaced by those of the command line where these are
+    stated.
 
     Args:
-        path: file to read or write.
+        path: of PSF.toml; None for the defaults.
+        over: settings of the command line by name, None where not stated.
 
     Raises:
         ConfigError: as :func:`metalens.core.config.load`.
     """
     table = {} if path is None else config.read(path, PsfSettings, empty=False)
-    given = {name: value for name, value in over.items() if value is not None}
-    where = " and ".join(
-        [
-            *([str(path)] if path is not None else []),
-            *(["the command line"] if given else []),
-        ]
-    )
-    return config.from_table(table | given, PsfSettings, where=where or "metalens psf")
+    stated = {name: value for name, value in over.items() if value is not None}
+    sources = [str(path)] if path is not None else []
+    if stated:
+        sources.append("the command line")
+    where = " and ".join(sources)
+    return config.from_table(table | stated, PsfSettings, where=where or "metalens psf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,9 +385,8 @@ class Computed:
     scan: "psf.FocusScan | None" = None
 
 
-# by kind of file, the module whose ``load`` gives a :class:`AsBuiltSource`; filled by
-# the
-# command line
+# by kind of file, the module whose ``load`` gives an :class:`AsBuiltSource`; filled by
+# the command line
 SOURCES: dict[str, str] = {}
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
@@ -466,21 +488,22 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Compute, write, draw; exit 1 where the error estimate stays above the tolerance,
-    pillars are hardly known, or a window holds hardly any of the light.
+    """Compute PSFs, write them and draw them.
+
+    Exit status 1 where the error estimate stays above the tolerance, pillars are hardly
+    known, or a window holds hardly any of the light.
 
     Args:
         options: of the command line.
     """
     if options.far_field:
-        return _far(options)
+        return _run_far_field(options)
     target = options.output or Path("psf.h5")
     settings = options.settings
     psf_export.check_psf_format(target)
     device, built = _read(options.lens)
-    device = (
-        device if settings.layers is None else replace(device, layers=settings.layers)
-    )
+    if settings.layers is not None:
+        device = replace(device, layers=settings.layers)
     settings = settings.about(device, None if built is None else built.angle_rad)
     view = settings.view
     pixels = (
@@ -506,8 +529,12 @@ def run(options: Options) -> int:
     return options.console.judged(values, text, failures)
 
 
-def _far(options: Options) -> int:
-    """Compute, write, draw the far field of a design."""
+def _run_far_field(options: Options) -> int:
+    """Compute, write and draw the far field of a design; exit status 0.
+
+    Raises:
+        ConfigError: another output than .h5, or a lens that is no design.
+    """
     target = options.output or Path("far_field.h5")
     if target.suffix.lower() != ".h5":
         raise ConfigError(f"{target}: a far field is written as .h5")
@@ -517,20 +544,20 @@ def _far(options: Options) -> int:
             f"{options.lens}: the far field of a design (lens.h5), not of a file of kind {kind}"
         )
     device = lens.load(options.lens)
-    wanted = far_field.far_field_request(options, device)
+    request = far_field.far_field_request(options, device)
     inputs = {options.lens.name: store.sha256(options.lens)}
     with options.claim(
         target,
         companions=("_far.png", ".html"),
-        room=transaction.ROOM + 4 * wanted.samples**2,
+        room=transaction.ROOM + 4 * request.samples**2,
     ) as draft:
-        fields = far_field.compute_far_fields(device, wanted, options.console)
+        fields = far_field.compute_far_fields(device, request, options.console)
         far_field.save_far_fields(
-            draft.path, wanted, fields, inputs=inputs, page=options.report
+            draft.path, request, fields, inputs=inputs, page=options.report
         )
     options.console.result(
-        far_field.far_field_values(wanted, fields),
-        far_field.far_field_text(target, wanted, fields),
+        far_field.far_field_values(request, fields),
+        far_field.far_field_text(target, request, fields),
     )
     return 0
 
@@ -554,8 +581,9 @@ class AsBuiltSource(Protocol):
 
 
 def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
-    """The design of a file, and what was made of it where the file is of another kind
-    that the command line knows.
+    """The design in a file, and the as-built lens where the file is of such a kind.
+
+    :data:`SOURCES` names the kinds; None for a design.
     """
     kind = store.kind_of(path)
     if kind not in SOURCES:
@@ -567,28 +595,38 @@ def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
 def _compute(
     path: Path, settings: PsfSettings, device: lens.Lens, built: AsBuiltSource | None
 ) -> Computed:
-    """PSFs, the figures of the sharpest of every angle, and a scan behind a lens for
-    collimated light.
+    """PSFs, figures of the sharpest depth of every angle, and a scan along z.
+
+    The scan is of a lens for collimated light. With ``own_cell`` solved neighbours are
+    in the PSFs.
+
+    Args:
+        path: of the lens file.
+        settings: with nothing left to the lens.
+        device: the design.
+        built: the as-built lens; None for a design.
     """
     if built is not None:
         stack = _of_built(path, settings, built)
         figures = psf.focus_metrics(stack, device)
         return Computed(stack, figures, design.lens_meeting_um(device))
     device = _in_light(path, device, settings)
-    known = _own_cell(device, settings) if settings.own_cell else None
-    if known is not None and isinstance(known.neighbours, lens.NeighbourRows):
-        device = replace(device, neighbours=known.neighbours)
-    stack = _of_design(device, settings, known, _provenance(path, settings))
+    left_out = _own_cell(device, settings) if settings.own_cell else None
+    if left_out is not None and isinstance(left_out.neighbours, lens.NeighbourRows):
+        device = replace(device, neighbours=left_out.neighbours)
+    stack = _of_design(device, settings, left_out, _provenance(path, settings))
     figures = psf.focus_metrics(stack, device, power_error=design.power_error(device))
-    lit = figures[0].window_share >= DARK
-    scan = _scan(device, settings, stack) if lit else None
+    bright = figures[0].window_share >= DARK
+    scan = _scan(device, settings, stack) if bright else None
     return Computed(stack, figures, design.lens_meeting_um(device), scan)
 
 
 def _scan(
     device: lens.Lens, settings: PsfSettings, stack: psf.PsfStack
 ) -> "psf.FocusScan | None":
-    """Behind a lens for collimated light, unless its sources were stated."""
+    """Irradiance along z behind a lens for collimated light; None where sources were
+    stated.
+    """
     if not math.isinf(device.source_distance_um) or settings.sources_mm != (math.inf,):
         return None
     nodes = psf.SpectralNodes(stack.wavelengths_um, stack.weights, 0.0)
@@ -596,12 +634,19 @@ def _scan(
 
 
 def _write(path: Path, computed: Computed, *, page: bool) -> None:
-    """The file of PSFs, its pictures, and with ``page`` its report."""
+    """Write the PSFs, their pictures, and with ``page`` the report.
+
+    Args:
+        path: of the PSFs; pictures are NAME_xz.png and so on.
+        computed: PSFs and figures.
+        page: whether to write NAME.html.
+    """
     from metalens.psf import plots as psf_plots
 
     psf_export.export_psf(path, computed.stack)
     limit = max(
-        (one.limit for one in computed.figures), key=lambda one: one.cutoff_per_um
+        (metrics.limit for metrics in computed.figures),
+        key=lambda limit: limit.cutoff_per_um,
     )
     pictures = psf_plots.psf_pictures(computed.stack, limit=limit, scan=computed.scan)
     depths = computed.stack.depths_um
@@ -620,8 +665,11 @@ def _write(path: Path, computed: Computed, *, page: bool) -> None:
 
 
 def plot_information(stack: psf.PsfStack) -> bytes:
-    """I(z) of Eq. 11 on pixels of 3 µm (three samples, if that is more), binned 1, 2
-    and 3 times, under two normalisations.
+    """PNG of the axial information I(z) of Eq. 11 over depth, for two normalisations.
+
+    Pixels of 3 µm (three samples, if that is more), binned 1, 2 and 3 times; the first
+    and last field angle. Information between neighbouring depths is divided by the
+    squared step in mm.
 
     Args:
         stack: PSFs over angle, depth and wavelength.
@@ -662,9 +710,16 @@ def plot_information(stack: psf.PsfStack) -> bytes:
     return figure_png(figure)
 
 
-def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.PsfStack:
-    """PSFs of a kind of file that the command line knows a source for, the posterior of
-    its fit in their error.
+def _of_built(path: Path, settings: PsfSettings, built: AsBuiltSource) -> psf.PsfStack:
+    """PSFs of an as-built lens, with the posterior of its fit in their error.
+
+    Args:
+        path: of the file.
+        settings: with nothing left to the lens.
+        given: the as-built lens.
+
+    Raises:
+        ConfigError: settings that are for a design.
     """
     for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
         if getattr(settings, name):
@@ -675,8 +730,8 @@ def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.Ps
     if settings.polarisation in ("flux", "vector"):
         stated = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
         raise ConfigError(f"{path}: {stated}")
-    stack = given.psf_stack(settings.view, tolerance=settings.tolerance)
-    posterior = given.psf_posterior(settings.view)
+    stack = built.psf_stack(settings.view, tolerance=settings.tolerance)
+    posterior = built.psf_posterior(settings.view)
     budget = replace(stack.budget, posterior=posterior)
     return replace(
         stack,
@@ -687,43 +742,62 @@ def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.Ps
 
 
 def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens:
-    """The lens for the polarisation that is asked for."""
+    """The lens for the polarisation in the settings.
+
+    Args:
+        path: of the lens file, for messages.
+        device: the lens.
+        settings: with ``light``: both, x or y.
+
+    Raises:
+        ConfigError: light along x or y of a lens that has no such response.
+    """
     if settings.light == "both" or (
         device.pairs is None and device.one_light == f"light along {settings.light}"
     ):
         return device
     if device.pairs is not None:
         return device.seen(settings.light)
-    known = (
+    response = (
         f"know {device.one_light} alone" if device.one_light else "treat x and y alike"
     )
-    known = "are turned, for circular light" if device.hand else known
+    response = "are turned, for circular light" if device.hand else response
     raise ConfigError(
-        f"{path}: light = {settings.light!r} is for pillars of two sizes; these {known}"
+        f"{path}: light = {settings.light!r} is for pillars of two sizes; these {response}"
     )
 
 
 def _of_design(
     device: lens.Lens,
     settings: PsfSettings,
-    known: psf.LeftOut | None,
+    left_out: psf.LeftOut | None,
     provenance: Provenance,
 ) -> psf.PsfStack:
-    """PSFs of a lens file; of pillars of two sizes the mean of light along x and y."""
+    """PSFs of a design; with pillars of two sizes the mean of light along x and y.
 
-    def of(one: lens.Lens) -> psf.PsfStack:
+    Args:
+        device: the lens.
+        settings: with nothing left to the lens.
+        left_out: solved terms of the error budget; None for rough ones.
+        provenance: of the stack.
+
+    Raises:
+        ConfigError: x and y are focused at other distances.
+    """
+
+    def stack_of(polarised: lens.Lens) -> psf.PsfStack:
         return psf.from_lens(
-            one,
+            polarised,
             settings.view,
             tolerance=settings.tolerance,
-            spectrum=settings.spectrum_of(one),
+            spectrum=settings.spectrum_of(polarised),
             provenance=provenance,
             polarisation=settings.polarisation,
-            left_out=known,
+            left_out=left_out,
         )
 
     if device.pairs is None or settings.light != "both":
-        return of(device)
+        return stack_of(device)
     x, y = device.seen("x"), device.seen("y")
     if (x.sensor_distance_um, x.source_distance_um) != (
         y.sensor_distance_um,
@@ -732,7 +806,7 @@ def _of_design(
         raise ConfigError(
             "light along x and y is focused at other distances by this lens: give light = 'x' or 'y'"
         )
-    return psf.mean_over_polarizations(of(x), of(y))
+    return psf.mean_over_polarizations(stack_of(x), stack_of(y))
 
 
 def _provenance(path: Path, settings: PsfSettings) -> Provenance:
@@ -743,8 +817,10 @@ def _provenance(path: Path, settings: PsfSettings) -> Provenance:
 
 
 def _own_cell(device: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
-    """Neighbours and angle of the lens's own pillars, at the largest aperture and angle
-    of the view.
+    """Terms of the error budget by the lens's own cell: neighbours and angle of
+    incidence.
+
+    Solved at the largest aperture and angle of the view.
     """
     apertures = [psf.sine_aperture(device, angle) for angle in settings.view.angles_rad]
     incidence = max(
@@ -753,7 +829,7 @@ def _own_cell(device: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
     return design.left_out(device, aperture=max(apertures), incidence_rad=incidence)
 
 
-DARK = 0.1  # share of the light in the window, below which it holds no image
+DARK = 0.1  # least share of the light in a window that holds an image
 BUDGET_WORDS = (
     "What computation and model are wrong by, each alone, the worst over angles: the terms of the model are those "
     "of a perfect lens of the same aperture."
@@ -774,7 +850,8 @@ FIGURES = (
 
 
 def tolerance_excess(stack: psf.PsfStack) -> str:
-    """That the computed error is above the tolerance, and its cure; else empty.
+    """Message that the computed error is above the tolerance, with its cure; else
+    empty.
 
     Args:
         stack: PSFs over angle, depth and wavelength.
@@ -786,16 +863,16 @@ def tolerance_excess(stack: psf.PsfStack) -> str:
 
 
 def dark_window(computed: Computed) -> str:
-    """That windows hold hardly any light, and where the rays meet; else empty.
+    """Message that windows hold hardly any light, and where the rays meet; else empty.
 
     Args:
-        found: what was computed.
+        computed: PSFs and figures.
     """
-    missed = [one for one in computed.figures if not one.window_share >= DARK]
-    if not missed:
+    dark = [metrics for metrics in computed.figures if not metrics.window_share >= DARK]
+    if not dark:
         return ""
-    angles = ", ".join(_angle(one.angle_rad) for one in missed)
-    share = max(one.window_share for one in missed)
+    angles = ", ".join(_angle(metrics.angle_rad) for metrics in dark)
+    share = max(metrics.window_share for metrics in dark)
     meets = computed.meets_um
     where = (
         "rays of the design source meet nowhere (psf --far-field shows where its light goes)"
@@ -806,11 +883,11 @@ def dark_window(computed: Computed) -> str:
 
 
 def psf_text(target: Path, computed: Computed) -> str:
-    """Lines for people.
+    """Result of the command in words: error budget, figures of each angle, scan.
 
     Args:
         target: output file.
-        found: what was computed.
+        computed: PSFs and figures.
     """
     stack = computed.stack
     counts = (
@@ -824,7 +901,7 @@ def psf_text(target: Path, computed: Computed) -> str:
     lines = [
         f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})",
         f"  {stack.budget.text}",
-        *(_figures(one) for one in computed.figures),
+        *(_figures(metrics) for metrics in computed.figures),
     ]
     if computed.scan is not None:
         ends = computed.scan.shift_um[[0, -1]]
@@ -838,36 +915,44 @@ def psf_text(target: Path, computed: Computed) -> str:
     return "\n".join(lines)
 
 
-def _figures(one: psf.FocusMetrics) -> str:
-    where = f"  at {_angle(one.angle_rad)}, source at {_depth(one.depth_um)}"
-    if not one.window_share >= DARK:
-        return f"{where}: no image, {one.window_share:.2g} of the light in the window"
-    mtf = " / ".join(f"{1e3 * f:.4g}" for f in one.mtf50_per_um)
-    error = 1e3 * max(one.mtf50_error_per_um)
+def _figures(spot: psf.FocusMetrics) -> str:
+    """Figures of the sharpest depth of one field angle, in words.
+
+    Args:
+        spot: FWHM, Strehl ratio, MTF50 and efficiency, with errors and limits.
+    """
+    where = f"  at {_angle(spot.angle_rad)}, source at {_depth(spot.depth_um)}"
+    if not spot.window_share >= DARK:
+        return f"{where}: no image, {spot.window_share:.2g} of the light in the window"
+    mtf = " / ".join(f"{1e3 * f:.4g}" for f in spot.mtf50_per_um)
+    error = 1e3 * max(spot.mtf50_error_per_um)
     return (
-        f"{where}: FWHM {one.fwhm_um:.4g} +- {one.fwhm_error_um:.2g} um (diffraction limit {one.limit.fwhm_um:.4g}), "
-        f"Strehl ratio {one.strehl:.3f} +- {one.strehl_error:.2g},\n"
-        f"    MTF50 along x / y {mtf} +- {error:.2g} cycles/mm (limit {1e3 * one.limit.mtf50_per_um:.4g}, cut-off "
-        f"{1e3 * one.limit.cutoff_per_um:.4g}),\n"
-        f"    focusing efficiency {one.efficiency:.3f} +- {one.efficiency_error:.2g}: power within three FWHM over "
-        f"power on the aperture (limit {one.limit.efficiency:.3f}); {one.window_share:.1%} of the light in the window"
+        f"{where}: FWHM {spot.fwhm_um:.4g} +- {spot.fwhm_error_um:.2g} um (diffraction limit {spot.limit.fwhm_um:.4g}), "
+        f"Strehl ratio {spot.strehl:.3f} +- {spot.strehl_error:.2g},\n"
+        f"    MTF50 along x / y {mtf} +- {error:.2g} cycles/mm (limit {1e3 * spot.limit.mtf50_per_um:.4g}, cut-off "
+        f"{1e3 * spot.limit.cutoff_per_um:.4g}),\n"
+        f"    focusing efficiency {spot.efficiency:.3f} +- {spot.efficiency_error:.2g}: power within three FWHM over "
+        f"power on the aperture (limit {spot.limit.efficiency:.3f}); {spot.window_share:.1%} of the light in the window"
     )
 
 
 def _angle(angle_rad: tuple[float, float]) -> str:
+    """A field angle (x, y) in deg, in words."""
     x, y = np.rad2deg(angle_rad)
     return f"({x:.3g}, {y:.3g}) deg"
 
 
 def _depth(depth_um: float) -> str:
+    """A source depth in mm, in words."""
     return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
 
 
 def psf_numbers(computed: Computed) -> dict[str, Any]:
-    """Numbers for programs; None for what JSON does not know.
+    """Result of the command as a dictionary for JSON; None for numbers that are not
+    finite.
 
     Args:
-        found: what was computed.
+        computed: PSFs and figures.
     """
     stack = computed.stack
     values: dict[str, Any] = {
@@ -880,7 +965,7 @@ def psf_numbers(computed: Computed) -> dict[str, Any]:
         "depths_um": [_plain(depth) for depth in stack.depths_um.tolist()],
         "angles_rad": stack.angles_rad.tolist(),
         "wavelengths_um": stack.wavelengths_um.tolist(),
-        "focus": [_plain(asdict(one)) for one in computed.figures],
+        "focus": [_plain(asdict(metrics)) for metrics in computed.figures],
     }
     meets = computed.meets_um
     values["rays_meet_um"] = None if meets is None else list(meets)
@@ -894,23 +979,23 @@ def psf_numbers(computed: Computed) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """A value with None in place of numbers that are not finite."""
     if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
+        return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
 def key_figures(computed: Computed) -> list[KeyFigure]:
-    """What was computed, how well, and what the focus is worth.
+    """Key figures of the report: counts, errors, efficiency and Strehl ratio on axis.
 
     Args:
-        found: what was computed.
+        computed: PSFs and figures.
     """
     stack = computed.stack
     budget = computed.stack.budget
-    best = computed.figures[0]
+    focus = computed.figures[0]
     shape = len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)
     figures = [
         KeyFigure("field angles × depths × wavelengths", " × ".join(map(str, shape))),
@@ -920,60 +1005,63 @@ def key_figures(computed: Computed) -> list[KeyFigure]:
             stack.converged,
         ),
         KeyFigure("with what the model leaves out", f"{budget.total:.2g}"),
-        KeyFigure("focusing efficiency", f"{best.efficiency:.3f}"),
-        KeyFigure("Strehl ratio", f"{best.strehl:.3f}"),
+        KeyFigure("focusing efficiency", f"{focus.efficiency:.3f}"),
+        KeyFigure("Strehl ratio", f"{focus.strehl:.3f}"),
     ]
     if math.isnan(budget.outside):
         return figures
-    beside = KeyFigure("of the light falls beside the window", f"{budget.outside:.2g}")
-    return [*figures, beside]
+    outside = KeyFigure("of the light falls beside the window", f"{budget.outside:.2g}")
+    return [*figures, outside]
 
 
 def psf_sections(computed: Computed, pictures: dict[str, bytes]) -> list[Section]:
-    """Of the report; pictures by their captions.
+    """Sections of the report: pictures, focus, error by cause, energy.
 
     Args:
-        found: what was computed.
+        computed: PSFs and figures.
+        pictures: PNG by caption.
     """
     stack = computed.stack
     figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]
+    focus_rows = [
+        [
+            *(f"{x:.3g}" for x in np.rad2deg(spot.angle_rad)),
+            "∞" if math.isinf(spot.depth_um) else f"{1e-3 * spot.depth_um:.4g}",
+            f"{spot.fwhm_um:.4g} ± {spot.fwhm_error_um:.2g}",
+            spot.limit.fwhm_um,
+            f"{spot.strehl:.3f} ± {spot.strehl_error:.2g}",
+            *(f"{1e3 * f:.4g}" for f in spot.mtf50_per_um),
+            1e3 * spot.limit.mtf50_per_um,
+            f"{spot.efficiency:.3f} ± {spot.efficiency_error:.2g}",
+            spot.limit.efficiency,
+        ]
+        for spot in computed.figures
+    ]
     focus = Table(
         FIGURES,
-        [
-            [
-                *(f"{x:.3g}" for x in np.rad2deg(one.angle_rad)),
-                "∞" if math.isinf(one.depth_um) else f"{1e-3 * one.depth_um:.4g}",
-                f"{one.fwhm_um:.4g} ± {one.fwhm_error_um:.2g}",
-                one.limit.fwhm_um,
-                f"{one.strehl:.3f} ± {one.strehl_error:.2g}",
-                *(f"{1e3 * f:.4g}" for f in one.mtf50_per_um),
-                1e3 * one.limit.mtf50_per_um,
-                f"{one.efficiency:.3f} ± {one.efficiency_error:.2g}",
-                one.limit.efficiency,
-            ]
-            for one in computed.figures
-        ],
+        focus_rows,
         "The sharpest depth of every field angle; efficiency: power within three FWHM over power on the aperture.",
     )
     energy = np.asarray(stack.energy_um2)
-    rows = [
+    energy_rows = [
         [f"{x:.3g}", f"{y:.3g}", float(e.min()), float(e.max())]
         for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
     ]
-    table = Table(
+    energy_table = Table(
         ("x / deg", "y / deg", "least", "most"),
-        rows,
+        energy_rows,
         "Light in the window for unit irradiance, µm², over depth.",
     )
     return [
         Section("Pictures", items=figures),
         Section("Focus", items=[focus]),
         Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
-        Section("Energy", f"Method: {stack.reason}.", [table]),
+        Section("Energy", f"Method: {stack.reason}.", [energy_table]),
     ]
 
 
 def _budget_table(stack: psf.PsfStack) -> Table:
+    """Table of the relative L2 error by cause, with both sums."""
     budget = stack.budget
     rows = [
         [name, "not known" if math.isnan(v) else f"{v:.2g}"]

@@ -45,16 +45,15 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    study = (
-        CellStudy()
-        if options.config is None
-        else config.load(options.config, CellStudy, empty=False)
-    )
-    given = "" if options.config is None else f" {options.config.name}"
+    study = CellStudy()
+    arguments = ""
+    if options.config is not None:
+        study = config.load(options.config, CellStudy, empty=False)
+        arguments = f" {options.config.name}"
     if options.process is not None:
         study = _printable(options.process, study)
-        given += f" --process {options.process.name}"
-    command = f"metalens study{given} -o {options.output.name}"
+        arguments += f" --process {options.process.name}"
+    command = f"metalens study{arguments} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.shared():
         journal = SweepJournal(
             options.output.with_name(options.output.name + ".resume"), study
@@ -71,8 +70,8 @@ def run(options: Options) -> int:
     text = f"{options.output}: {len(verdicts)} cells"
     if best is not None:
         text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
-    missed = cell_study.uncertain_entries(study, verdicts)
-    text += f"\n  {missed}" if missed else ""
+    uncertain = cell_study.uncertain_entries(study, verdicts)
+    text += f"\n  {uncertain}" if uncertain else ""
     return options.console.judged(
         values, text, [] if best else ["no cell covers a full turn at all wavelengths"]
     )
@@ -84,9 +83,9 @@ def _printable(path: Path, study: CellStudy) -> CellStudy:
     """
     module = load_above("process")
     shapes = itertools.product(study.pitches_um, study.heights_um)
-    found = [
+    limits = [
         module.printable_limits(path, pitch_um=pitch, height_um=height)
         for pitch, height in shapes
     ]
-    thinnest, gap = (max(values) for values in zip(*found, strict=True))
+    thinnest, gap = (max(values) for values in zip(*limits, strict=True))
     return replace(study, min_diameter_um=thinnest * nm, min_gap_um=gap * nm)

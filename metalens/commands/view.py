@@ -15,16 +15,14 @@ from metalens.core import store, transaction
 from metalens.core.errors import ConfigError
 from metalens.view import Panel, write_page
 
-# what tells the kind of a folder: names of files in it, any of them
+# kind of a folder by patterns of file names, any of which it holds
 FOLDERS = {
     "mask": tuple(f"*{end}" for end in MASKS),
     "run": ("log.jsonl", "checkpoint.safetensors"),
     "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
 }
-GENERATOR, _HEAD = (
-    'content="metalens toolchain"',
-    400,
-)  # what tells these pages, and characters that hold it
+GENERATOR = 'content="metalens toolchain"'  # in the head of these pages
+_HEAD = 400  # characters of a page that include it
 OWN = {
     "library": "library_panels",
     "axes-library": "axes_panels",
@@ -60,9 +58,9 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    target = options.output or _beside(options.file)
+    target = options.output or _default_page(options.file)
     with options.claim(target) as draft:
-        title, panels = _shown(options.file)
+        title, panels = _title_and_panels(options.file)
         write_page(draft.path, title, panels, about=_about(options.file))
     size = target.stat().st_size
     options.console.result(
@@ -73,9 +71,10 @@ def run(options: Options) -> int:
     return 0
 
 
-def _beside(path: Path) -> Path:
-    """NAME.html beside it; NAME_view.html where the first is another page, as the
-    report of ``psf`` or ``fit``.
+def _default_page(path: Path) -> Path:
+    """NAME.html in the folder of the artefact.
+
+    NAME_view.html where NAME.html is another page, as the report of ``psf`` or ``fit``.
     """
     own = path.resolve() if not path.name else path
     target = own.with_name(own.name.removesuffix(".h5") + ".html")
@@ -86,50 +85,45 @@ def _beside(path: Path) -> Path:
     return target if GENERATOR in head else target.with_name(f"{target.stem}_view.html")
 
 
-def _shown(path: Path) -> tuple[str, list[Panel]]:
+def _title_and_panels(path: Path) -> tuple[str, list[Panel]]:
+    """Title of the page and panels of an artefact."""
     kind = kind_of(path)
     return f"{path.name} ({kind})", panels_of(kind)(path)
 
 
 def kind_of(path: Path) -> str:
-    """What an artefact is: a kind of HDF5 file, ``mask``, ``run`` or ``capture``.
+    """Kind of an artefact: that of an HDF5 file, ``mask``, ``run``, ``capture`` or
+    ``lights``.
 
     Args:
-        path: file to read or write.
+        path: of the file or folder.
 
     Raises:
         ConfigError: a folder of none of these kinds; what can be shown of it is named.
-            StoreError: no artefact.
+        StoreError: no artefact.
     """
     if path.is_dir():
         if kind := _folder_kind(path):
             return kind
         inside = [str(p) for p in _inside(path)]
         pages = [str(p) for p in sorted(path.glob("*.html"))]
+        hint = "" if pages else "; give a file"
+        if inside:
+            hint = f"; give one of {', '.join(inside[:9])}"
+        if pages:
+            hint += f"; its own page is {', '.join(pages[:3])}"
         raise ConfigError(
-            f"{path} is no folder of a mask, of captures or of a run"
-            + (
-                f"; give one of {', '.join(inside[:9])}"
-                if inside
-                else "; give a file"
-                if not pages
-                else ""
-            )
-            + (f"; its own page is {', '.join(pages[:3])}" if pages else "")
+            f"{path} is no folder of a mask, of captures or of a run{hint}"
         )
     return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
 
 
 def _folder_kind(path: Path) -> str | None:
-    kind = next(
-        (
-            k
-            for k, names in FOLDERS.items()
-            if any(True for name in names for _ in path.glob(name))
-        ),
-        None,
-    )
-    return kind or ("lights" if _of_lights(path) else None)
+    """Kind of a folder by the names of its files; None where none fits."""
+    for kind, patterns in FOLDERS.items():
+        if any(True for pattern in patterns for _ in path.glob(pattern)):
+            return kind
+    return "lights" if _of_lights(path) else None
 
 
 def _of_lights(path: Path) -> bool:
@@ -148,25 +142,33 @@ def _inside(path: Path) -> list[Path]:
 
 
 def _about(path: Path) -> dict[str, object]:
-    """Where an artefact comes from."""
+    """Provenance of an artefact for its page: command or versions, inputs, settings."""
     if path.is_dir() or path.suffix != ".h5":
-        found = transaction.read_manifest(path if path.is_dir() else path.parent) or {}
-        return {name: found[name] for name in found if name != "files"}
-    made = store.load(path).provenance
+        manifest = (
+            transaction.read_manifest(path if path.is_dir() else path.parent) or {}
+        )
+        return {name: manifest[name] for name in manifest if name != "files"}
+    provenance = store.load(path).provenance
     return {
-        "made with": ", ".join(f"{k} {v}" for k, v in made.versions.items()),
-        "from": {name: digest for name, digest in made.inputs.items()},
-        "settings": made.config,
+        "made with": ", ".join(f"{k} {v}" for k, v in provenance.versions.items()),
+        "from": {name: digest for name, digest in provenance.inputs.items()},
+        "settings": provenance.config,
     }
 
 
 def panels_of(kind: str) -> Callable[[Path], list[Panel]]:
-    """What shows a kind of artefact; any other kind is shown plainly."""
+    """The function that makes the panels of a kind of artefact from its path.
+
+    Kinds without their own are shown by arrays and attributes.
+
+    Args:
+        kind: as :func:`kind_of` gives it.
+    """
     module, _, function = VIEWS.get(kind, "").partition(":")
     if not module:
         module = "metalens.view.artefacts"
         function = OWN.get(kind, "plain_panels")
-    found: Callable[[Path], list[Panel]] = getattr(
+    make_panels: Callable[[Path], list[Panel]] = getattr(
         importlib.import_module(module), function
     )
-    return found
+    return make_panels

@@ -25,12 +25,12 @@ from metalens.library import GeometricPhase, PillarLibrary, Proxy, height_hint
 from metalens.library.axes import AxesLibrary, cell_of_sizes
 
 EDGE_UM = 2e-3  # a proxy that ends this near a printable limit is ended by the process
-_STEP_RAD = 0.05  # phase between tabulated diameters; a parabola interpolates
-_COVERED_RAD = 0.2  # phase error within which a pillar covers a wanted phase
-_COVERED_LEVEL = 0.7  # and the |t| that it needs
-_GAPS = 12  # sizes along each axis at which gaps of oblique pillars are computed
+_STEP_RAD = 0.05  # phase step between tabulated diameters (parabolic interpolation)
+_COVERED_RAD = 0.2  # largest phase error at which a pillar covers a target phase
+_COVERED_LEVEL = 0.7  # least |t| at which a pillar covers a target phase
+_GAPS = 12  # grid of sizes along each axis for the gaps of oblique pillars
 
-# wanted (channels, sites) phases -> (maps (k, sites), [(phase, |t|) of each channel])
+# target phases (channels, sites) -> (maps (k, sites), [(phase, |t|) of each channel])
 _Choice = Callable[
     [Array], tuple[Sequence[Array] | Array, Sequence[tuple[Array, Array]]]
 ]
@@ -43,13 +43,13 @@ class Quality:
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
     wavefront_efficiency: |sum T exp(i error)|² / N²: power on the aperture that leaves
-    in the wanted wave front. The focusing efficiency is that of the PSF
+    in the target wave front. The focusing efficiency is that of the PSF
     (:func:`metalens.design.focus_figures`).
     transmission: mean |T|².
     strehl: |sum T exp(i error)|² / (sum T)²: Strehl ratio left by the phase errors.
     field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a
     Strehl ratio of 0.8 on its flat sensor (Maréchal's criterion).
-    max_phase_error_rad: largest difference between wanted and assigned phase.
+    max_phase_error_rad: largest difference between target and assigned phase.
     rms_phase_error_rad: its root mean square over the pillars.
     turns: phase coverage of the pillars over 2 pi; below 1 some phases are replaced by
     the nearest.
@@ -98,7 +98,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class WavelengthTarget:
-    """Wanted phase at one wavelength.
+    """Target phase at one wavelength.
 
     phase: function of position, see :func:`metalens.design.phase_of`.
     focus: what is imaged onto what at this wavelength.
@@ -154,7 +154,7 @@ class ConversionMetrics:
 def phase_of(
     shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float
 ) -> PhaseOf:
-    """Wanted phase of a lens profile in rad as a function of position.
+    """Target phase of a lens profile in rad as a function of position.
 
     Args:
         shape: profile on top of the focus; None for the hyperbolic lens.
@@ -202,18 +202,18 @@ def make(
     provenance: Provenance | None = None,
     accept_partial_turn: bool = False,
 ) -> tuple[Lens, Quality]:
-    """Assign the pillar of the wanted phase to every site (paper Eq. 2 inverted).
+    """Assign the pillar of the target phase to every site (paper Eq. 2 inverted).
 
     Args:
-        phase: function of the sites' x (columns,) and y (rows,) in um to the wanted
+        phase: function of the sites' x (columns,) and y (rows,) in um to the target
             phase (rows, columns) in rad (:func:`phase_of`); called by blocks of rows.
         focus: what is imaged onto what.
         aperture_um: diameter; every pillar's centre lies half a pitch inside it.
         cell: unit cell of the pillars.
         proxy: phase and |t| over the diameter.
         limits: of the process; they narrow the proxy's domain.
-        profile: name kept in the lens.
-        provenance: kept in the lens.
+        profile: name in the lens file.
+        provenance: of the lens file.
         accept_partial_turn: take the nearest phase where the pillars cover less than a
             turn; the quality states the loss.
 
@@ -224,21 +224,22 @@ def make(
         LensError: the aperture holds no pillar, the printable diameters reach less than
             a full turn, or the phase has another shape.
     """
-    limits, wave = limits or Limits(), focus.wavelength_um
+    limits = limits or Limits()
+    wave = focus.wavelength_um
     span = printable_range_um(
         proxy, cell, limits, wave, accept_partial_turn=accept_partial_turn
     )
     gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"
 
-    def choose(wanted: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
-        size = proxy.diameter_um(wanted[0], wave, within_um=span, gap=gap)
-        size = size.astype(np.float32)
-        return [size], [_response(proxy, size, wave)]
+    def choose_sizes(targets: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
+        sizes = proxy.diameter_um(targets[0], wave, within_um=span, gap=gap)
+        sizes = sizes.astype(np.float32)
+        return [sizes], [_response(proxy, sizes, wave)]
 
-    place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
-    maps, (sums,) = _fill_sites(place, [phase], choose)
-    lens = _make_lens(place.map(maps[0]), cell, proxy, focus, profile, provenance)
-    return lens, sums.quality(focus, place, cell, _coverage(proxy, wave, span))
+    sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
+    maps, (sums,) = _fill_sites(sites, [phase], choose_sizes)
+    lens = _make_lens(sites.map(maps[0]), cell, proxy, focus, profile, provenance)
+    return lens, sums.quality(focus, sites, cell, _coverage(proxy, wave, span))
 
 
 def assign_multi_wavelength(
@@ -270,8 +271,8 @@ def assign_multi_wavelength(
         diameters lie within 1e-4 rad of the least sum for these pistons; the pistons
         are the best of 16 starts, another minimum may be lower.
     """
-    waves = [w.focus.wavelength_um for w in wanted]
-    weights = [w.weight for w in wanted]
+    waves = [target.focus.wavelength_um for target in wanted]
+    weights = [target.weight for target in wanted]
     if not waves or len(set(waves)) < len(waves):
         raise LensError(
             f"wavelengths {', '.join(f'{w:g}' for w in waves)} um: "
@@ -284,24 +285,24 @@ def assign_multi_wavelength(
     limits = limits or Limits()
     for wave in waves:  # every wavelength is checked; the range is the same for all
         span = printable_range_um(proxy, cell, limits, wave, accept_partial_turn=True)
-    sizes = _table_sizes(proxy, span, waves)
-    tabulated = (_response(proxy, sizes, wave) for wave in waves)
-    t = [level * np.exp(1j * phase) for phase, level in tabulated]
+    tabulated = _table_sizes(proxy, span, waves)
+    responses = (_response(proxy, tabulated, wave) for wave in waves)
+    t = [level * np.exp(1j * phase) for phase, level in responses]
     table = make_candidates(np.stack(t), np.array(weights))
 
-    def choose(block: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
-        size = span[0] + (sizes[1] - sizes[0]) * table.between(block)
-        size = size.astype(np.float32)
-        return [size], [_response(proxy, size, wave, span) for wave in waves]
+    def choose_sizes(targets: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
+        chosen = span[0] + (tabulated[1] - tabulated[0]) * table.between(targets)
+        chosen = chosen.astype(np.float32)
+        return [chosen], [_response(proxy, chosen, wave, span) for wave in waves]
 
-    place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
-    phases = [one.phase for one in wanted]
-    maps, sums = _fill_sites(place, phases, choose, table=table)
+    sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
+    phases = [target.phase for target in wanted]
+    maps, channel_sums = _fill_sites(sites, phases, choose_sizes, table=table)
     first = wanted[0].focus
-    lens = _make_lens(place.map(maps[0]), cell, proxy, first, profile, provenance)
+    lens = _make_lens(sites.map(maps[0]), cell, proxy, first, profile, provenance)
     return lens, tuple(
-        one.quality(target.focus, place, cell, _coverage(proxy, wave, span))
-        for one, target, wave in zip(sums, wanted, waves, strict=True)
+        sums.quality(target.focus, sites, cell, _coverage(proxy, wave, span))
+        for sums, target, wave in zip(channel_sums, wanted, waves, strict=True)
     )
 
 
@@ -317,10 +318,11 @@ def assign_polarization_multiplexed(
 ) -> tuple[Lens, PolarizationMetrics]:
     """Assign two-size pillars for light polarised along x and along y.
 
-    Where both phases are one, they share a piston: any polarisation stays as it is.
+    Where both phases are equal they share a piston, so that the lens keeps any
+    polarisation.
 
     Args:
-        phases: wanted for light along x and along y; None: one phase for both.
+        phases: targets for light along x and along y; None: one phase for both.
         focuses: what each images onto what.
         library: response over the two sizes; its entries are the candidates.
         aperture_um, limits, profile, provenance: see :func:`make`.
@@ -333,54 +335,57 @@ def assign_polarization_multiplexed(
         LensError: no printable pair of sizes within its error bar.
         DomainError: a wavelength that the library lacks.
     """
-    limits, cell = limits or Limits(), library.cell
-    at = library.at(focuses[0].wavelength_um)
+    limits = limits or Limits()
+    cell = library.cell
+    wave = library.at(focuses[0].wavelength_um)  # index along the wavelength axis
     isotropic = phases[1] is None
-    printed = library.usable[at] & _is_printable(library, limits)
-    if not printed.any():
+    printable = library.usable[wave] & _is_printable(library, limits)
+    if not printable.any():
         x, y = library.x_um, library.y_um
         raise LensError(
             "no printable pair of sizes within its error bar: the library holds "
             f"{x[0]:.4g}-{x[-1]:.4g} um by {y[0]:.4g}-{y[-1]:.4g} um, the process "
             f"prints {limits.min_diameter_nm:g} nm and gaps of {limits.min_gap_nm:g} nm"
         )
-    row, column = np.nonzero(printed)
-    jones = library.t[at, row, column]
+    row, column = np.nonzero(printable)
+    jones = library.t[wave, row, column]  # (candidates, 2, 2)
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]])
     sizes = np.array([library.x_um[row], library.y_um[column]], np.float32)
     table = make_candidates(t, np.ones(2), common_piston=isotropic)
-    used = np.zeros(t.shape[1], int)
+    counts = np.zeros(t.shape[1], int)  # sites at which each candidate stands
 
-    def choose(block: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-        pick = table.nearest(block)
-        used[:] += np.bincount(pick, minlength=len(used))
-        return sizes[:, pick], [(np.angle(one), abs(one)) for one in t[:, pick]]
+    def choose_pairs(targets: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        pick = table.nearest(targets)
+        counts[:] += np.bincount(pick, minlength=len(counts))
+        chosen = [(np.angle(t_pol), abs(t_pol)) for t_pol in t[:, pick]]
+        return sizes[:, pick], chosen
 
-    place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
-    wanted = phases[0], phases[1] or phases[0]
-    maps, sums = _fill_sites(place, wanted, choose, table=table, maps=2)
-    bars = library.t_error[at, row, column]
-    relative = bars / np.abs(t).min(axis=0).clip(1e-6)
+    sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
+    targets = phases[0], phases[1] or phases[0]
+    maps, sums = _fill_sites(sites, targets, choose_pairs, table=table, maps=2)
+    t_error = library.t_error[wave, row, column]
+    relative_error = t_error / np.abs(t).min(axis=0).clip(1e-6)
     pairs = TwoSizeTable(
         library.wavelength_um,
         library.x_um,
         library.y_um,
         np.stack([library.t[..., 0, 0], library.t[..., 1, 1]], axis=-1),
         (focuses[1].sensor_distance_um, focuses[1].source_distance_um),
-        math.sqrt(np.average(relative**2, weights=used)),
+        math.sqrt(np.average(relative_error**2, weights=counts)),
     )
-    made = place.map(maps[0], length_um=maps[1])
+    diameters = sites.map(maps[0], length_um=maps[1])
     lens = _make_lens(
-        made, cell, pairs.proxy, focuses[0], profile, provenance, pairs=pairs
+        diameters, cell, pairs.proxy, focuses[0], profile, provenance, pairs=pairs
     )
     quality = [
-        one.quality(f, place, cell, 1.0) for one, f in zip(sums, focuses, strict=True)
+        channel.quality(focus, sites, cell, 1.0)
+        for channel, focus in zip(sums, focuses, strict=True)
     ]
-    mean = float(np.average(bars, weights=used))  # bounds the error of the peak
+    mean = float(np.average(t_error, weights=counts))  # bounds the error of the peak
     errors = [2 * math.sqrt(q.wavefront_efficiency) * mean + mean**2 for q in quality]
     leaked = [
-        float(np.average(np.abs(one) ** 2, weights=used))
-        for one in (jones[:, 1, 0], jones[:, 0, 1])
+        float(np.average(np.abs(crossed) ** 2, weights=counts))
+        for crossed in (jones[:, 1, 0], jones[:, 0, 1])
     ]
     return lens, PolarizationMetrics(
         quality[0],
@@ -389,7 +394,7 @@ def assign_polarization_multiplexed(
         (leaked[0], leaked[1]),
         _covered_share(t, isotropic=isotropic),
         not isotropic,
-        int(np.count_nonzero(used)),
+        int(np.count_nonzero(counts)),
     )
 
 
@@ -404,16 +409,16 @@ def assign_geometric_phase(
     profile: str = "map",
     provenance: Provenance | None = None,
 ) -> tuple[Lens, Quality, ConversionMetrics]:
-    """Rotate pillars of one size by half the wanted phase (Pancharatnam-Berry phase).
+    """Rotate pillars of one size by half the target phase (Pancharatnam-Berry phase).
 
     Args:
         phase, focus, aperture_um, limits, profile, provenance: see :func:`make`.
-        library: for circular light, with its proxy; its best size is taken.
+        library: for circular light, with its proxy; all pillars take its best size.
         hand: of the incident light: right is x + iy, left x - iy.
 
     Returns:
-        The lens (rotations in [0, pi), float32), its quality (that of the converted
-        light), and the conversion.
+        The lens (rotations in [0, pi), float32), the quality of the converted light,
+        and the conversion.
 
     Raises:
         LensError: a library that is not for circular light, pillars that the process
@@ -426,29 +431,30 @@ def assign_geometric_phase(
             "hand: the library holds no turned pillars; "
             "sweep it with light = 'circular'"
         )
-    limits, wave = limits or Limits(), focus.wavelength_um
+    limits = limits or Limits()
+    wave = focus.wavelength_um
     _check_rotated(cell, rotated, limits)
-    step = HANDS[hand]
+    slope = HANDS[hand]  # d phase / d rotation, +2 or -2
     start, level = _response(proxy, np.array([rotated.size_um]), wave)
 
-    def choose(wanted: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
-        angle = np.mod((wanted[0] - start) / step, np.pi).astype(np.float32)
-        made = start + step * angle.astype(float)
+    def choose_angles(targets: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
+        angle = np.mod((targets[0] - start) / slope, np.pi).astype(np.float32)
+        assigned = start + slope * angle.astype(float)
         size = np.full(len(angle), np.float32(rotated.size_um))
-        return [size, angle], [(made, np.broadcast_to(level, made.shape))]
+        return [size, angle], [(assigned, np.broadcast_to(level, assigned.shape))]
 
-    place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
-    maps, (sums,) = _fill_sites(place, [phase], choose, maps=2)
-    made = place.map(maps[0], maps[1])
-    lens = _make_lens(made, cell, proxy, focus, profile, provenance, hand=hand)
-    sign = float(np.sign(step))
+    sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
+    maps, (sums,) = _fill_sites(sites, [phase], choose_angles, maps=2)
+    diameters = sites.map(maps[0], maps[1])
+    lens = _make_lens(diameters, cell, proxy, focus, profile, provenance, hand=hand)
+    sign = float(np.sign(slope))
     conversion = ConversionMetrics(
         rotated.size_um,
         *rotated.efficiency(sign),
         *rotated.unconverted(sign),
         rotated.model_error,
     )
-    return lens, sums.quality(focus, place, cell, 1.0), conversion
+    return lens, sums.quality(focus, sites, cell, 1.0), conversion
 
 
 def printable_range_um(
@@ -471,7 +477,7 @@ def printable_range_um(
     Raises:
         LensError: no diameter, or less than a full turn of phase without leave.
     """
-    thinnest, widest = _printed(cell, limits)
+    thinnest, widest = _printable_sizes_um(cell, limits)
     low = max(proxy.domain_um[0], thinnest)
     high = min(proxy.domain_um[1], widest)
     if low >= high:
@@ -493,11 +499,10 @@ def printable_range_um(
 
 
 def phase_coverage_hint(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
-    """Advice for pillars that cover less than a turn of phase.
+    """Advice in words for pillars that cover less than a full turn of phase.
 
-    Phase grows with the height as long as no resonance ends it: where the process ends
-    the pillars, a height over the turns covers one. Where the library ends them sooner,
-    taller pillars bring the resonance nearer.
+    Where the process bounds the diameters, a pillar of height h / turns covers a full
+    turn. Where a resonance bounds them, the advice is a wider sweep or another pitch.
 
     Args:
         proxy: phase over the diameter.
@@ -505,7 +510,7 @@ def phase_coverage_hint(proxy: Proxy, cell: Cell, limits: Limits, turns: float) 
         limits: of the process.
         turns: phase coverage over 2 pi.
     """
-    thinnest, widest = _printed(cell, limits)
+    thinnest, widest = _printable_sizes_um(cell, limits)
     low, high = proxy.domain_um
     if low <= thinnest + EDGE_UM and high >= widest - EDGE_UM:
         return height_hint(cell.height_um, turns)
@@ -522,12 +527,19 @@ class _MetricSums:
     """Running sums over all pillars that :class:`Quality` is computed from."""
 
     def __init__(self) -> None:
-        self.count, self.field = 0, 0j
+        self.count = 0
+        self.field = 0j  # sum of T exp(i error)
         self.level = self.power = self.square = self.worst = 0.0
 
-    def add(self, wanted: Array, phase: Array, level: Array) -> None:
-        """Add pillars: wanted and assigned phase in rad, and |T|."""
-        error = np.remainder(phase - wanted + np.pi, 2 * np.pi) - np.pi
+    def add(self, target: Array, phase: Array, level: Array) -> None:
+        """Add pillars to the sums.
+
+        Args:
+            target: (n,) target phase, rad.
+            phase: (n,) assigned phase, rad.
+            level: (n,) |T|.
+        """
+        error = np.remainder(phase - target + np.pi, 2 * np.pi) - np.pi
         self.count += error.size
         self.field += complex((level * np.exp(1j * error)).sum())
         self.level += float(level.sum())
@@ -538,8 +550,19 @@ class _MetricSums:
     def quality(
         self, focus: Focus, place: LatticeSites, cell: Cell, turns: float
     ) -> Quality:
-        """Quality of all pillars that were added."""
-        peak, radius = abs(self.field) ** 2, place.aperture_um / 2
+        """Quality of all added pillars from the running sums.
+
+        With N pillars, F = sum T exp(i error) and L = sum T: wave-front efficiency
+        |F|² / N², Strehl ratio |F|² / L².
+
+        Args:
+            focus: source and sensor distances of the design.
+            place: sites of the lattice and the aperture.
+            cell: unit cell of the pillars.
+            turns: phase coverage of the pillars over 2 pi.
+        """
+        peak = abs(self.field) ** 2
+        radius = place.aperture_um / 2
         source, wave = focus.source_distance_um, focus.wavelength_um
         return Quality(
             pillars=self.count,
@@ -566,18 +589,27 @@ def _fill_sites(
     table: CandidateTable | None = None,
     maps: int = 1,
 ) -> tuple[Array, list[_MetricSums]]:
-    """(maps, y, x) float32 maps of the chosen pillars, and the sums of every channel;
-    with a table its best pistons are added to the wanted phases.
+    """Maps of the chosen pillars and the metric sums of every channel, block by block.
+
+    Args:
+        place: sites of the lattice inside the aperture.
+        phases: target phase of every channel.
+        choose: pillars and their responses for (channels, sites) target phases, rad.
+        table: candidates whose best pistons are added to the targets; None adds none.
+        maps: quantities per pillar, 1 or 2.
+
+    Returns:
+        (maps, y, x) float32 maps, 0 without a pillar, and one sum for every channel.
     """
     pistons = None if table is None else table.pistons(place.sample(phases))
     filled = np.zeros((maps, *place.shape), np.float32)
     sums = [_MetricSums() for _ in phases]
-    for rows, inside, wanted in place.blocks(phases, pistons):
-        chosen, responses = choose(wanted)
+    for rows, inside, targets in place.blocks(phases, pistons):
+        chosen, responses = choose(targets)
         for array, values in zip(filled, chosen, strict=True):
             array[rows][inside] = values
-        for one, phase, response in zip(sums, wanted, responses, strict=True):
-            one.add(phase, *response)
+        for channel, phase, response in zip(sums, targets, responses, strict=True):
+            channel.add(phase, *response)
     return filled, sums
 
 
@@ -587,7 +619,14 @@ def _response(
     wavelength_um: float,
     within_um: tuple[float, float] = (-math.inf, math.inf),
 ) -> tuple[Array, Array]:
-    """Phase in rad and |t| of pillars; sizes that float32 moved out are clipped."""
+    """Phase in rad and |t| of pillars of given sizes by the proxy.
+
+    Args:
+        proxy: phase and |t| over the diameter.
+        size_um: (n,) sizes, um.
+        wavelength_um: vacuum wavelength, um.
+        within_um: range to which the sizes are clipped (float32 rounding may leave it).
+    """
     size_um = np.asarray(size_um, float).clip(*within_um)
     phase = proxy.phase_rad(size_um, wavelength_um)
     return phase, proxy.transmission(size_um, wavelength_um)
@@ -604,6 +643,18 @@ def _make_lens(
     hand: Hand = "",
     pairs: TwoSizeTable | None = None,
 ) -> Lens:
+    """The lens of these pillars with the distances and films of its focus.
+
+    Args:
+        diameters: map of the pillars.
+        cell: unit cell of the pillars.
+        proxy: phase and |t| over the diameter.
+        focus: wavelength, distances and films of the design.
+        profile: name in the lens file.
+        provenance: of the lens file.
+        hand: of the incident circular light; empty for other light.
+        pairs: table of pillars of two sizes; None for one size.
+    """
     return Lens(
         diameters=diameters,
         cell=cell,
@@ -622,11 +673,11 @@ def _make_lens(
 def _coverage(
     proxy: Proxy, wavelength_um: float, span_um: tuple[float, float]
 ) -> float:
-    """Phase coverage over 2 pi."""
+    """Phase coverage over 2 pi of the diameters in a range, at a wavelength."""
     return proxy.coverage_rad(wavelength_um, within_um=span_um) / (2 * math.pi)
 
 
-def _printed(cell: Cell, limits: Limits) -> tuple[float, float]:
+def _printable_sizes_um(cell: Cell, limits: Limits) -> tuple[float, float]:
     """(least, largest) size in um that a process prints."""
     gap_um = limits.min_gap_nm * 1e-3
     return cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
@@ -635,7 +686,14 @@ def _printed(cell: Cell, limits: Limits) -> tuple[float, float]:
 def _table_sizes(
     proxy: Proxy, span_um: tuple[float, float], waves_um: Sequence[float]
 ) -> Array:
-    """Evenly spaced diameters, their steps at most ``_STEP_RAD`` at any wavelength."""
+    """Evenly spaced diameters in um, the phase step at most 0.05 rad at all
+    wavelengths.
+
+    Args:
+        proxy: phase over the diameter.
+        span_um: least and largest diameter.
+        waves_um: vacuum wavelengths.
+    """
     probe = np.linspace(*span_um, 513)
     slopes = [np.abs(proxy.dphase_ddiameter(probe, wave)).max() for wave in waves_um]
     count = math.ceil(float(max(slopes)) * (span_um[1] - span_um[0]) / _STEP_RAD) + 1
@@ -643,47 +701,74 @@ def _table_sizes(
 
 
 def _is_printable(library: AxesLibrary, limits: Limits) -> Array:
-    """(m, n) whether the process prints a pillar, and the gap to equal neighbours."""
+    """(m, n) whether the process prints a pillar of sizes x, y next to an equal one.
+
+    For upright pillars on a rectangular lattice the gap is the period less the size.
+    Otherwise gaps are computed on a coarse grid of sizes; a pair takes the gap of the
+    next larger grid point.
+
+    Args:
+        library: m sizes along x, n along y, and the cell.
+        limits: least diameter and gap of the process.
+    """
     x, y, cell = library.x_um, library.y_um, library.cell
     wide = np.minimum(x[:, None], y) >= limits.min_diameter_nm * 1e-3 - 1e-9
-    least = limits.min_gap_nm * 1e-3
+    least_gap = limits.min_gap_nm * 1e-3
     quarters = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
     if cell.lattice.kind != "hexagonal" and quarters % 1 == 0:
         px, py = cell.lattice.periods_um(cell.pitch_um)[:: -1 if quarters % 2 else 1]
         gap = np.minimum(px - x[:, None], py - y)
-        return np.asarray(wide & (gap >= least - 1e-9))
-    ends = [np.linspace(v[0], v[-1], _GAPS) for v in (x, y)]
-    gaps = [
-        [cell_of_sizes(cell, a, b).gap_um(a) for b in ends[1]] for a in ends[0]
-    ]  # a pair takes the gap of the next larger one
+        return np.asarray(wide & (gap >= least_gap - 1e-9))
+    grid = [np.linspace(v[0], v[-1], _GAPS) for v in (x, y)]
+    gaps = [[cell_of_sizes(cell, a, b).gap_um(a) for b in grid[1]] for a in grid[0]]
     row, column = (
-        np.minimum(np.searchsorted(e, v), _GAPS - 1)
-        for e, v in zip(ends, (x, y), strict=True)
+        np.minimum(np.searchsorted(nodes, v), _GAPS - 1)
+        for nodes, v in zip(grid, (x, y), strict=True)
     )
-    return np.asarray(wide & (np.array(gaps)[row[:, None], column] >= least))
+    return np.asarray(wide & (np.array(gaps)[row[:, None], column] >= least_gap))
 
 
 def _covered_share(t: Array, *, isotropic: bool) -> float:
-    """Share of the phases, or of pairs of them, that a pillar of (2, n) t gives."""
+    """Share of a grid of target phases that some candidate realises.
+
+    A target is covered at a phase error of 0.2 rad or less and |t| of 0.7 or more.
+
+    Args:
+        t: (2, n) complex transmission of the candidates for light along x and y.
+        isotropic: targets are single phases in place of pairs of phases.
+    """
     steps = 72 if isotropic else 36
-    turn = 2 * np.pi * np.arange(steps) / steps
-    x, y = (turn, turn) if isotropic else (v.ravel() for v in np.meshgrid(turn, turn))
-    wanted = np.stack([x, y])
-    chosen = t[:, make_candidates(t, np.ones(2)).nearest(wanted)]
-    error = np.abs(np.angle(chosen * np.exp(-1j * wanted))).max(axis=0)
+    phases = 2 * np.pi * np.arange(steps) / steps
+    x, y = (
+        (phases, phases)
+        if isotropic
+        else (v.ravel() for v in np.meshgrid(phases, phases))
+    )
+    targets = np.stack([x, y])
+    chosen = t[:, make_candidates(t, np.ones(2)).nearest(targets)]
+    error = np.abs(np.angle(chosen * np.exp(-1j * targets))).max(axis=0)
     bright = np.abs(chosen).min(axis=0) >= _COVERED_LEVEL
     return float((bright & (error <= _COVERED_RAD)).mean())
 
 
 def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:
-    """Refuse a pillar that the process does not print at every rotation."""
+    """Refuse a pillar that the process does not print at every rotation.
+
+    Args:
+        cell: unit cell of the pillars.
+        rotated: the solved rotated pillar, with its size.
+        limits: of the process.
+
+    Raises:
+        LensError: a gap between rotated neighbours or a width below the limits.
+    """
     outline = cell.outline(rotated.size_um)
-    named = f"a {cell.shape.name} of "
+    name = f"a {cell.shape.name} of "
     steps = cell.lattice.steps_um(cell.pitch_um)
     gap = min(np.hypot(*step) for step in steps) - 2 * outline.radius_um
     if gap < limits.min_gap_nm * 1e-3 - 1e-9:
         raise LensError(
-            f"{named}{rotated.size_um:.4g} um leaves {1e3 * gap:.4g} nm to a neighbour "
+            f"{name}{rotated.size_um:.4g} um leaves {1e3 * gap:.4g} nm to a neighbour "
             "when both are turned towards each other, the process prints "
             f"{limits.min_gap_nm:g} nm: take a larger pitch, or lower diameters_um of "
             "the library"
@@ -691,7 +776,7 @@ def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:
     narrowest_um = outline.spans_um[0]
     if narrowest_um < limits.min_diameter_nm * 1e-3 - 1e-9:
         raise LensError(
-            f"{named}{rotated.size_um:.4g} um is {1e3 * narrowest_um:.4g} nm wide, the "
+            f"{name}{rotated.size_um:.4g} um is {1e3 * narrowest_um:.4g} nm wide, the "
             f"process prints {limits.min_diameter_nm:g} nm: take a ratio nearer to 1, "
             "or a longer pillar"
         )

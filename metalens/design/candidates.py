@@ -8,20 +8,24 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
 
-_STARTS, _ROUNDS = 16, 40  # of the pistons: starts, and rounds of each at most
+_STARTS = 16  # initial pistons of the alternating minimisation
+_ROUNDS = 40  # most iterations from each
 _CONVERGED_RAD = 1e-3  # pistons that move less have converged
 _ROWS = 256  # sites whose sums (1) stay in a processor's cache
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CandidateTable:
-    """Pillars to choose from.
+    """Candidate pillars for several channels, and the sums that rank them.
+
+    Weighted squared error (1) of candidate j at a site with target phases phi_c:
+    sum_c w_c |t_cj - exp(i phi_c)|².
 
     t: (channels, n) complex transmission of each candidate.
     weights: (channels,) w of (1), above 0.
     common_piston: whether all channels share one piston.
-    factors: (2 channels, n) float32 by which cosines and sines of the wanted phases
-    enter (1). power: (n,) the part of (1) that no phase changes.
+    factors: (2 channels, n) float32 coefficients of cos phi and sin phi in (1).
+    power: (n,) sum_c w_c |t_cj|², the part of (1) that no phase changes.
     """
 
     t: Array
@@ -43,18 +47,27 @@ class CandidateTable:
         return np.asarray(self.power + phasors.astype(np.float32).T @ self.factors)
 
     def nearest(self, phases_rad: Array) -> Array:
-        """(sites,) candidates of the least sums (1)."""
+        """(sites,) indices of the candidates of the least sums (1)."""
         return self._over_sites(phases_rad, lambda sums: sums.argmin(1)).astype(int)
 
     def between(self, phases_rad: Array) -> Array:
-        """(sites,) places of the least sums in a table of one size, in steps of it.
+        """(sites,) fractional indices of the least sums in a table over one size.
 
         Vertices of the parabolas through the least sums and their two neighbours; the
         ends of the table as they are.
+
+        Args:
+            phases_rad: (channels, sites) target phases, pistons included.
         """
         return self._over_sites(phases_rad, _vertices)
 
     def _over_sites(self, phases_rad: Array, choose: Callable[[Array], Array]) -> Array:
+        """(sites,) results of ``choose``, in threads by blocks of sites.
+
+        Args:
+            phases_rad: (channels, sites) target phases, pistons included.
+            choose: (sites, n) sums (1) of a block to its (sites,) results.
+        """
         out = np.empty(phases_rad.shape[1])
 
         def work(start: int, stop: int) -> None:
@@ -72,20 +85,28 @@ class CandidateTable:
             phases_rad: (channels, sites) wanted phases of a sample of sites.
         """
         count = 1 if self.common_piston else len(self.t)
-        found = [self._converged(phases_rad, start) for start in _starts(count)]
-        return min(found, key=lambda one: one[0])[1]
+        results = [self._converged(phases_rad, start) for start in _starts(count)]
+        return min(results, key=lambda result: result[0])[1]
 
     def _converged(self, phases: Array, start: Array) -> tuple[float, Array]:
-        """The sum over the sites and its pistons, by pillars and pistons in turn."""
+        """Least sum over the sites and its pistons, by alternating minimisation.
+
+        In turn: the best candidate of every site for the pistons, then the best pistons
+        arg(sum_sites w t exp(-i phi)) for these candidates.
+
+        Args:
+            phases: (channels, sites) target phases, rad.
+            start: (channels,) or (1,) initial pistons, rad.
+        """
         pistons = np.broadcast_to(start, len(self.t))
         for _ in range(_ROUNDS):
             pick = self.sums(phases + pistons[:, None]).argmin(1)
             peaks = self.weights * (self.t[:, pick] * np.exp(-1j * phases)).sum(1)
             peaks = peaks.sum(keepdims=True) if self.common_piston else peaks
-            before = pistons
+            previous = pistons
             pistons = np.broadcast_to(np.angle(peaks), len(self.t))
-            moved = np.angle(np.exp(1j * (pistons - before)))
-            if np.abs(moved).max() < _CONVERGED_RAD:
+            change = np.angle(np.exp(1j * (pistons - previous)))
+            if np.abs(change).max() < _CONVERGED_RAD:
                 break
         least = self.sums(phases + pistons[:, None]).min(1)
         return float(least.sum(dtype=float)), pistons
@@ -119,9 +140,12 @@ def _vertices(sums: Array) -> Array:
 
 
 def _starts(count: int) -> Array:
-    """(starts, count) pistons spread evenly over all turns.
+    """(16, count) pistons spread evenly over all turns, rad.
 
     Additive recurrence of the roots of x^(n+1) = x + 1 (M. Roberts, 2018).
+
+    Args:
+        count: pistons of one start.
     """
     root = 2.0
     for _ in range(50):

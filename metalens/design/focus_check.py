@@ -17,25 +17,25 @@ from metalens.lens import Lens
 from metalens.propagate import PropagationCase, field_at, rayleigh_sommerfeld_kernel
 from metalens.psf import FocusMetrics
 
-_ARM = np.linspace(
-    -1.2, 1.2, 9
-)  # arms of the cross of points, in units of wavelength / (2 NA)
-_SHIFTS = np.array(
-    [-0.5, -0.25, 0.0, 0.25, 0.5]
-)  # sensor distances tried, in units of wavelength / NA²
+# arms of the cross of points, in units of wavelength / (2 NA)
+_ARM = np.linspace(-1.2, 1.2, 9)
+# shifts of the sensor, in units of wavelength / NA²
+_SHIFTS = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
+_AXIS = np.zeros((1, 2))  # the point x = y = 0
 
 
 @dataclass(frozen=True, slots=True)
 class FocusCheck:
-    """Where the light of the design source meets.
+    """Where the light of the design source meets, and how bright it is.
 
-    x_um, y_um: of the brightest point of the sensor plane (0, 0 is meant).
-    z_um: distance of the brightest point of the axis from the sensor plane (0 is
-    meant); nan where not asked for.
-    strehl: peak intensity against all pillars' magnitudes in step.
-    resolution_um: wavelength / (2 NA); depth_um: wavelength / NA².
+    x_um, y_um: of the brightest point of the sensor plane; the target is (0, 0).
+    z_um: distance of the brightest point of the axis from the sensor plane; nan where
+        it was not computed.
+    strehl: peak intensity over that of all pillars in phase.
+    resolution_um: wavelength / (2 NA).
+    depth_um: wavelength / NA².
     expected: Strehl ratio that the pillars' phase errors leave, where they are a
-    compromise.
+        compromise.
     """
 
     x_um: float
@@ -61,20 +61,21 @@ class FocusCheck:
 
 
 def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> FocusCheck:
-    """Sum the light of every pillar on a cross of points around the axis, and along it.
+    """Place and Strehl ratio of the focus by the direct Rayleigh-Sommerfeld sum.
+
+    All pillars are summed on a cross of 9 + 9 points around the axis of the sensor, and
+    at 5 points along the axis.
 
     Args:
-        axial: also look before and behind the sensor plane; five more sums over the
-            lens. Lenses of fewer than
-            five Fresnel zones (R² / (wavelength x distance)) have their brightest point
-            far before the focus and
-            are not judged by it.
+        lens: the lens.
+        axial: also sum at points along the axis, five more sums over the lens. Lenses
+            of fewer than five Fresnel zones (R² / (wavelength × distance)) are left
+            out: their brightest point lies before the focus.
         expected: Strehl ratio that the phase errors of the pillars leave.
 
     Accuracy:
         the sum is exact to rounding; the peak is the vertex of a parabola through the
-        three brightest points
-        of a line, within 2 % of the resolution.
+        three brightest points of a line, within 2 % of the resolution.
     """
     d = lens.diameters
     focus = Focus(
@@ -96,8 +97,8 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
     level = lens.transmission() * _illumination(lens)
     case = _case(lens, resolution, 0.0)
     axial = axial and after.thickness_um[0] > depth / 2
-    arm, rest = _ARM * resolution, np.zeros_like(_ARM)
-    cross = np.concatenate([np.stack([arm, rest], 1), np.stack([rest, arm], 1)])
+    arm, zero = _ARM * resolution, np.zeros_like(_ARM)
+    cross = np.concatenate([np.stack([arm, zero], 1), np.stack([zero, arm], 1)])
     power = np.abs(field_at(phase, level, case, cross)[0]) ** 2
     along_x, along_y = power[: len(arm)], power[len(arm) :]
     return FocusCheck(
@@ -106,7 +107,7 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
         z_um=_axial_peak(lens, (phase, level), resolution, depth)
         if axial and zones >= 5
         else math.nan,
-        strehl=float(max(along_x.max(), along_y.max())) / _in_step(level, case) ** 2,
+        strehl=float(max(along_x.max(), along_y.max())) / _ideal_peak(level, case) ** 2,
         resolution_um=resolution,
         depth_um=depth,
         expected=expected,
@@ -117,10 +118,9 @@ def focus_figures(lens: Lens) -> FocusMetrics:
     """FWHM, Strehl ratio, MTF50 and focusing efficiency of the PSF of the design
     source.
 
-    The PSF is that of :func:`metalens.psf.from_lens` about the place where the rays
-    meet: films, stop, losses of the pillars and solved neighbours are in it. Spots
-    wider
-    than the window of 8 wavelength / NA get one of four times the width.
+    The PSF (:func:`metalens.psf.from_lens`) is centred where the rays meet. It includes
+    films, stop, losses of the pillars and solved neighbours. The window is 8 wavelength
+    / NA; four times that for a spot without a finite FWHM in it.
 
     Args:
         lens: the lens.
@@ -154,7 +154,13 @@ def _illumination(lens: Lens) -> Any:
 
 
 def _case(lens: Lens, step_um: float, shift_um: float) -> PropagationCase:
-    """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
+    """Propagation case of one sample on the axis.
+
+    Args:
+        lens: the lens.
+        step_um: width of the sample.
+        shift_um: of the sensor away from the lens, in the cover.
+    """
     return propagate.make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
@@ -170,6 +176,15 @@ def _case(lens: Lens, step_um: float, shift_um: float) -> PropagationCase:
 def _axial_peak(
     lens: Lens, maps: tuple[Array, Array], step_um: float, depth_um: float
 ) -> float:
+    """Distance in um of the brightest of 5 points of the axis from the sensor, by a
+    parabola.
+
+    Args:
+        lens: the lens.
+        maps: (y, x) phase in rad and magnitude of the pillars.
+        step_um: resolution, for the sampling of the case.
+        depth_um: depth of focus.
+    """
     shifts = _SHIFTS * depth_um
     fields = [
         field_at(*maps, _case(lens, step_um, float(s)), _AXIS)[0, 0] for s in shifts
@@ -177,12 +192,13 @@ def _axial_peak(
     return _vertex(shifts, np.abs(np.array(fields)) ** 2)
 
 
-_AXIS = np.zeros((1, 2))
+def _ideal_peak(level: Array, case: PropagationCase) -> float:
+    """Magnitude at the focus of all pillars in phase: sum p² T d / (2 pi r²) |1/r -
+    ik|.
 
-
-def _in_step(level: Array, case: PropagationCase) -> float:
-    """Magnitude at the focus if all pillars were in step: sum of p² T d / (2 pi r²)
-    |1/r - ik|.
+    Args:
+        level: (y, x) |T| times the illumination.
+        case: of one point on the axis.
     """
     y, x = case.pillars_um
     total = sum(
@@ -195,16 +211,19 @@ def _in_step(level: Array, case: PropagationCase) -> float:
 
 
 def _vertex(position: Array, value: Array) -> float:
-    """Top of the parabola through the largest value and its neighbours; the end itself
-    if it is the largest.
+    """Position of the vertex of the parabola through the largest value and its
+    neighbours.
+
+    The end itself where it is the largest.
+
+    Args:
+        position: (n,) even positions.
+        value: (n,) values there.
     """
     i = int(value.argmax())
     if i in (0, len(value) - 1):
         return float(position[i])
     before, here, after = value[i - 1 : i + 2]
-    return float(
-        position[i]
-        + (position[1] - position[0])
-        * (before - after)
-        / (2 * (before - 2 * here + after))
-    )
+    step = position[1] - position[0]
+    curvature = before - 2 * here + after
+    return float(position[i] + step * (before - after) / (2 * curvature))

@@ -14,10 +14,11 @@ from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, LensError
 
 _LARGEST = 1 << 31  # bytes that the arrays of one file may take
-_MATRIX, _COMPRESSED, _COMPLEX = 14, 15, 0x800
+_COMPRESSED = 15  # type of a compressed element of level 5
+_COMPLEX = 0x800  # flag of a complex matrix of level 5
 _STORED = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
 _CLASSES = dict(zip(range(6, 16), "dfbBhHiIqQ", strict=True))
-_LEVEL_4 = "dfihHB"  # by the third digit of a matrix's type
+_LEVEL_4 = "dfihHB"  # types by the tens digit of a matrix's type number
 _REFUSED = (*DAMAGE, EOFError, IndexError, zlib.error, zipfile.BadZipFile)
 
 
@@ -71,29 +72,49 @@ def _check_size(size: int) -> None:
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and bytes of the data elements of level 5, one after the other: a tag of
-    8 bytes (type, size), the data, and zeros up to a multiple of 8 bytes.
+    """Type and bytes of the data elements of a MATLAB file of level 5 in turn.
+
+    An element is a tag of 8 bytes (type, size), the data, and zeros up to a multiple of
+    8 bytes. Small ones have a tag of 4 bytes and 4 bytes of data.
+
+    Args:
+        content: bytes of the elements.
+        order: byte order, "<" or ">".
+
+    Raises:
+        ValueError: an element longer than the bytes that are left.
     """
-    place = 0
-    while place < len(content):
-        kind, size = np.frombuffer(content[place : place + 8], f"{order}u4").tolist()
-        start = place + 8
-        room = len(content) - start
-        place = start + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+    position = 0
+    while position < len(content):
+        kind, size = np.frombuffer(
+            content[position : position + 8], f"{order}u4"
+        ).tolist()
+        start = position + 8
+        available = len(content) - start
+        position = start + (size if kind == _COMPRESSED else -(-size // 8) * 8)
         if kind >> 16:  # a tag of 4 bytes (size, type), the data in the other 4
-            kind, size = kind & 0xFFFF, kind >> 16
-            place, start, room = start, start - 4, 4
-        if size > room:
+            size = kind >> 16
+            kind = kind & 0xFFFF
+            position = start
+            start = start - 4
+            available = 4
+        if size > available:
             raise ValueError("cut short")
         yield kind, content[start : start + size]
 
 
 def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
+    """Name and array of every numeric matrix of a MATLAB file of level 5.
+
+    Args:
+        content: of the file after its head of 128 bytes.
+        order: byte order, "<" or ">".
+    """
     for kind, data in _elements(content, order):
         if kind == _COMPRESSED:
             stream = zlib.decompressobj()
-            head = stream.decompress(data, 8)
-            size = int(np.frombuffer(head, f"{order}u4")[1])
+            tag = stream.decompress(data, 8)
+            size = int(np.frombuffer(tag, f"{order}u4")[1])
             _check_size(size)
             data = stream.decompress(stream.unconsumed_tail, size + 1)
             if not stream.eof or len(data) != size:
@@ -107,11 +128,12 @@ def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
             np.frombuffer(data, order + _STORED[kind]).astype(_CLASSES[flags & 0xFF])
             for kind, data in parts[3:]
         ]
-        whole = values[0] + 1j * values[1] if flags & _COMPLEX else values[0]
-        yield parts[2][1].decode("latin-1"), whole.reshape(shape, order="F")
+        matrix = values[0] + 1j * values[1] if flags & _COMPLEX else values[0]
+        yield parts[2][1].decode("latin-1"), matrix.reshape(shape, order="F")
 
 
 def _level_4(content: bytes) -> Iterator[tuple[str, Array]]:
+    """Name and array of every full numeric matrix of a MATLAB file of level 4."""
     order = "<" if int.from_bytes(content[:4], "little") < 5000 else ">"
     file = io.BytesIO(content)
     while head := file.read(20):
@@ -119,17 +141,18 @@ def _level_4(content: bytes) -> Iterator[tuple[str, Array]]:
             head, f"{order}i4"
         ).tolist()
         name = file.read(length).rstrip(b"\0").decode("latin-1")
-        number = np.dtype(order + _LEVEL_4[kind // 10 % 10])
+        dtype = np.dtype(order + _LEVEL_4[kind // 10 % 10])
         parts = [
-            np.frombuffer(file.read(rows * columns * number.itemsize), number)
+            np.frombuffer(file.read(rows * columns * dtype.itemsize), dtype)
             for _ in range(1 + bool(imaginary))
         ]
         if kind % 10 == 0:  # neither text nor sparse
-            whole = parts[0] + 1j * parts[1] if imaginary else parts[0]
-            yield name, whole.reshape(rows, columns, order="F")
+            matrix = parts[0] + 1j * parts[1] if imaginary else parts[0]
+            yield name, matrix.reshape(rows, columns, order="F")
 
 
 def _level_7(path: Path, file: h5py.File) -> dict[str, Array]:
+    """Arrays of a MATLAB file of level 7.3 (HDF5) by name, axes in MATLAB's order."""
     arrays = {}
     for name in file:
         if isinstance(file.get(name, getlink=True), h5py.HardLink):

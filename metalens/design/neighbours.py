@@ -12,10 +12,8 @@ from metalens.core.arrays import Array
 from metalens.lens import Lens, NeighbourRows
 from metalens.rcwa import block_of, solve_row
 
-LONG = 6  # pillars: of shorter rows several are solved
-# sine in the cover of the light of a row; that of steeper ones runs along the lens, or
-# nowhere
-STEEPEST = 0.95
+LONG = 6  # pillars; of shorter rows several with shifted phases are solved
+STEEPEST = 0.95  # largest sine in the cover of a row's deflected light
 
 
 def estimate_neighbour_coupling(
@@ -25,17 +23,18 @@ def estimate_neighbour_coupling(
     harmonics: int = 3,
     diagonal: bool = True,
 ) -> NeighbourRows:
-    """Coupling of non-identical neighbours in this lens: supercell RCWA of blazed rows
-    of its own pillars, both polarisations.
+    """Coupling factor of non-identical neighbours in this lens, over the deflection
+    sine.
 
-    A row of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N
-    pitch), as the lens does where
-    its phase has that slope. Of short rows several are solved, whose phases begin
-    elsewhere, and their mean is taken.
+    Supercell RCWA of blazed rows of the lens's own pillars, both polarisations. A row
+    of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N
+    pitch), as the lens does where its phase has that slope. Of short rows several with
+    shifted phases are solved and averaged.
 
     Args:
-        counts: pillars of the rows along the lattice. harmonics: of :func:`solve_row`;
-            one less for ``coarse``.
+        lens: the lens.
+        counts: pillars of the rows along the lattice.
+        harmonics: of :func:`solve_row`; ``coarse`` has one less.
         diagonal: also solve rows along the diagonal, of the even numbers next to √2 of
             those.
 
@@ -44,14 +43,10 @@ def estimate_neighbour_coupling(
             lattice.
     """
     cover = materials.index(lens.cell.cover, lens.wavelength_um).real
-    diagonal_counts = (
-        sorted({2 * max(1, round(count / math.sqrt(2))) for count in counts})
-        if diagonal
-        else []
-    )
-    rows = [(count, False) for count in counts] + [
-        (count, True) for count in diagonal_counts
-    ]
+    rows = [(count, False) for count in counts]
+    if diagonal:
+        even = {2 * max(1, round(count / math.sqrt(2))) for count in counts}
+        rows += [(count, True) for count in sorted(even)]
     sines = [
         lens.wavelength_um / (n * block_of(lens.cell.pitch_um, turned).spacing_um)
         for n, turned in rows
@@ -61,17 +56,17 @@ def estimate_neighbour_coupling(
         for row, sine in zip(rows, sines, strict=True)
         if sine < STEEPEST * cover
     ]
-    found = [
-        [_mean(lens, *row, reach) for row, _ in propagating]
-        for reach in (harmonics, harmonics - 1)
+    solutions = [
+        [_mean(lens, *row, truncation) for row, _ in propagating]
+        for truncation in (harmonics, harmonics - 1)
     ]
-    fine, coarse = ([factor for factor, _ in one] for one in found)
+    fine, coarse = ([factor for factor, _ in solution] for solution in solutions)
     return NeighbourRows(
         np.array([sine for _, sine in propagating]),
         np.array([turned for (_, turned), _ in propagating], bool),
         np.array(fine).reshape(-1, 2).T,
         np.array(coarse).reshape(-1, 2).T,
-        np.array([lost for _, lost in found[0]]),
+        np.array([lost for _, lost in solutions[0]]),
         lens.wavelength_um,
         cover,
     )
@@ -80,35 +75,49 @@ def estimate_neighbour_coupling(
 def _mean(
     lens: Lens, count: int, diagonal: bool, harmonics: int
 ) -> tuple[Array, float]:
-    """(2,) factor and the power that went elsewhere, mean over rows of ``count`` whose
-    phases begin elsewhere.
+    """Mean factor (2,) and power lost to other orders, over rows with shifted phases.
+
+    Args:
+        lens: the lens.
+        count: pillars of the row.
+        diagonal: along the diagonal of the lattice.
+        harmonics: truncation of the solver.
     """
-    begins = max(1, round(LONG / count))
-    found = []
-    for begin in range(begins):
-        wanted = 2 * np.pi * (np.arange(count) + 0.25 + begin / begins) / count
+    shifts = max(1, round(LONG / count))
+    rows = []
+    for shift in range(shifts):
+        phases = 2 * np.pi * (np.arange(count) + 0.25 + shift / shifts) / count
         diameters = lens.proxy.diameter_um(
-            wanted,
+            phases,
             lens.wavelength_um,
             within_um=drawn_diameter_range(lens),
             gap="nearest",
         )
-        found.append(_blazed(lens, np.asarray(diameters), harmonics, diagonal))
-    return np.mean([ratio for ratio, _ in found], axis=0), float(
-        np.mean([lost for _, lost in found])
+        rows.append(_blazed(lens, np.asarray(diameters), harmonics, diagonal))
+    return np.mean([ratio for ratio, _ in rows], axis=0), float(
+        np.mean([lost for _, lost in rows])
     )
 
 
 def _blazed(
     lens: Lens, diameters_um: Array, harmonics: int, diagonal: bool
 ) -> tuple[Array, float]:
-    """Amplitude in the wanted order against pillars one by one, of light along and
-    across the row, and power that went
-    elsewhere, the mean of both."""
+    """Amplitude of the deflected order over that of pillars solved one by one.
+
+    Args:
+        lens: the lens.
+        diameters_um: (n,) pillars of the row.
+        harmonics: truncation of the solver.
+        diagonal: along the diagonal of the lattice.
+
+    Returns:
+        (2,) complex ratios for light along and across the row, and the power lost to
+        other orders beyond that of the pillars one by one, the mean of both.
+    """
     count = len(diameters_um)
     block = block_of(lens.cell.pitch_um, diagonal)
     place = np.arange(count) - (count - 1) / 2
-    about: dict[str, Any] = {"harmonics": harmonics, "diagonal": diagonal}
+    options: dict[str, Any] = {"harmonics": harmonics, "diagonal": diagonal}
     ratios, lost = [], []
     for polarization in ("x", "y"):
         whole = solve_row(
@@ -116,7 +125,7 @@ def _blazed(
             diameters_um,
             lens.wavelength_um,
             polarization=polarization,
-            **about,
+            **options,
         )
         alone = np.array(
             [
@@ -125,20 +134,20 @@ def _blazed(
                     [d] * block.pillars,
                     lens.wavelength_um,
                     polarization=polarization,
-                    **about,
+                    **options,
                 ).order(0)
                 for d in diameters_um
             ]
         )
-        want = (alone * np.exp(-2j * np.pi * place / count)).mean()
-        got = whole.order(1)
-        ratios.append(got / want)
+        expected = (alone * np.exp(-2j * np.pi * place / count)).mean()
+        deflected = whole.order(1)
+        ratios.append(deflected / expected)
         travels = np.abs(whole.orders) * lens.wavelength_um < count * block.spacing_um
         total = float((np.abs(whole.t[travels]) ** 2).sum())
         lost.append(
             1
-            - abs(got) ** 2 / total
-            - (1 - abs(want) ** 2 / float((np.abs(alone) ** 2).mean()))
+            - abs(deflected) ** 2 / total
+            - (1 - abs(expected) ** 2 / float((np.abs(alone) ** 2).mean()))
         )
     return np.array(ratios), float(np.mean(lost))
 

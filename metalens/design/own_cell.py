@@ -17,12 +17,11 @@ from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.psf import NEIGHBOURS, LeftOut
 
 RINGS = 48  # of a lens, over which light is summed
-FEWEST, MOST = (
-    2,
-    12,
-)  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
-# (with two, light to both sides is separated by rows whose phases begin elsewhere)
-DIAMETERS = 5
+# pillars in a row; zones of fewer or more pillars take the row of that length (with
+# two, rows of shifted phases separate the light to both sides)
+FEWEST = 2
+MOST = 12
+DIAMETERS = 5  # at which t is compared over the angle
 TOLERANCE = 1e-2  # of t
 
 
@@ -43,7 +42,7 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
         raise CellError(
             "own_cell: rows of pillars of two sizes are not solved here; leave own_cell out"
         )
-    found = lens.neighbours or estimate_neighbour_coupling(
+    rows = lens.neighbours or estimate_neighbour_coupling(
         lens, counts=_counts(lens, aperture)
     )
     angle = (
@@ -51,7 +50,7 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
         if incidence_rad
         else 0.0
     )
-    return LeftOut(found, angle, "the lens's own cell")
+    return LeftOut(rows, angle, "the lens's own cell")
 
 
 def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
@@ -95,27 +94,32 @@ def solve_coupling_rows(lens: Lens, *, radius_um: float) -> NeighbourRows:
 
 
 def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplingLoss:
-    """Rows of the lens's own pillars (those that it holds, else solved here), summed
-    over its aperture.
+    """Focus power with coupling over that without, from solved rows of the lens's
+    pillars.
 
-    Accuracy: the error is what another truncation, and leaving out any one row, change,
-    and a fifth of the loss for
-        zones that get shorter from one to the next, which no row has.
+    share = |sum_r w_r c(s_r)|² over rings r of the aperture, of area w and deflection
+    sine s, with the coupling factor c of the rows.
+
+    Accuracy: the change by another truncation, plus that by leaving out any one row,
+    plus
+        a fifth of the loss for zones that shorten from one to the next, as in no row.
 
     Args:
+        lens: the lens; rows that it holds are not solved again.
         radius_um: radius of the aperture, um.
 
     Raises:
         CellError: as :func:`solve_coupling_rows`.
     """
-    found = lens.neighbours or solve_coupling_rows(lens, radius_um=radius_um)
+    rows = lens.neighbours or solve_coupling_rows(lens, radius_um=radius_um)
     sine, weight = _rings(lens, radius_um)
-    share = found.share(sine, weight)
-    less = [other.share(sine, weight) for other in found.others]
-    error = abs(found.coarser.share(sine, weight) - share) + max(
-        (abs(one - share) for one in less), default=0.0
+    share = rows.share(sine, weight)
+    reduced = [other.share(sine, weight) for other in rows.others]
+    truncation = abs(rows.coarser.share(sine, weight) - share)
+    error = truncation + max(
+        (abs(other_share - share) for other_share in reduced), default=0.0
     )
-    pitches = lens.wavelength_um / (found.sine[~found.diagonal] * lens.cell.pitch_um)
+    pitches = lens.wavelength_um / (rows.sine[~rows.diagonal] * lens.cell.pitch_um)
     return NeighbourCouplingLoss(
         share,
         error + CURVED * abs(1 - share),
@@ -126,10 +130,11 @@ def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplin
 def estimate_neighbour_coupling_loss(
     lens: Lens, *, radius_um: float
 ) -> NeighbourCouplingLoss:
-    """The same with the factor of another cell
-    (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
+    """Rough :func:`neighbour_coupling_loss` with the coupling factor of another cell.
 
-    Where that cell gains a little, these pillars may lose as much.
+    share = |sum_r w_r (1 + a s_r + b s_r²)|², a and b of
+    :data:`metalens.psf.budget.NEIGHBOURS`. Only its size is meaningful: where that cell
+    gains a little, these pillars may lose as much.
 
     Args:
         lens: the lens.
@@ -142,28 +147,38 @@ def estimate_neighbour_coupling_loss(
 
 
 def power_error(lens: Lens) -> float:
-    """Relative error of the power behind the pillars: that of |T|² by their curve, and
-    what neighbours take beyond the solved rows (rough where none is solved).
+    """Relative error of the power behind the pillars.
+
+    Root sum square of twice the error of |t| by the proxy, and the error of the
+    neighbour coupling (rough where no rows are solved).
 
     Args:
         lens: the lens.
     """
-    pillars = (
+    t_error = (
         lens.proxy.error(lens.wavelength_um)
         if lens.pairs is None
         else lens.pairs.entry_error
     )
     radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
-    known = (
+    coupling_loss = (
         estimate_neighbour_coupling_loss
         if lens.neighbours is None
         else neighbour_coupling_loss
     )
-    return math.hypot(2 * pillars, known(lens, radius_um=radius_um).error)
+    return math.hypot(2 * t_error, coupling_loss(lens, radius_um=radius_um).error)
 
 
 def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
-    """(m,) sines by which rings of a lens turn light, and their shares of the area."""
+    """(m,) sines by which rings of a lens turn light, and their shares of the area.
+
+    Gauss-Legendre nodes in the squared radius; sine = NA towards the sensor plus
+    r / hypot(r, source distance).
+
+    Args:
+        lens: the lens.
+        radius_um: radius of the aperture, um.
+    """
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
     focus = Focus(
@@ -182,10 +197,11 @@ def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
 
 
 def angle_change(lens: Lens, incidence_rad: float) -> float:
-    """Root mean square relative change of t at an angle over diameters and both
+    """Root mean square relative change of t at an angle, over diameters and
     polarisations.
 
-    A factor that all pillars share is taken out: it changes no PSF of sum 1.
+    |t(angle) - c t(0)|² / |t(angle)|² with the best common factor c: a factor that all
+    pillars share changes no PSF of sum 1.
 
     Args:
         lens: the lens.
@@ -197,19 +213,26 @@ def angle_change(lens: Lens, incidence_rad: float) -> float:
     both: tuple[Literal["s", "p"], ...] = ("s", "p")
     for polarization in both:
         flat, tilted = (
-            _answers(lens, diameters, angle, polarization)
+            _transmissions(lens, diameters, angle, polarization)
             for angle in (0.0, incidence_rad)
         )
         common = np.vdot(flat, tilted) / np.vdot(flat, flat)
-        changes.append(
-            np.linalg.norm(tilted - common * flat) ** 2 / np.linalg.norm(tilted) ** 2
-        )
+        residual = np.linalg.norm(tilted - common * flat) ** 2
+        changes.append(residual / np.linalg.norm(tilted) ** 2)
     return float(np.sqrt(np.mean(changes)))
 
 
-def _answers(
+def _transmissions(
     lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]
 ) -> Array:
+    """(n,) complex t of pillars of the lens's cell by RCWA.
+
+    Args:
+        lens: the lens.
+        diameters_um: (n,) diameters.
+        angle_rad: angle of incidence in air.
+        polarization: s or p.
+    """
     return np.array(
         [
             rcwa.solve(

@@ -16,14 +16,12 @@ from metalens.design.foreign_arrays import read_matlab, read_npz
 from metalens.design.profiles import PhaseMap
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
-CORE, MANY = (
-    8,
-    256,
-)  # samples from a vortex to a ring that is fine enough; places in all of them
+CORE = 8  # samples, largest half width of a ring around a vortex
+MANY = 256  # most places inside the rings of all vortices
 _COMMENT = re.compile(r"\s*(#|%|//)")
-SAME_STEP = 1e-6  # relative difference within which two spacings are one
-EVEN_STEP = 1e-3  # of a step, by which printed coordinates may leave an even grid
-PERIODS = {  # of 2 pi, by what the setting of a map that is not in radians should say
+SAME_STEP = 1e-6  # relative difference at which two spacings still agree
+EVEN_STEP = 1e-3  # of a step: tolerance of printed coordinates of an even grid
+PERIODS = {  # value of a full turn in other units: the setting that states it
     360.0: "degrees: unit = 'deg'",
     256.0: "levels of 8 bits: levels = 256",
     1.0: "waves: unit = 'waves'",
@@ -32,11 +30,11 @@ PERIODS = {  # of 2 pi, by what the setting of a map that is not in radians shou
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhaseSamples:
-    """A phase map as it was read.
+    """A phase map in the sampling of its file.
 
-    phase_rad: (y, x), +x right, +y down; nan where the file says that there is no data.
-    step_um: between samples along (x, y). centre_um: (x, y) of the middle of the map,
-    seen from the lens axis.
+    phase_rad: (y, x), +x right, +y down; nan without data.
+    step_um: spacing of the samples along (x, y).
+    centre_um: (x, y) of the middle of the map from the lens axis.
     """
 
     phase_rad: Array
@@ -45,14 +43,14 @@ class PhaseSamples:
 
 
 def read_phase_map(shape: PhaseMap) -> PhaseSamples:
-    """Read the file of a phase map, by the ending of its name, in radians.
+    """Phase map of a file in radians; by the ending of its name.
 
-    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named;
-    ``.dat`` (Zemax grid phase, which brings its own spacing); anything else is text.
-    Text is a matrix of numbers, or three columns x (um), y (um, down) and phase.
-    Columns are separated by commas, or by semicolons, tabs or blanks with decimal
-    commas; lines after #, % or // are comments. A first row or column that counts
-    (0, 1, 2 ... of a table) is no phase.
+    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the named one;
+    ``.dat`` (Zemax grid phase, with its own spacing); anything else is text. Text is a
+    matrix of numbers, or three columns x (um), y (um, down) and phase. Columns are
+    separated by commas, or by semicolons, tabs or blanks with decimal commas; lines
+    after #, % or // are comments. A first row or column that counts (0, 1, 2 ... of a
+    table) is no phase.
 
     Args:
         shape: file, spacing and unit.
@@ -93,7 +91,7 @@ def _require_pitch(path: Path, pitch_um: float | None) -> None:
 
 
 def _square(values: Any, path: Path, shape: PhaseMap) -> PhaseSamples:
-    """A matrix with the same stated spacing along x and y."""
+    """Samples of a matrix with the stated spacing along x and y."""
     _require_pitch(path, shape.pitch_um)
     pitch_um = float(shape.pitch_um or 0)
     return PhaseSamples(_checked(values, path, shape), (pitch_um, pitch_um))
@@ -115,7 +113,19 @@ def _radians(samples: PhaseSamples, path: Path, shape: PhaseMap) -> Array:
 
 
 def _refuse_other_unit(values: Array, path: Path) -> None:
-    """Refuse integers, and wraps by the period of another unit than radians."""
+    """Refuse samples that look like another unit than radians.
+
+    These are whole numbers throughout, or a phase that wraps by 360, 256 or 1. A wrap
+    means: span within 10 % below the period, one step above 3/4 of the span, and a
+    median step below 1/4.
+
+    Args:
+        values: (y, x) samples of the file.
+        path: of the file, for messages.
+
+    Raises:
+        LensError: with the setting that states the unit.
+    """
     finite = values[np.isfinite(values)]
     low, high = float(finite.min()), float(finite.max())
     if high > low and (finite == np.rint(finite)).all():
@@ -141,22 +151,23 @@ def _refuse_other_unit(values: Array, path: Path) -> None:
 def interpolate_phase(
     samples: PhaseSamples, x_um: Array, y_um: Array, *, radius_um: float = math.inf
 ) -> Array:
-    """Phase between the samples, (y, x), by bilinear interpolation of the phasor exp(i
+    """Phase in rad at positions, (y, x): bilinear interpolation of the phasor exp(i
     phase).
 
-    About a vortex, whose phase goes through whole turns around a point however fine the
-    map is, that of the nearest
-    sample, up to CORE samples from it.
+    Around a vortex the phase passes whole turns however fine the map is. Up to 8
+    samples from one, the phase of the nearest sample is taken.
 
     Args:
-        x_um: (x,) positions; y_um: (y,) positions, all inside the map.
+        samples: the phase map.
+        x_um: (x,) positions, all inside the map.
+        y_um: (y,) positions, all inside the map.
         radius_um: of the aperture; outside it the map may have no data, or be too
             coarse.
 
     Raises:
         LensError: a position lies outside the map or where it has no data, or
-            neighbouring samples differ by nearly
-            half a turn, so that the phase between them is not known.
+            neighbouring samples differ by nearly half a turn, so that the phase between
+            them is not known.
     """
     rows, columns = samples.phase_rad.shape
     (step_x, step_y), (x0, y0) = samples.step_um, samples.centre_um
@@ -171,46 +182,53 @@ def interpolate_phase(
             f"the phase map covers {columns * step_x:.1f} x {rows * step_y:.1f} um about ({x0:.1f}, {y0:.1f}) um, "
             "less than the aperture"
         )
-    between, known_share = _blended(samples.phase_rad, row, column)
+    phasor, data_weight = _interpolated_phasor(samples.phase_rad, row, column)
     radius2 = x_um**2 + y_um[:, None] ** 2
     inside = radius2 <= radius_um**2
     nearest_row = np.clip(np.rint(row).astype(int), 0, rows - 1)
     nearest_column = np.clip(np.rint(column).astype(int), 0, columns - 1)
-    hole = np.isnan(samples.phase_rad[np.ix_(nearest_row, nearest_column)])
-    by_the_rim = radius2 > max(radius_um - math.hypot(step_x, step_y), 0.0) ** 2
-    empty = inside & (known_share == 0) | inside & hole & ~by_the_rim
-    size = np.where(inside & ~empty, np.abs(between), 1.0)
+    no_data = np.isnan(samples.phase_rad[np.ix_(nearest_row, nearest_column)])
+    at_rim = radius2 > max(radius_um - math.hypot(step_x, step_y), 0.0) ** 2
+    empty = inside & (data_weight == 0) | inside & no_data & ~at_rim
+    size = np.where(inside & ~empty, np.abs(phasor), 1.0)
     worst = np.unravel_index(int(np.where(empty, -1.0, size).argmin()), size.shape)
     place = f"near row {row[worst[0]]:.1f}, column {column[worst[1]]:.1f}"
     if empty.any():
         raise LensError(
             f"the phase map has no data {place}, inside the aperture; fill it or take a smaller aperture"
         )
-    coarse = np.argwhere(size < 0.5)
-    known = [
-        _vortex(samples.phase_rad, float(row[i]), float(column[k]))
+    coarse = np.argwhere(size < 0.5)  # neighbours differ by over 2/3 of half a turn
+    vortices = [
+        _vortex_phase(samples.phase_rad, float(row[i]), float(column[k]))
         for i, k in coarse[:MANY]
     ]
-    if len(coarse) > MANY or None in known:
+    if len(coarse) > MANY or None in vortices:
         raise LensError(
             f"the phase map turns by more than 2/3 of half a turn between samples {place}; "
             f"give it on a finer pitch than {max(step_x, step_y)} um, or state the unit "
             "of its phase if that is not radians"
         )
-    found = np.angle(between)
-    for (i, k), phase in zip(coarse, known, strict=True):
-        found[i, k] = phase
-    return np.asarray(found)
+    phases = np.angle(phasor)
+    for (i, k), phase in zip(coarse, vortices, strict=True):
+        phases[i, k] = phase
+    return np.asarray(phases)
 
 
-def _vortex(phase_rad: Array, row: float, column: float) -> float | None:
-    """Phase of the sample nearest to a place, where a closed ring of samples around it
-    is fine enough to tell that the
-    phase turns about it; None where none does."""
+def _vortex_phase(phase_rad: Array, row: float, column: float) -> float | None:
+    """Phase in rad of the nearest sample, where the place lies near a vortex; else
+    None.
+
+    There is a vortex where the phase around some closed square ring of samples, half
+    width 2 to 8, changes by whole turns in steps below a third of a turn.
+
+    Args:
+        phase_rad: (y, x) samples.
+        row: fractional row of the place.
+        column: fractional column of the place.
+    """
     rows, columns = phase_rad.shape
-    i, k = (
-        min(max(math.floor(at), 0), n - 2) for at, n in ((row, rows), (column, columns))
-    )
+    i = min(max(math.floor(row), 0), rows - 2)
+    k = min(max(math.floor(column), 0), columns - 2)
     for half in range(2, CORE + 1):
         if min(i, k) < half - 1 or i + half >= rows or k + half >= columns:
             return None
@@ -220,27 +238,36 @@ def _vortex(phase_rad: Array, row: float, column: float) -> float | None:
         )
         steps = np.diff(ring, append=ring[:1]) / (2 * np.pi)
         steps = steps - np.rint(steps)
-        if (
-            np.abs(steps).max() < 1 / 3 and abs(steps.sum()) > 0.5
-        ):  # nan compares as neither
+        # with nan among the steps both comparisons are false
+        if np.abs(steps).max() < 1 / 3 and abs(steps.sum()) > 0.5:
             return float(phase_rad[round(row), round(column)])
     return None
 
 
-def _blended(phase_rad: Array, row: Array, column: Array) -> tuple[Array, Array]:
-    """Phasors between the samples that hold data, and the weight of those samples."""
-    known = np.isfinite(phase_rad)
-    phasor = np.where(known, np.exp(1j * np.where(known, phase_rad, 0.0)), 0.0)
+def _interpolated_phasor(
+    phase_rad: Array, row: Array, column: Array
+) -> tuple[Array, Array]:
+    """Bilinear mean of exp(i phase) over the samples with data, and their weight, (y,
+    x).
+
+    Args:
+        phase_rad: (rows, columns) samples, nan without data.
+        row: (y,) fractional rows.
+        column: (x,) fractional columns.
+    """
+    finite = np.isfinite(phase_rad)
+    phasor = np.where(finite, np.exp(1j * np.where(finite, phase_rad, 0.0)), 0.0)
     total, weight = (
         _blend(_blend(values, row).T, column).T
-        for values in (phasor, known.astype(float))
+        for values in (phasor, finite.astype(float))
     )
     return total / np.where(weight > 0, weight, 1.0), weight
 
 
 def _blend(samples: Array, position: Array) -> Array:
-    """Linear interpolation along the first axis; positions beyond the ends take the end
-    sample.
+    """Linear interpolation of (n, m) samples along the first axis at (k,) positions.
+
+    Positions beyond the ends take the end sample.
     """
     low = np.clip(np.floor(position).astype(int), 0, len(samples) - 2)
     weight = np.clip(position - low, 0, 1)[:, None]
@@ -248,6 +275,17 @@ def _blend(samples: Array, position: Array) -> Array:
 
 
 def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
+    """Samples of a phase map as (y, x) float64.
+
+    Args:
+        values: array of the file.
+        path: of the file, for messages.
+        shape: stated settings of the map.
+
+    Raises:
+        LensError: complex, not 2-D, smaller than 2 by 2, infinite values, no finite
+            value, or a value above the stated ``levels``.
+    """
     phase = np.asarray(values)
     if phase.dtype.kind == "c":
         raise LensError(
@@ -270,10 +308,12 @@ def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
 
 
 def _npy(path: Path, variable: str | None) -> Any:
+    """The array of a .npy file, memory-mapped first.
+
+    A header that claims more than the file holds is refused before memory is taken.
+    """
     _no_variable(path, variable)
     try:
-        # mapped, so that a header that claims more than the file holds is refused
-        # before memory is taken
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
     except (
         *store.DAMAGE,
@@ -286,7 +326,15 @@ def _npy(path: Path, variable: str | None) -> Any:
 
 
 def _text(path: Path, shape: PhaseMap) -> PhaseSamples:
-    """A matrix, or rows of x, y and phase."""
+    """A phase map of a text file: a matrix, or rows of x, y and phase.
+
+    Args:
+        path: of the file.
+        shape: stated spacing and unit of the map.
+
+    Raises:
+        LensError: not text, fewer than two rows, or values that are no numbers.
+    """
     _no_variable(path, shape.variable)
     try:
         lines = reading.read_text(path).splitlines()
@@ -297,14 +345,18 @@ def _text(path: Path, shape: PhaseMap) -> PhaseSamples:
         raise LensError(
             f"{path}: not a phase map: it holds {len(rows)} rows of numbers"
         )
-    mark, decimal = reading.column_separator(max(*rows[:2], rows[-1], key=len))
-    if decimal:
+    separator, decimal_comma = reading.column_separator(
+        max(*rows[:2], rows[-1], key=len)
+    )
+    if decimal_comma:
         rows = [line.replace(",", ".") for line in rows]
-    if mark and rows[0].startswith(mark):  # the corner of a table with named rows
+    if separator and rows[0].startswith(
+        separator
+    ):  # the corner of a table with named rows
         rows[0] = "nan" + rows[0]
-    header = _header(rows[0].split(mark))
+    header = _header(rows[0].split(separator))
     try:
-        table = np.loadtxt(rows[1:] if header else rows, delimiter=mark, ndmin=2)
+        table = np.loadtxt(rows[1:] if header else rows, delimiter=separator, ndmin=2)
     except ValueError as error:
         raise LensError(
             f"{path}: not a phase map: {error}; need rows of numbers, or columns x, y "
@@ -336,20 +388,26 @@ def _counts(values: Array) -> bool:
 
 
 def _without_counts(table: Array, header: list[str]) -> Array:
-    """A matrix without the numbers of its columns and rows, as tables are saved."""
+    """A matrix without a leading row and column of counts (0, 1, 2 ...), as tables are
+    saved.
+
+    A table of whole numbers throughout is left as it is.
+    """
     if len(table) > 2 and min(table.shape) > 2:
-        named = np.isnan(table[0, 0]) and _counts(table[0, 1:])
-        rest = table[1:, 1:]
-        whole = bool((rest == np.rint(rest)).all())
-        if (named or _counts(table[0])) and not whole:
+        named_corner = np.isnan(table[0, 0]) and _counts(table[0, 1:])
+        body = table[1:, 1:]
+        integers = bool((body == np.rint(body)).all())
+        if (named_corner or _counts(table[0])) and not integers:
             table = table[1:]
-        if (named or header or _counts(table[:, 0])) and not whole:
+        if (named_corner or header or _counts(table[:, 0])) and not integers:
             table = table[:, 1:] if _counts(table[:, 0]) else table
     return table
 
 
 def _is_triple(header: list[str], table: Array) -> bool:
-    """Whether three columns are x, y and phase: by their names, or by a grid of x, y."""
+    """Whether three columns are x, y and phase: by their names, or by a grid of x,
+    y.
+    """
     if header:
         return header[0][:1].lower() == "x" and header[1][:1].lower() == "y"
     x, y = np.unique(table[:, 0]), np.unique(table[:, 1])
@@ -358,16 +416,22 @@ def _is_triple(header: list[str], table: Array) -> bool:
 
 def _length_scale(name: str) -> float:
     """um in the unit that the name of a column ends in; um where it names none."""
-    found = re.search(r"(?<![a-zA-Z])_?(nm|mm|m)[)\]\s]*$", name)
-    return {"nm": 1e-3, "mm": 1e3, "m": 1e6}[found.group(1)] if found else 1.0
+    unit = re.search(r"(?<![a-zA-Z])_?(nm|mm|m)[)\]\s]*$", name)
+    return {"nm": 1e-3, "mm": 1e3, "m": 1e6}[unit.group(1)] if unit else 1.0
 
 
 def _gridded(
     path: Path, table: Array, header: list[str], shape: PhaseMap
 ) -> PhaseSamples:
-    """Rows of x, y (down) and phase on an even grid, in any order.
+    """Samples on an even grid from rows of x, y (down) and phase in any order.
 
     x and y are in um, or in the unit that their names end in: x (nm), x_mm.
+
+    Args:
+        path: of the file, for messages.
+        table: (rows, 3) x, y and phase.
+        header: names of the columns; empty for none.
+        shape: stated spacing and unit.
 
     Raises:
         LensError: not one phase at every place of an even grid.
@@ -375,23 +439,23 @@ def _gridded(
     axes, steps = [], []
     scales = [_length_scale(name) for name in header[:2]] or [1.0, 1.0]
     for name, values, scale in zip("xy", table.T[:2], scales, strict=True):
-        at = np.unique(values) * scale
-        step = np.diff(at)
-        if len(at) < 2 or np.ptp(step) > EVEN_STEP * step.mean():
+        coordinates = np.unique(values) * scale
+        step = np.diff(coordinates)
+        if len(coordinates) < 2 or np.ptp(step) > EVEN_STEP * step.mean():
             raise LensError(
-                f"{path}: {len(at)} values of {name}, not evenly spaced; need x, y and "
+                f"{path}: {len(coordinates)} values of {name}, not evenly spaced; need x, y and "
                 "phase on an even grid, or a matrix of the phase"
             )
-        axes.append(at)
-        steps.append(float((at[-1] - at[0]) / (len(at) - 1)))
+        axes.append(coordinates)
+        steps.append(float((coordinates[-1] - coordinates[0]) / (len(coordinates) - 1)))
     x, y = axes
     phase = np.full((len(y), len(x)), np.nan)
-    place = tuple(
+    cells = tuple(
         np.unique(table[:, k], return_inverse=True)[1].ravel() for k in (1, 0)
     )
-    if len(np.unique(place[0] * len(x) + place[1])) < len(table):
+    if len(np.unique(cells[0] * len(x) + cells[1])) < len(table):
         raise LensError(f"{path}: two rows have the same x and y; need one phase each")
-    phase[place] = table[:, 2]
+    phase[cells] = table[:, 2]
     pitch_um = shape.pitch_um
     if pitch_um is not None and max(abs(s / pitch_um - 1) for s in steps) > EVEN_STEP:
         raise LensError(
@@ -410,7 +474,16 @@ def _no_variable(path: Path, variable: str | None) -> None:
 
 
 def _named(path: Path, arrays: dict[str, Array], variable: str | None) -> Array:
-    """The matrix of that name; without one the only matrix."""
+    """The matrix of a name; without a name the only matrix.
+
+    Args:
+        path: of the file, for messages.
+        arrays: arrays of the file by name.
+        variable: name of the matrix; None for the only one.
+
+    Raises:
+        LensError: no such name, or not exactly one matrix.
+    """
     if variable is not None:
         if variable not in arrays:
             raise LensError(
@@ -427,13 +500,19 @@ def _named(path: Path, arrays: dict[str, Array], variable: str | None) -> Array:
 
 
 def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
-    """A grid-phase file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy
-    [nodata]`` a point.
+    """Samples of a Zemax grid-phase file, rad.
 
-    Points run from the corner of least x and largest y along x, then down in y
-    (OpticStudio help, Grid Sag and Grid
-    Phase); phases are radians whatever the unit. Their derivatives are not used. +y of
-    the file points up, ours down.
+    Head ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy [nodata]`` for
+    every point. Points run from the corner of least x and largest y along x, then down
+    in y (OpticStudio help, Grid Sag and Grid Phase). Phases are radians in any unit of
+    length; derivatives are not used. +y of the file points up, here down.
+
+    Args:
+        path: of the file.
+        pitch_um: stated spacing, compared with that of the file; None for none.
+
+    Raises:
+        LensError: not text, empty, damaged, or of another spacing than stated.
     """
     try:
         lines = reading.read_text(path).splitlines()
@@ -466,6 +545,18 @@ def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
 def _zemax_head(
     path: Path, words: list[str]
 ) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
+    """Size, spacing and centre of the grid in the head of a grid-phase file.
+
+    Args:
+        path: of the file, for messages.
+        words: of the first line, ``nx ny delx dely unitflag [xdec ydec]``.
+
+    Returns:
+        Columns and rows, spacing (x, y) and centre (x, y) in um, +y down.
+
+    Raises:
+        LensError: words that are no head, or a grid below 2 by 2 points.
+    """
     try:
         columns = int(words[0])
         rows = int(words[1])
@@ -489,6 +580,16 @@ def _zemax_head(
 
 
 def _zemax_point(path: Path, number: int, words: list[str]) -> float:
+    """Phase in rad of one point of a grid-phase file; nan where its nodata flag is 1.
+
+    Args:
+        path: of the file, for messages.
+        number: of the line, for messages.
+        words: of the line.
+
+    Raises:
+        LensError: no number, or a phase that is not finite.
+    """
     try:
         value = float(words[0])
         missing = len(words) > 4 and int(words[4]) == 1

@@ -41,24 +41,25 @@ class Focus:
         check_gaps(self.layers, self.sensor_distance_um, self.source_distance_um)
 
     def path_um(self, radius2_um2: Array) -> Array:
-        """Optical path source - lens - sensor through a ring of squared radius r², less
-        that along the axis, um.
+        """Optical path source - lens - sensor at radius r, less that along the axis,
+        um.
 
-        Paper Eq. 1 on both sides; through films that of the ray which reaches r, to
-        rounding.
+        Paper Eq. 1 on both sides. Through films it is the path of the ray that reaches
+        r, exact to rounding.
+
+        Args:
+            radius2_um2: r², um².
         """
         if self.layers.plain:
-            near, far = self.sensor_distance_um, self.source_distance_um
-            return np.asarray(
-                path_difference(radius2_um2, near) + path_difference(radius2_um2, far)
-            )
+            behind = path_difference(radius2_um2, self.sensor_distance_um)
+            before = path_difference(radius2_um2, self.source_distance_um)
+            return np.asarray(behind + before)
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um).layers
         total = media.path_difference(after, 0.0, 0.0, radius2_um2)[1]
         if math.isfinite(self.source_distance_um):
-            before = self.layers.before(
-                self.source_distance_um, self.wavelength_um
-            ).layers
-            total = total + media.path_difference(before, 0.0, 0.0, radius2_um2)[1]
+            front = self.layers.before(self.source_distance_um, self.wavelength_um)
+            front_path = media.path_difference(front.layers, 0.0, 0.0, radius2_um2)[1]
+            total = total + front_path
         return np.asarray(total)
 
     def aperture(self, radius_um: float) -> float:
@@ -71,31 +72,39 @@ class Focus:
     def paths_from(
         self, x_um: Array, y_um: Array, tangent: float
     ) -> tuple[Array, Array]:
-        """Optical paths to (x, y) of the lens from the source and the sensor point of a
-        field angle along x, less those
-        to its middle, um."""
-        near, far = self.sensor_distance_um, self.source_distance_um
+        """Optical paths to (x, y) of the lens from the source and from the sensor
+        point.
+
+        Both points belong to a field angle along x; the paths are less those to the
+        middle of the lens.
+
+        Args:
+            x_um: places along x, um.
+            y_um: places along y, um.
+            tangent: of the field angle.
+
+        Returns:
+            Paths from the sensor point and from the source, um.
+        """
+        sensor_um = self.sensor_distance_um
+        source_um = self.source_distance_um
         if self.layers.plain:
-            sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / near)
-            return np.asarray(sensor), np.asarray(
-                source_path(x_um, y_um, (tangent, 0.0), 1 / far)
-            )
+            sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / sensor_um)
+            source = source_path(x_um, y_um, (tangent, 0.0), 1 / source_um)
+            return np.asarray(sensor), np.asarray(source)
         sine = tangent / math.hypot(1.0, tangent)
-        found = []
-        for gap, side in ((self.layers.after(near, self.wavelength_um), 1), (None, -1)):
-            if gap is None and not math.isfinite(far):
-                found.append(np.asarray(x_um * sine))
+        behind = self.layers.after(sensor_um, self.wavelength_um)
+        paths = []
+        for gap, side in ((behind, 1), (None, -1)):  # None: in front of the lens
+            if gap is None and not math.isfinite(source_um):
+                paths.append(np.asarray(x_um * sine))
                 continue
-            pairs = (gap or self.layers.before(far, self.wavelength_um)).layers
+            pairs = (gap or self.layers.before(source_um, self.wavelength_um)).layers
             reach = side * sine * media.reach_per_direction(pairs, sine**2)
-            found.append(
-                np.asarray(
-                    media.path_difference(
-                        pairs, sine**2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um
-                    )[1]
-                )
-            )
-        return found[0], found[1]
+            change = x_um**2 + y_um**2 - 2 * reach * x_um
+            path = media.path_difference(pairs, sine**2, reach**2, change)[1]
+            paths.append(np.asarray(path))
+        return paths[0], paths[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,12 +176,15 @@ class PhaseMap:
 
 
 def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
-    """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both
+    """Hyperbolic lens phase in rad: -k × optical path difference (paper Eq. 1, both
     sides).
 
+    Paths source - lens - sensor are then equal over the aperture.
+
     Args:
+        x_um: positions along x; broadcast with y_um to (y, x).
+        y_um: positions along y.
         focus: source and sensor distances of the design.
-        x_um, y_um: positions that broadcast to (y, x).
 
     Returns:
         (y, x) phase in rad, 0 on the axis and negative outwards, float64.
@@ -185,15 +197,18 @@ def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
 def double_helix_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float
 ) -> Array:
-    """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes
-    that turn with depth.
+    """Hyperbolic phase plus annular vortices, (y, x) in rad: (2 l - 1) azimuth in ring
+    l.
+
+    The PSF has two lobes that rotate with depth. l = ceil(zones (r/R)^(1/exponent)), 1
+    to ``zones``.
 
     Args:
         x_um: places along x, um.
-        y_um: places along y, um.
+        y_um: places along y, um; they broadcast to (y, x).
         focus: source and sensor distances of the design.
-        shape: (y, x) samples.
-        radius_um: radius of the aperture, um.
+        shape: number of zones and exponent of their radii.
+        radius_um: radius R of the aperture, um.
     """
     fraction = np.hypot(x_um, y_um) / radius_um
     ring = np.clip(
@@ -207,14 +222,14 @@ def double_helix_phase(
 def cubic_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float
 ) -> Array:
-    """Hyperbolic phase plus :class:`Cubic`.
+    """Hyperbolic phase plus strength ((x/R)³ + (y/R)³), (y, x) in rad.
 
     Args:
         x_um: places along x, um.
-        y_um: places along y, um.
+        y_um: places along y, um; they broadcast to (y, x).
         focus: source and sensor distances of the design.
-        shape: (y, x) samples.
-        radius_um: radius of the aperture, um.
+        shape: strength of the cubic term.
+        radius_um: radius R of the aperture, um.
     """
     x, y = x_um / radius_um, y_um / radius_um
     return np.asarray(

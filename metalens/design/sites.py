@@ -13,21 +13,22 @@ from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.lens import DiameterMap
 
-PhaseOf = Callable[
-    [Array, Array], Array
-]  # (x,) and (y,) positions in um to (y, x) phase in rad
-_BLOCK_SITES = (
-    1 << 21
-)  # sites worked on at a time, so that memory does not grow with the lens
+# (x,) and (y,) positions in um to (y, x) phase in rad
+PhaseOf = Callable[[Array, Array], Array]
+_BLOCK_SITES = 1 << 21  # sites of one block, so that memory does not grow with the lens
 
 
 @dataclass(frozen=True, slots=True)
 class LatticeSites:
-    """Where pillars may stand: centres half a pitch inside a round aperture.
+    """Sites of a lattice that may hold pillars: centres half a pitch inside an
+    aperture.
 
-    shape: (y, x) of the map. steps_um: (x, y) from site to site of the map; on a
-    hexagonal lattice every other site of
-    the map is one of the lattice, the middle one among them.
+    pitch_um: lattice constant.
+    lattice: square or hexagonal.
+    shape: (y, x) of the map.
+    steps_um: (x, y) from site to site of the map. On a hexagonal lattice every other
+        site of the map is one of the lattice, the middle one included.
+    aperture_um: diameter of the aperture.
     """
 
     pitch_um: float
@@ -39,11 +40,11 @@ class LatticeSites:
     def blocks(
         self, phases: Sequence[PhaseOf], pistons_rad: Array | None = None
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """Blocks of rows: which sites hold a pillar, and the phases wanted there.
+        """Blocks of rows with the mask of their pillars and the target phases there.
 
         Args:
             phases: function of position for every channel.
-            pistons_rad: (channels,) added to them.
+            pistons_rad: (channels,) added to the target phases.
 
         Yields:
             The rows, (rows, columns) whether a pillar stands, (channels, sites) phase
@@ -64,7 +65,7 @@ class LatticeSites:
             if self.lattice.centred:
                 row, column = np.ogrid[start : start + len(inside), : len(x)]
                 inside &= (row + column) % 2 == 0
-            wanted = []
+            targets = []
             for phase in phases:
                 block = phase(x, y[rows])
                 if np.shape(block) != inside.shape:
@@ -73,20 +74,20 @@ class LatticeSites:
                         f"{y[rows].shape}: need {inside.shape}, as "
                         "phase(x, y[:, None]) of a function of one point gives"
                     )
-                wanted.append(block[inside])
-            added = np.zeros(len(phases)) if pistons_rad is None else pistons_rad
-            yield rows, inside, np.stack(wanted) + added[:, None]
+                targets.append(block[inside])
+            pistons = np.zeros(len(phases)) if pistons_rad is None else pistons_rad
+            yield rows, inside, np.stack(targets) + pistons[:, None]
 
     def sample(self, phases: Sequence[PhaseOf], count: int = 1500) -> Array:
-        """(channels, sites) wanted phases in rad at evenly picked sites.
+        """(channels, sites) target phases in rad at evenly picked sites.
 
         Args:
             phases: function of position for every channel.
-            count: sites at most.
+            count: most sites.
         """
-        wanted = np.concatenate([block for *_, block in self.blocks(phases)], axis=1)
-        pick = np.linspace(0, wanted.shape[1] - 1, count).astype(int)
-        return np.asarray(wanted[:, np.unique(pick)])
+        targets = np.concatenate([block for *_, block in self.blocks(phases)], axis=1)
+        pick = np.linspace(0, targets.shape[1] - 1, count).astype(int)
+        return np.asarray(targets[:, np.unique(pick)])
 
     def map(
         self,
@@ -94,7 +95,13 @@ class LatticeSites:
         angle_rad: Array | None = None,
         length_um: Array | None = None,
     ) -> DiameterMap:
-        """The pillars on these sites."""
+        """The map of pillars on these sites.
+
+        Args:
+            diameter_um: (y, x) sizes, 0 without a pillar.
+            angle_rad: (y, x) rotations; None for none.
+            length_um: (y, x) second sizes; None for one size.
+        """
         row_um = 0.0 if self.lattice.kind == "square" else self.steps_um[1]
         return DiameterMap(
             diameter_um, self.pitch_um, self.lattice, row_um, angle_rad, length_um
@@ -102,13 +109,14 @@ class LatticeSites:
 
 
 def lattice_sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> LatticeSites:
-    """The sites of the cell's lattice in an aperture.
+    """The sites of the cell's lattice inside a round aperture.
 
-    grid_nm: of the mask: rows of a hexagonal lattice are sqrt(3)/2 pitches apart,
-    rounded to it.
+    Rows of a hexagonal lattice are sqrt(3)/2 pitches apart, rounded to the mask grid.
 
     Args:
+        cell: unit cell with its pitch and lattice.
         aperture_um: diameter of the aperture, um.
+        grid_nm: of the mask.
 
     Raises:
         LensError: the aperture holds no pillar.
@@ -137,11 +145,11 @@ def lattice_sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> LatticeS
 
 
 def least_period_um(cell: Cell) -> float:
-    """Twice the Nyquist step of a phase on this lattice: it may turn half a turn over
-    half of this, in any direction.
+    """Twice the Nyquist step of a phase on the lattice, um: 2 pi / least reciprocal
+    vector.
 
-    The shortest reciprocal vector is 2 pi / this: the pitch on a square lattice,
-    sqrt(3)/2 of it on a hexagonal one.
+    The pitch on a square lattice, sqrt(3)/2 of it on a hexagonal one. A phase may
+    change by half a turn over half of this, in any direction.
 
     Args:
         cell: unit cell of the lens.

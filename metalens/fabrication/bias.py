@@ -11,7 +11,7 @@ from metalens.core import reading
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-# |d bias / d diameter| above this is refused: the inverse would not be a contraction
+# largest |d bias / d diameter|; above it the fixed-point inverse may not converge
 STEEPEST = 0.5
 _PROBES_NM = np.linspace(10, 2000, 1991)
 
@@ -41,6 +41,11 @@ class Bias:
     range_um: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse several sources of the bias, impossible numbers and steep slopes.
+
+        Raises:
+            ProcessError: naming the setting.
+        """
         if sum((bool(self.table_nm), bool(self.curve_nm), self.csv is not None)) > 1:
             raise ProcessError(
                 "bias is given more than once; keep one of table_nm, curve_nm and csv"
@@ -63,6 +68,11 @@ class Bias:
         self._check_slope()
 
     def _check_slope(self) -> None:
+        """Refuse a bias whose slope is above 0.5 nm per nm anywhere.
+
+        Raises:
+            ProcessError: with the slope and where it is.
+        """
         probes = (
             np.array([pair[0] for pair in self.table_nm])
             if self.table_nm
@@ -90,33 +100,43 @@ class Bias:
         return np.zeros_like(drawn)
 
     def made_nm(self, drawn_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Diameter that comes out; ``isolation``: 0 in a full lattice, 1 alone."""
+        """Fabricated diameter in nm: drawn + bias(drawn) + isolated_nm × isolation.
+
+        Args:
+            drawn_nm: drawn diameter.
+            isolation: 0 in a full lattice, 1 alone.
+        """
         drawn = np.asarray(drawn_nm, float)
         return np.asarray(
             drawn + self.at(drawn) + self.isolated_nm * np.asarray(isolation)
         )
 
     def drawn_nm(self, made_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Inverse of :meth:`made_nm`: what to draw so that ``made_nm`` comes out, to
+        """Drawn diameter in nm for a fabricated one, inverse of :meth:`made_nm`, to
         1e-9 nm.
 
-        The fixed point of drawn = made - bias(drawn): each round halves the error at
-        least.
+        Fixed point of drawn = goal - bias(drawn); each iteration at least halves the
+        error.
+
+        Args:
+            made_nm: diameter after fabrication.
+            isolation: 0 in a full lattice, 1 alone.
         """
         goal = np.asarray(made_nm, float) - self.isolated_nm * np.asarray(isolation)
         drawn = goal.copy()
         for _ in range(60):
-            before, drawn = drawn, goal - self.at(drawn)
+            before = drawn
+            drawn = goal - self.at(drawn)
             if np.abs(drawn - before).max(initial=0.0) < 1e-10:
                 break
         return np.asarray(drawn)
 
 
 def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
-    """(drawn diameter, bias) pairs in nm from a file of two columns, below a line of
-    words or not.
+    """(drawn diameter, bias) pairs in nm from a file of two columns.
 
-    Columns are parted by commas, or by semicolons, tabs or blanks with decimal commas.
+    A first line of words is a header. Columns are separated by commas, or by
+    semicolons, tabs or blanks with decimal commas.
 
     Args:
         path: of a table of two columns.

@@ -29,9 +29,9 @@ class OwnRates:
     """Logarithmic derivatives of t at some sizes.
 
     rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0
-        of what such pillars cannot have.
-    edges: (n,) by a bias of all edges, less that by the size, which is what a proxy
-    knows: 0 where a shape keeps its form as its edges move (circles, squares), per um.
+        for errors that such pillars cannot have.
+    edges: (n,) by a bias of all edges less that by the size, per um; 0 where a shape
+        keeps its form as its edges move (circles, squares).
     error: largest relative change (rms over the sizes) of one of them from a coarser
         truncation.
     """
@@ -42,21 +42,19 @@ class OwnRates:
 
 
 def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
-    """Derivatives of ln t of a lens's pillars by central differences of RCWA, for the
-    light that the lens's proxy is of.
+    """Derivatives of ln t of a lens's pillars by every pillar-response error.
+
+    Central differences of RCWA, for the light of the lens's proxy.
 
     Args:
-        lens: with one size a pillar.
+        lens: with pillars of one size.
         size_um: (n,) sizes of pillars.
-
-    Returns:
-        Derivatives at these sizes by every pillar-response error.
 
     Accuracy: ``error``, the change from a coarser truncation: a few percent.
 
     Raises:
-        CellError, MaterialError: from the solver. LensError: pillars of two sizes
-            (:func:`pair_rates`).
+        CellError, MaterialError: from the solver.
+        LensError: pillars of two sizes (:func:`pair_rates`).
     """
     if lens.pairs is not None:
         raise LensError(
@@ -65,13 +63,13 @@ def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
     edges = (
         {} if lens.cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
     )
-    (found,) = _rates(
+    (rates,) = _rates(
         lens,
         [(lens.cell, float(d)) for d in size_um],
         edges,
         (polarization_weights(lens),),
     )
-    return found
+    return rates
 
 
 def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, OwnRates]:
@@ -98,49 +96,64 @@ def _rates(
     edges: dict[str, float],
     weights: tuple[Array, ...],
 ) -> list[OwnRates]:
-    """Of pillars of these cells and sizes, for each weighting of the Jones matrix."""
+    """Rates of pillars, one :class:`OwnRates` for each weighting of the Jones matrix.
+
+    Args:
+        lens: the lens.
+        cells: cell and size of each pillar.
+        edges: rates of the cell's numbers by a bias of edges less that by the size.
+        weights: (2, 2) weightings of the Jones matrix.
+    """
     tasks = [(cell, size, order) for order in _TRUNCATIONS for cell, size in cells]
-    some = list(
-        executor.gather_parallel(_derived, (lens.wavelength_um, edges, weights), tasks)
-    )
-    every = (
-        np.array(some)
-        .reshape(len(_TRUNCATIONS), len(cells), len(weights), -1)
-        .transpose(2, 0, 3, 1)
-    )
-    return [_judged(coarse, fine) for coarse, fine in every]
+    common = (lens.wavelength_um, edges, weights)
+    slopes = np.array(list(executor.gather_parallel(_log_slopes, common, tasks)))
+    # (truncations, cells, weights, causes) to (weights, truncations, causes, cells)
+    slopes = slopes.reshape(len(_TRUNCATIONS), len(cells), len(weights), -1)
+    return [_with_error(coarse, fine) for coarse, fine in slopes.transpose(2, 0, 3, 1)]
 
 
-def _judged(coarse: Array, fine: Array) -> OwnRates:
-    off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(
-        np.linalg.norm(fine, axis=1), 1e-9
-    )
-    known = (
-        np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()
-    )  # a turn that a mirror of the cell forbids is rounding
-    return OwnRates(fine[:-1], fine[-1], float((off * known).max()))
+def _with_error(coarse: Array, fine: Array) -> OwnRates:
+    """Rates of the finer truncation, with the largest relative change from the coarser.
+
+    Args:
+        coarse, fine: (causes + 1, n) rates, the last row by the edges.
+    """
+    change = np.linalg.norm(fine - coarse, axis=1)
+    relative = change / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
+    # rates that a mirror of the cell forbids (a turn) are rounding errors
+    nonzero = np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()
+    return OwnRates(fine[:-1], fine[-1], float((relative * nonzero).max()))
 
 
 def polarization_weights(lens: "Lens") -> Array:
-    """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of, its
-    geometric phase aside.
+    """(2, 2) weights of the Jones matrix whose weighted sum is the t of the proxy.
+
+    The geometric phase is left out. Circular light: outer product of (1, ±i) / √2;
+    light
+    along x alone: xx; otherwise the mean of xx and yy.
 
     Args:
         lens: the lens.
     """
     if lens.hand:
-        come = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)
-        return np.outer(come, come)
-    one = lens.one_light and lens.proxy.max_angle_rad == 0
-    return _ALONG_X if one else (_ALONG_X + _ALONG_Y) / 2
+        incident = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)
+        return np.outer(incident, incident)
+    along_x = lens.one_light and lens.proxy.max_angle_rad == 0
+    return _ALONG_X if along_x else (_ALONG_X + _ALONG_Y) / 2
 
 
-def _derived(
+def _log_slopes(
     about: tuple[float, dict[str, float], tuple[Array, ...]],
     task: tuple[Cell, float, int],
 ) -> list[list[complex]]:
-    """For each weighting: derivatives of ln t by every pillar-response error, and by
-    the edges less by the size.
+    """Derivatives of ln t of one pillar at one truncation, for each weighting.
+
+    Args:
+        about: wavelength in um, rates of the edges, weightings of the Jones matrix.
+        task: cell, size in um, harmonics.
+
+    Returns:
+        Of each weighting a row: every pillar-response error, last the edges.
     """
     (wavelength_um, edges, weights), (cell, size_um, _harmonics) = about, task
     changes = [acts.numbers(cell, size_um) for _, acts in response_errors()]
@@ -156,16 +169,23 @@ def _slopes(
     weights: tuple[Array, ...],
     task: tuple[Cell, float, int],
 ) -> list[complex]:
-    """Central differences of ln t, for each weighting, as numbers of a pillar grow at
-    these rates; 0 where there are none.
+    """Central difference of ln t as a pillar's numbers change, for each weighting.
+
+    (ln t(+h) - ln t(-h)) / 2h with t = sum(weights × Jones matrix); 0 without numbers.
+
+    Args:
+        numbers: rate of each number of the cell.
+        wavelength_um: vacuum wavelength, um.
+        weights: (2, 2) weightings of the Jones matrix.
+        task: cell, size in um, harmonics.
     """
     from metalens.rcwa import solve_truncation
 
     cell, size_um, harmonics = task
     if not numbers:
         return [0j] * len(weights)
-    tilts = "sidewall_rad" in numbers
-    step = _WALL_STEP_RAD if tilts else _STEP
+    tilted = "sidewall_rad" in numbers
+    step = _WALL_STEP_RAD if tilted else _STEP
     less, middle, more = (
         changed_pillar(cell, size_um, numbers, amount, wavelength_um)
         for amount in (-step, 1e-6 * step, step)
@@ -175,7 +195,7 @@ def _slopes(
             *end,
             wavelength_um,
             harmonics=harmonics,
-            normals_of=None if tilts else middle,  # normals move with a tilted wall
+            normals_of=None if tilted else middle,  # normals move with a tilted wall
         ).t
         for end in (less, more)
     )

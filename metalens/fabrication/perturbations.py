@@ -20,12 +20,13 @@ Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """Pillars as guides of one mode, over their diameters; what the quick derivatives
-    are made of.
+    """Pillars as single-mode waveguides over their diameters, for the quick
+    derivatives.
 
-    k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,)
-        effective index and its derivatives by the diameter. index, around: of pillar
-        and surroundings. height_um, sidewall_rad: of the design.
+    k: wavenumber in vacuum, rad/um. diameter_um: (n,). effective: (n,) effective index.
+    slope, curvature: (n,) its first and second derivative by the diameter. index,
+    around: refractive index of the pillar and of its surroundings. height_um,
+    sidewall_rad: of the design.
     """
 
     k: float
@@ -77,11 +78,11 @@ Kind = type[CDError] | type[ResponseError] | type[WavefrontError]
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """How a process spreads a cause, in PROCESS.toml's table ``spread``.
+    """How a process spreads a cause, by its entry in PROCESS.toml's table ``spread``.
 
-    name, sigma: entry there and its default. share: of the entry's amount that the
-        cause gets; two causes of one entry are the x and y of a direction that every
-        lens draws anew.
+    name, sigma: entry and its default standard deviation. share: factor of the entry's
+        amount for this cause; two causes of one entry are the x and y component of a
+        direction that is random for every lens.
     """
 
     name: str
@@ -124,78 +125,79 @@ class Perturbation:
     measured_by: str = ""
 
 
-def _by_height(g: Guide) -> Array:
+def _height_rate(g: Guide) -> Array:
+    """d ln t / d height of pillars, per um: i k n_eff."""
     return 1j * g.k * g.effective
 
 
-def _by_index(g: Guide) -> Array:
-    """With b = (n_eff² - 1) / (n² - 1) a function of D sqrt(n² - 1): d n_eff / dn = (b
-    n + n D b' / 2) / n_eff.
+def _index_rate(g: Guide) -> Array:
+    """d ln t / d n of pillars: i k h (b n + n D b' / 2) / n_eff.
+
+    b = (n_eff² - n_0²) / (n² - n_0²), with n_0 of the surroundings, is a function of
+    D sqrt(n² - n_0²).
     """
     contrast = g.index**2 - g.around**2
     b = (g.effective**2 - g.around**2) / contrast
-    by_diameter = 2 * g.effective * g.slope / contrast
-    return (
-        1j
-        * g.k
-        * g.height_um
-        * (b * g.index + g.index * g.diameter_um * by_diameter / 2)
-        / g.effective
-    )
+    db_dd = 2 * g.effective * g.slope / contrast
+    bracket = b * g.index + g.index * g.diameter_um * db_dd / 2
+    return 1j * g.k * g.height_um * bracket / g.effective
 
 
-def _by_sidewall(g: Guide) -> Array:
-    """Pillars are measured at half height: the wall acts in second order, k n_eff'' s
-    h³ / 3.
+def _sidewall_rate(g: Guide) -> Array:
+    """d ln t / d sidewall angle of pillars, per rad: i k n_eff'' s h³ / 3.
+
+    The diameter is that at half height, so that the wall acts in second order.
     """
     return 1j * g.k * g.curvature * g.sidewall_rad * g.height_um**3 / 3
 
 
-def _by_side(g: Guide) -> Array:
-    """A round pillar that is wider along one axis: the mean over both polarisations is
-    half of the diameter's.
+def _side_rate(g: Guide) -> Array:
+    """d ln t / d width or length of pillars, per um: i k h n_eff' / 2.
+
+    The mean over both polarisations is half of the diameter's derivative.
     """
     return 0.5j * g.k * g.height_um * g.slope
 
 
-def _by_none(g: Guide) -> Array:
-    """A plain round pillar is the same at any turn, and has no other films under or on
-    it.
-    """
+def _zero_rate(g: Guide) -> Array:
+    """Zeros: round pillars without films do not depend on a turn or on films."""
     return np.zeros_like(g.effective, complex)
 
 
-def _number(name: str) -> Callable[[Cell, float], dict[str, float]]:
-    """A number that every cell has."""
+def _cell_number(name: str) -> Callable[[Cell, float], dict[str, float]]:
+    """Rates of a cell's numbers by this one alone, which every cell has."""
     return lambda cell, size_um: {name: 1.0}
 
 
-def _width(cell: Cell, size_um: float) -> dict[str, float]:
-    """Along the shape's own x at the length that it has, where it has two sides: L =
-    ratio times the size.
+def _width_numbers(cell: Cell, size_um: float) -> dict[str, float]:
+    """Rates of a cell's numbers by its width: the size grows and the length stays.
+
+    L = ratio × size, so that the ratio changes by -ratio / size; {} for shapes of one
+    size.
     """
     ratio = _ratio(cell)
     return {"size_um": 1.0, "shape.ratio": -ratio / size_um} if ratio else {}
 
 
-def _length(cell: Cell, size_um: float) -> dict[str, float]:
-    """Along the shape's own y at the width that it has."""
+def _length_numbers(cell: Cell, size_um: float) -> dict[str, float]:
+    """Rates of a cell's numbers by its length; {} for shapes of one size."""
     return {"shape.ratio": 1 / size_um} if _ratio(cell) else {}
 
 
-def _turn(cell: Cell, size_um: float) -> dict[str, float]:
+def _turn_numbers(cell: Cell, size_um: float) -> dict[str, float]:
+    """Rates of a cell's numbers by a turn of the pillar, {} for round ones."""
     return {"shape.angle_rad": 1.0} if hasattr(cell.shape, "angle_rad") else {}
 
 
 def _ratio(cell: Cell) -> float:
-    """Of the second side of a rectangle or an ellipse to its size; 0 for other shapes."""
+    """Length over size of a rectangle or an ellipse; 0 for other shapes."""
     return (
         float(cell.shape.ratio) if isinstance(cell.shape, Rectangle | Ellipse) else 0.0
     )
 
 
-def _heights(cell: Cell, size_um: float) -> dict[str, float]:
-    """Of the pillar, or of its sections."""
+def _height_numbers(cell: Cell, size_um: float) -> dict[str, float]:
+    """Rates of a cell's numbers by its height, shared by its sections."""
     if not cell.layers:
         return {"height_um": 1.0}
     return {
@@ -206,20 +208,33 @@ def _heights(cell: Cell, size_um: float) -> dict[str, float]:
 
 
 def _films(cell: Cell, *, under: bool) -> dict[str, float]:
-    """Of the films under all sections of the pillar's own material, or on them, in
-    proportion to their heights.
+    """Rates of layer heights by the total height of the films under or on the pillar.
+
+    The films lie under all sections of the pillar's own material, or on all of them.
+    Each grows in proportion to its height; {} for a cell without layers.
     """
-    own = [i for i, layer in enumerate(cell.layers) if layer.material is None]
-    if not own:
+    sections = [i for i, layer in enumerate(cell.layers) if layer.material is None]
+    if not sections:
         return {}
-    places = range(own[0]) if under else range(own[-1] + 1, len(cell.layers))
-    whole = sum(cell.layers[i].height_um for i in places)
-    return {f"layers.{i}.height_um": cell.layers[i].height_um / whole for i in places}
+    films = range(sections[0]) if under else range(sections[-1] + 1, len(cell.layers))
+    total_um = sum(cell.layers[i].height_um for i in films)
+    return {f"layers.{i}.height_um": cell.layers[i].height_um / total_um for i in films}
 
 
 def _cd_error(
     name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: Any
 ) -> Perturbation:
+    """Row of a diameter error in nm: bias(u, v) = sum c u^i v^j, (u, v) over the
+    radius.
+
+    Args:
+        name: of the row.
+        meaning: for reports.
+        sigma: prior standard deviation, nm.
+        bound: largest amount of either sign, nm.
+        terms: (c, i, j) in nm per unit of the row.
+        more: further fields of the row.
+    """
     nm = tuple((c * 1e-3, i, j) for c, i, j in terms)
     return Perturbation(
         name, meaning, 1.0, sigma, -bound, bound, CDError(nm), 1e-3, **more
@@ -227,7 +242,13 @@ def _cd_error(
 
 
 def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
-    """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
+    """Row of a Zernike wave-front error (Noll 1976), rad rms over the disc.
+
+    Args:
+        name: of the polynomial.
+        norm: squared factor that makes its rms 1.
+        terms: (c, i, j) of the polynomial sum c u^i v^j.
+    """
     rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
     return Perturbation(
         f"{name}_rad",
@@ -243,7 +264,14 @@ def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
 def _side(
     name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
 ) -> Perturbation:
-    acts = ResponseError(_by_side, numbers)
+    """Row of an error in nm of one side of all rectangles or ellipses.
+
+    Args:
+        name: of the row.
+        meaning: for reports.
+        numbers: rates of a cell's numbers by that side.
+    """
+    acts = ResponseError(_side_rate, numbers)
     return Perturbation(
         name,
         meaning,
@@ -259,7 +287,14 @@ def _side(
 
 
 def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
-    acts = ResponseError(_by_none, lambda cell, size_um: _films(cell, under=under))
+    """Row of an error in nm of the film heights under or on the pillar.
+
+    Args:
+        name: of the row.
+        meaning: for reports.
+        under: films under the pillar's own material in place of those on it.
+    """
+    acts = ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=under))
     return Perturbation(
         name,
         meaning,
@@ -348,7 +383,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         10.0,
         -28.0,
         28.0,
-        ResponseError(_by_height, _heights, "height_um"),
+        ResponseError(_height_rate, _height_numbers, "height_um"),
         1e-3,
         drawn=Drawn("height_nm", 7.0),
         measured_by="the height (AFM) or the power",
@@ -360,7 +395,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.02,
         -0.075,
         0.075,
-        ResponseError(_by_index, _number("pillar.n"), "n"),
+        ResponseError(_index_rate, _cell_number("pillar.n"), "n"),
         free=False,
         drawn=Drawn("index", 0.02),
         effect="another refractive index",
@@ -374,7 +409,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.5,
         -1.6,
         1.6,
-        ResponseError(_by_sidewall, _number("sidewall_rad")),
+        ResponseError(_sidewall_rate, _cell_number("sidewall_rad")),
         DEG,
         free=False,
         drawn=Drawn("sidewall_deg", 0.5),
@@ -386,12 +421,12 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
     _side(
         "width_nm",
         "side of a rectangle or ellipse along its x, minus design and bias",
-        _width,
+        _width_numbers,
     ),
     _side(
         "length_nm",
         "side of a rectangle or ellipse along its y, minus design and bias",
-        _length,
+        _length_numbers,
     ),
     Perturbation(
         "turn_deg",
@@ -400,7 +435,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.3,
         -3.0,
         3.0,
-        ResponseError(_by_none, _turn),
+        ResponseError(_zero_rate, _turn_numbers),
         DEG,
         free=False,
         drawn=Drawn("turn_deg", 0.0),
@@ -430,12 +465,12 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
 
 
 def wavelength_scale(wavelength_um: float) -> float:
-    """How much larger what the table gives in nm is for a lens of this wavelength:
-    wavelength / 0.85 um, 1 at least.
+    """Factor of the nm amounts of the table at a wavelength: max(1, wavelength / 0.85
+    um).
 
-    Pillars, their height and what their tools are asked to hold grow with the
-    wavelength, so that errors of one kind turn the phase equally; lenses of shorter waves
-    come from the same writers and etchers, with their nanometres.
+    Pillars, their height and the tolerances of their tools grow with the wavelength, so
+    that errors of one kind turn the phase equally. Lenses of shorter wavelengths come
+    from the same writers and etchers, with their nanometres.
 
     Args:
         wavelength_um: vacuum wavelength, um.
@@ -444,8 +479,9 @@ def wavelength_scale(wavelength_um: float) -> float:
 
 
 def prior_scale(name: str, wavelength_um: float) -> float:
-    """By which prior and bounds of a row are multiplied for a wavelength:
-    :func:`wavelength_scale` of what is given in nm.
+    """Factor of the prior and bounds of a row at a wavelength; 1 for rows not in nm.
+
+    See :func:`wavelength_scale`.
 
     Args:
         name: of a row of the table.
@@ -482,12 +518,13 @@ def names_of_kind(kind: Kind) -> tuple[str, ...]:
 
 
 def with_missing(rows: Sequence[Array]) -> Array:
-    """(pillar-response errors, *shape) of the first rows of the table: those that are
-    not there are 0.
+    """(pillar-response errors, *shape) of the first rows of the table, zeros appended.
+
+    Args:
+        rows: (*shape) of each of the first pillar-response errors.
     """
-    return np.stack(
-        [*rows, *[np.zeros_like(rows[0])] * (len(response_errors()) - len(rows))]
-    )
+    missing = len(response_errors()) - len(rows)
+    return np.stack([*rows, *[np.zeros_like(rows[0])] * missing])
 
 
 def inapplicable_names(cell: Cell) -> tuple[str, ...]:
@@ -504,33 +541,44 @@ def inapplicable_names(cell: Cell) -> tuple[str, ...]:
 
 
 def polynomial_coefficients(kind: type[CDError] | type[WavefrontError]) -> Array:
-    """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each cause."""
+    """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each
+    cause.
+    """
     return _polynomials(kind.__name__)
 
 
 @functools.cache
 def _polynomials(kind: str) -> Array:
-    found = [
+    """Coefficients as :func:`polynomial_coefficients`, by the name of the kind
+    (cached).
+    """
+    rows = [
         row.acts.terms
         for row in PERTURBATIONS
         if type(row.acts).__name__ == kind and not isinstance(row.acts, ResponseError)
     ]
-    size = 1 + max((max(i, j) for terms in found for _, i, j in terms), default=0)
-    out = np.zeros((len(found), size, size))
-    for n, terms in enumerate(found):
+    size = 1 + max((max(i, j) for terms in rows for _, i, j in terms), default=0)
+    coefficients = np.zeros((len(rows), size, size))
+    for n, terms in enumerate(rows):
         for c, i, j in terms:
-            out[n, i, j] += c
-    return out
+            coefficients[n, i, j] += c
+    return coefficients
 
 
 def derivative_maps(
     kind: type[CDError] | type[WavefrontError], u: Array, v: Array
 ) -> Array:
-    """(rows of the kind, *shape) derivative maps at lens places (u, v) over the radius."""
+    """(rows of the kind, *shape) derivative maps, um or rad for one unit of each row.
+
+    Args:
+        kind: CDError or WavefrontError.
+        u: (*shape) x over the radius of the lens.
+        v: (*shape) y over the radius of the lens.
+    """
     return np.stack(
         [
-            np.polynomial.polynomial.polyval2d(u, v, each)
-            for each in polynomial_coefficients(kind)
+            np.polynomial.polynomial.polyval2d(u, v, coefficients)
+            for coefficients in polynomial_coefficients(kind)
         ]
     )
 
@@ -542,34 +590,33 @@ def changed_pillar(
     amount: float,
     wavelength_um: float,
 ) -> tuple[Cell, float]:
-    """A pillar whose numbers have grown.
+    """Cell and size of a pillar whose numbers changed by rate × amount.
 
     Args:
-        cell, size_um: the pillar as designed.
+        cell: the designed pillar.
+        size_um: its size.
         numbers: rate of each number, named as in a cell file (``height_um``,
             ``shape.ratio``, ``layers.0.height_um``, ``pillar.n``); ``size_um``, and
             ``grow_um`` of all edge pairs.
-        amount: that the rates are multiplied by.
+        amount: factor of the rates.
         wavelength_um: in vacuum, of the refractive index.
-
-    Returns:
-        Cell and size of the changed pillar.
     """
     layers = list(cell.layers)
     for name, rate in numbers.items():
-        first, *rest = name.split(".")
+        path = name.split(".")
         change = rate * amount
         if name == "size_um":
             size_um += change
         elif name == "grow_um":
-            layers = [_grown(layer, name, change) for layer in cell.sections]
+            layers = [_grown(section, name, change) for section in cell.sections]
         elif name == "pillar.n":
             n = index(cell.pillar, wavelength_um)
             cell = dataclasses.replace(cell, pillar=Index(n.real + change, n.imag))
-        elif first == "shape":
-            cell = dataclasses.replace(cell, shape=_grown(cell.shape, rest[0], change))
-        elif first == "layers":
-            layers[int(rest[0])] = _grown(layers[int(rest[0])], rest[1], change)
+        elif path[0] == "shape":
+            cell = dataclasses.replace(cell, shape=_grown(cell.shape, path[1], change))
+        elif path[0] == "layers":
+            layer = int(path[1])
+            layers[layer] = _grown(layers[layer], path[2], change)
         else:
             cell = _grown(cell, name, change)
     if layers:
@@ -579,5 +626,5 @@ def changed_pillar(
 
 
 def _grown(record: Any, name: str, change: float) -> Any:
-    """A record with one number larger."""
+    """A copy of a record with one of its numbers larger by ``change``."""
     return dataclasses.replace(record, **{name: getattr(record, name) + change})

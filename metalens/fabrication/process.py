@@ -50,7 +50,7 @@ class State:
 
     @classmethod
     def of(cls, values: Mapping[str, float] | None = None) -> Self:
-        """The state with these amounts by name, the rest as designed.
+        """The state with these amounts by name, all others 0 (as designed).
 
         Raises:
             ConfigError: an unknown name.
@@ -130,7 +130,7 @@ class Spread(_Entries):  # type: ignore[misc]
 
     @property
     def stated(self) -> dict[str, float]:
-        """The same without entries that no process has unless it says so."""
+        """Standard deviations that are above 0, or whose default is."""
         return {
             name: value
             for name, value in self.values().items()
@@ -158,50 +158,53 @@ class Spread(_Entries):  # type: ignore[misc]
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One lens of a process: amounts by entry of the spread, and the direction that the
-    lens drew for its gradients.
+    """A random lens of a process.
+
+    amounts: by entry of the spread. turn_rad: direction of its gradients.
     """
 
     amounts: dict[str, float]
     turn_rad: float = 0.0
 
     def state(self) -> State:
-        """The causes that these amounts mean."""
-        found: dict[str, float] = {}
+        """State of a lens: amount of each entry × share × direction cosine or sine."""
+        amounts: dict[str, float] = {}
         for row in PERTURBATIONS:
             if row.drawn and row.drawn.name in self.amounts:
-                found[row.name] = (
+                amounts[row.name] = (
                     self.amounts[row.drawn.name]
                     * row.drawn.share
                     * self._direction(row.name)
                 )
-        return State.of(found)
+        return State.of(amounts)
 
     def _direction(self, cause: str) -> float:
-        """1, or cosine and sine of the direction for the first and second cause of one
-        entry.
+        """Factor of a cause by the direction of the lens's gradients.
+
+        cos and sin of ``turn_rad`` for the first and second cause of one entry; 1 where
+        the entry has one cause.
         """
         entry = next(
             row.drawn.name for row in PERTURBATIONS if row.name == cause and row.drawn
         )
-        together = [
+        causes = [
             row.name for row in PERTURBATIONS if row.drawn and row.drawn.name == entry
         ]
-        return (
-            1.0
-            if len(together) == 1
-            else (math.cos, math.sin)[together.index(cause)](self.turn_rad)
-        )
+        if len(causes) == 1:
+            return 1.0
+        return (math.cos, math.sin)[causes.index(cause)](self.turn_rad)
 
 
 def draw_lenses(spread: Spread, count: int, *, seed: int) -> list[Draw]:
-    """``count`` lenses of a process: normal amounts, gradients in any direction.
+    """Random lenses of a process: normal amounts, uniform direction of the gradients.
 
     Args:
         spread: standard deviations of the process.
+        count: number of lenses.
         seed: of the random generator.
     """
-    random, stated = np.random.default_rng(seed), spread.stated
+    random = np.random.default_rng(seed)
+    stated = spread.stated
     sigma = np.array(list(stated.values()))
     normal = random.standard_normal((count, len(sigma))) * sigma
     turns = random.uniform(0, 2 * np.pi, count)
@@ -223,8 +226,10 @@ class Printed:
 
 
 def of_process(path: str | Path) -> Printed:
-    """These entries of a PROCESS.toml; CSV files that it names lie in its folder. The rest
-    is left to ``layout``.
+    """Bias, spread and diameter step of a PROCESS.toml; ``layout`` reads its other
+    tables.
+
+    CSV files that it names lie in its folder.
 
     Args:
         path: of PROCESS.toml.
@@ -235,14 +240,14 @@ def of_process(path: str | Path) -> Printed:
     """
     path = Path(path)
     table = config.read(path, Printed)
-    wanted: dict[str, Any] = {
+    entries: dict[str, Any] = {
         name: table[name] for name in ("bias", "spread") if name in table
     }
     rules = table.get("rules", {})
     if isinstance(rules, dict) and "diameter_step_nm" in rules:
-        wanted["diameter_step_nm"] = rules["diameter_step_nm"]
-    found = config.from_table(wanted, Printed, where=str(path))
-    return dataclasses.replace(found, bias=with_table(found.bias, path.parent))
+        entries["diameter_step_nm"] = rules["diameter_step_nm"]
+    printed = config.from_table(entries, Printed, where=str(path))
+    return dataclasses.replace(printed, bias=with_table(printed.bias, path.parent))
 
 
 def with_table(bias: Bias, folder: str | Path) -> Bias:

@@ -18,28 +18,23 @@ from metalens.fabrication.two_sizes import PairSensitivities
 from metalens.lens import Lens
 from metalens.library import Proxy
 
-# steps in the wavelengths of a proxy, of which the last one gives the tangent at its
-# end
-_END = 64
-# |T| that a tangent beyond a proxy falls to at most: what a solver has there is a
-# multiple of it
-_DARKEST = 1e-3
-_NODES, _DEGREE = (
-    9,
-    5,
-)  # sizes that own shapes are solved at, and of the polynomials through them
+_END = 64  # the tangent at an end of a proxy: over 1/64 of its wavelength range
+_DARKEST = 1e-3  # least |T| of a tangent beyond the domain of a proxy
+_NODES = 9  # Chebyshev sizes at which pillars of own shape are solved
+_DEGREE = 5  # of the polynomials through these
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solved:
-    """Complex t at some diameters, as power series of single causes; cubic between the
-    diameters.
+    """Complex t of pillars as power series in single fabrication errors.
 
-    wavelength_um: that it was solved at. diameter_um: (n,) rising.
-    powers: (causes, orders, n) of t in powers of the amount of each pillar-response
-        error (um, rad, 1), in the table's order; the first is the designed t, the
-        others are 0 for a cause that was not solved. Between the amounts that were
-        solved a series misses resonances that move by: up to 0.03 of t near them.
+    Cubic splines between the diameters. Between the solved amounts a series misses
+    resonances that pass: up to 0.03 of t near them.
+
+    wavelength_um: at which it was solved. diameter_um: (n,) rising.
+    powers: (causes, orders, n) coefficients of t in powers of the amount of each
+        pillar-response error (um, rad, 1), in the table's order. The first is the
+        designed t; the others are 0 for a cause that was not solved.
     """
 
     wavelength_um: float
@@ -57,20 +52,19 @@ class Solved:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivity:
-    """First-order change of ln t with the pillar-response errors, as polynomials of the
-    diameter.
+    """First-order change of ln t with the pillar-response errors, over the diameter.
 
-    coefficients: (pillar-response errors, degree + 1) complex power series in (D -
-        center_um) of d ln t by the base unit (um, rad, 1) of each; a row of zeros
-        switches a cause off, and so does a row that is not there.
+    coefficients: (pillar-response errors, degree + 1) complex power series in
+        (D - center_um) of d ln t by the base unit (um, rad, 1) of each. A row of zeros,
+        or a row that is missing, switches a cause off.
+    center_um: origin of the power series.
     error: of the slopes, relative to their change across the lens; nan where not known.
-    low_um, high_um: diameters that the polynomials were made for; beyond them they go
-        on along their tangents.
-    solved: t itself under large changes, where a solver was asked; it stands for the
-        proxy then.
-    edges: (1, degree + 1) likewise of d ln t by a bias of all edges less that by the size,
-        per um: a proxy knows pillars that keep their form as they grow, which a biased
-        rectangle does not; None for those that do.
+    low_um, high_um: diameters of the fit; beyond them the polynomials continue along
+        their tangents.
+    solved: t itself under large changes from a solver, in place of the proxy.
+    edges: (1, degree + 1) likewise of d ln t by a bias of all edges less that by the
+        size, per um. A proxy has pillars that keep their form as they grow, which a
+        biased rectangle does not. None for shapes that do.
     pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
     """
 
@@ -101,12 +95,23 @@ class Sensitivity:
         return with_missing(self._series(self.coefficients, diameter_um))
 
     def by_edges(self, diameter_um: Array) -> Array | None:
-        """(*shape) what a bias of all edges changes ln t by beyond the same change of
-        the size; None for nothing.
+        """(*shape) change of ln t per um of a bias of all edges, beyond that of the
+        size.
+
+        None for pillars that keep their form.
         """
         return None if self.edges is None else self._series(self.edges, diameter_um)[0]
 
     def _series(self, coefficients: Array, diameter_um: Array) -> list[Array]:
+        """Polynomials at diameters, one value of (*shape) for every row of
+        coefficients.
+
+        Beyond ``low_um`` and ``high_um`` they continue along their tangents.
+
+        Args:
+            coefficients: (rows, degree + 1) power series in D - ``center_um``.
+            diameter_um: (*shape) diameters, um.
+        """
         inside = np.clip(diameter_um, self.low_um, self.high_um)
         offset = inside - self.center_um
         beyond = np.asarray(diameter_um - inside)
@@ -125,12 +130,14 @@ class Sensitivity:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """Pillars of given diameters under the pillar-response errors: t over that of the
-    proxy at the design's wavelength.
+    """Response of pillars of given diameters to the pillar-response errors.
 
-    slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
-        orders, *shape) of t in powers of the others, the designed t first; None where
-        all are linear. proxy: (*shape) t of the proxy.
+    t over that of the proxy at the design wavelength.
+
+    slopes: (causes, *shape) d ln t by the causes that act linearly.
+    series: (causes, orders, *shape) of t in powers of the others, the designed t first;
+        None where all are linear.
+    proxy: (*shape) t of the proxy.
     """
 
     slopes: Array
@@ -138,8 +145,13 @@ class Answer:
     proxy: Array
 
     def factor(self, amounts: Array) -> Array:
-        """(*shape) t under the change over the proxy's: prod_c t(a_c) / t(0) times
-        exp(sum_c a_c s_c).
+        """(*shape) t under the change over the proxy's t.
+
+        t_solved / t_proxy times prod_c t_c(a_c) / t_c(0) over causes with a series,
+        times exp(sum_c a_c s_c) over the others.
+
+        Args:
+            amounts: (causes,) a_c in base units (um, rad, 1).
         """
         change = np.exp(np.tensordot(amounts, self.slopes, 1))
         if self.series is None:
@@ -151,19 +163,23 @@ class Answer:
         return np.asarray(change)
 
     def rates(self, amounts: Array) -> Array:
-        """(causes, *shape) d ln t by every cause at the change."""
+        """(causes, *shape) d ln t by every cause at the change: s_c, or t_c'(a_c) /
+        t_c(a_c).
+
+        Args:
+            amounts: (causes,) a_c in base units (um, rad, 1).
+        """
         out = self.slopes.astype(complex)
         if self.series is not None:
             for n, (amount, row) in enumerate(zip(amounts, self.series, strict=False)):
                 if row[1:].any():
-                    out[n] = polynomial.polyval(
-                        amount, polynomial.polyder(row)
-                    ) / polynomial.polyval(amount, row)
+                    slope = polynomial.polyval(amount, polynomial.polyder(row))
+                    out[n] = slope / polynomial.polyval(amount, row)
         return out
 
 
 class Slopes(Protocol):
-    """Anything that knows d ln t by the answering perturbations."""
+    """Anything with the derivatives of ln t by the pillar-response errors."""
 
     def at(self, diameter_um: Array) -> Array:
         """(pillar-response errors, *shape) derivatives of ln t by the base unit of
@@ -177,73 +193,75 @@ class Slopes(Protocol):
 
 
 def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
-    """Derivatives from the effective index of the pillars that the proxy's phase
-    implies; of pillars that are not round on a square lattice those of their own shape,
-    by exact derivatives of a solver (seconds a lens).
+    """Derivatives of ln t by the pillar-response errors, as polynomials of the
+    diameter.
+
+    Of round pillars on a square lattice: from the effective index n_eff that the phase
+    of the proxy implies, phase = k n_eff h. Of other shapes: by central differences of
+    RCWA for the shape itself (seconds a lens).
 
     Args:
+        lens: the lens, with its cell and proxy.
         degree: of the polynomials over the diameter.
 
     Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by
-        index; interference between foot and top is left out. The cell solvers say it
-        better, at seconds a lens. For other shapes: ``error`` of the result.
+        index; interference between foot and top is left out. The cell solvers are
+        more exact, at seconds a lens. For other shapes: ``error`` of the result.
 
     Raises:
         CellError, MaterialError, LensError: pillars that are not round and that the
             solver does not take.
     """
     if not lens.cell.round:
-        return _of_its_own(lens)
-    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-    low = max(float(d.min()), lens.proxy.domain_um[0])
-    high = min(float(d.max()), lens.proxy.domain_um[1])
-    seen = effective_indices(
+        return _own_shape_sensitivity(lens)
+    diameters = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    low = max(float(diameters.min()), lens.proxy.domain_um[0])
+    high = min(float(diameters.max()), lens.proxy.domain_um[1])
+    guide = effective_indices(
         lens.cell,
         lens.proxy,
         lens.wavelength_um,
         np.linspace(low, high, 61),
         degree=degree,
     )
-    center = float(seen.diameter_um.mean())
+    center = float(guide.diameter_um.mean())
     rows = [
-        polynomial.polyfit(seen.diameter_um - center, acts.quick(seen), degree)
+        polynomial.polyfit(guide.diameter_um - center, acts.quick(guide), degree)
         for _, acts in response_errors()
     ]
     return Sensitivity(np.array(rows), center, 0.5, low, high)
 
 
-def _of_its_own(lens: Lens) -> Sensitivity:
-    """From :func:`metalens.fabrication.own.own_rates` at Chebyshev sizes, as
-    polynomials of degree 5.
+def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
+    """Derivatives of ln t of a lens's own pillar shape, as polynomials of degree 5.
+
+    RCWA rates (:func:`metalens.fabrication.own.own_rates`) at the 9 Chebyshev sizes of
+    the proxy's domain are fitted by Chebyshev polynomials. These become power series in
+    size - centre. ``error``: truncation of the solver plus the largest relative
+    residual of the fit.
     """
     low, high = lens.proxy.domain_um
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    found = own_rates(lens, (low + high) / 2 + (high - low) / 2 * unit)
-    rows = np.vstack([found.rates, found.edges])
+    solved = own_rates(lens, (low + high) / 2 + (high - low) / 2 * unit)
+    rows = np.vstack([solved.rates, solved.edges])
     series = chebyshev.chebfit(unit, rows.T, _DEGREE)
-    off = np.linalg.norm(chebyshev.chebval(unit, series) - rows, axis=1) / np.maximum(
-        np.linalg.norm(rows, axis=1), 1e-9
-    )
-    known = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
+    residual = np.linalg.norm(chebyshev.chebval(unit, series) - rows, axis=1)
+    fit_error = residual / np.maximum(np.linalg.norm(rows, axis=1), 1e-9)
+    nonzero = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
     scale = (2 / (high - low)) ** np.arange(_DEGREE + 1)
-    made = (
-        np.array(
-            [
-                np.pad(c, (0, _DEGREE + 1 - len(c)))
-                for c in map(chebyshev.cheb2poly, series.T)
-            ]
-        )
-        * scale
-    )
-    error = found.error + float((off * known).max())
+    powers = [
+        np.pad(c, (0, _DEGREE + 1 - len(c))) for c in map(chebyshev.cheb2poly, series.T)
+    ]
+    coefficients = np.array(powers) * scale
+    error = solved.error + float((fit_error * nonzero).max())
     return Sensitivity(
-        made[:-1],
+        coefficients[:-1],
         (low + high) / 2,
         error,
         low,
         high,
         None,
-        made[-1:] if known[-1] else None,
+        coefficients[-1:] if nonzero[-1] else None,
     )
 
 
@@ -255,45 +273,50 @@ def effective_indices(
     *,
     degree: int = 5,
 ) -> Guide:
-    """Effective indices of pillars: phase(D) = k n_eff(D) h, smoothed by a polynomial.
+    """Effective index n_eff of pillars over the diameter, with two derivatives.
 
-    Anchored at the thinnest pillar by the effective medium of thin cylinders across the
-    field (Rayleigh 1892, two dimensions).
+    phase(D) - phase(D_0) = k h (n_eff(D) - n_eff(D_0)), smoothed by a polynomial. At
+    the thinnest pillar D_0, n_eff is that of thin cylinders across the field (Rayleigh
+    1892, two dimensions).
 
     Args:
         cell: unit cell with its materials, shape and lattice.
         proxy: phase and |T| over the diameter.
         wavelength_um: vacuum wavelength, um.
-        diameter_um: (n,) diameters at which it is evaluated, um.
+        diameter_um: (n,) rising diameters, um.
         degree: of the polynomials over the diameter.
     """
     from metalens.cell import materials
 
-    index, outer = (
-        m.n if isinstance(m, Index) else materials.index(m, wavelength_um).real
-        for m in (cell.pillar, cell.fill)
+    n_pillar, n_around = (
+        material.n
+        if isinstance(material, Index)
+        else materials.index(material, wavelength_um).real
+        for material in (cell.pillar, cell.fill)
     )
-    k, h = 2 * math.pi / wavelength_um, cell.height_um
+    k = 2 * math.pi / wavelength_um
+    h = cell.height_um
     fill = math.pi * diameter_um[0] ** 2 / 4 / cell.pitch_um**2
-    inside, around = index**2, outer**2
-    thin = (
-        around
-        * (inside * (1 + fill) + around * (1 - fill))
-        / (inside * (1 - fill) + around * (1 + fill))
+    eps_pillar = n_pillar**2
+    eps_around = n_around**2
+    eps_thin = (
+        eps_around
+        * (eps_pillar * (1 + fill) + eps_around * (1 - fill))
+        / (eps_pillar * (1 - fill) + eps_around * (1 + fill))
     )
     phase = proxy.phase_rad(diameter_um, wavelength_um)
     offset = diameter_um - diameter_um.mean()
-    fit = np.polynomial.Polynomial.fit(
-        offset, math.sqrt(thin) + (phase - phase[0]) / (k * h), degree
+    n_eff = np.polynomial.Polynomial.fit(
+        offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * h), degree
     )
     return Guide(
         k,
         diameter_um,
-        fit(offset),
-        fit.deriv()(offset),
-        fit.deriv(2)(offset),
-        index,
-        outer,
+        n_eff(offset),
+        n_eff.deriv()(offset),
+        n_eff.deriv(2)(offset),
+        n_pillar,
+        n_around,
         h,
         cell.sidewall_rad,
     )
@@ -302,34 +325,41 @@ def effective_indices(
 def designed_transmission(
     proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0
 ) -> Array:
-    """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at
-    an angle of incidence.
+    """Complex t of pillars by their proxy, extrapolated along tangents beyond its
+    domain.
 
-    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T|
-    held within 1e-3 to 1): by diameter, and by wavelength as far again as the proxy
-    reaches, then held; of one wavelength they hold at all.
+    By diameter, phase and |T| continue along their tangents without end. By wavelength
+    they do so over one more range of the proxy, then stay constant. With a proxy of one
+    wavelength they are constant over wavelength. |T| stays within 1e-3 to 1.
 
     Args:
+        proxy: phase and |T| over the diameter.
+        d_um: diameters of any shape, um.
         wavelength_um: vacuum wavelength, um.
         angle_rad: angle of incidence in air, rad.
     """
     low, high = proxy.wavelengths_um
     inside = min(max(wavelength_um, low), high)
-    phase, level = _levels(proxy, d_um, low if high == low else inside, angle_rad)
-    away = min(max(wavelength_um - inside, low - high), high - low)
-    if away:
-        step = math.copysign((high - low) / _END, away)
-        before = _levels(proxy, d_um, inside - step, angle_rad)
-        phase = phase + (phase - before[0]) * (away / step)
-        level = level + (level - before[1]) * (away / step)
+    phase, level = _phase_and_level(proxy, d_um, inside, angle_rad)
+    beyond = min(max(wavelength_um - inside, low - high), high - low)
+    if beyond:
+        step = math.copysign((high - low) / _END, beyond)
+        phase_in, level_in = _phase_and_level(proxy, d_um, inside - step, angle_rad)
+        phase = phase + (phase - phase_in) * (beyond / step)
+        level = level + (level - level_in) * (beyond / step)
     return np.asarray(np.clip(level, _DARKEST, 1) * np.exp(1j * phase))
 
 
-def _levels(
+def _phase_and_level(
     proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float
 ) -> tuple[Array, Array]:
-    """Phase and |T| at a wavelength that the proxy knows, along their tangents beyond
-    its diameters.
+    """Phase in rad and |T| of pillars, along tangents beyond the proxy's diameters.
+
+    Args:
+        proxy: phase and |T| over the diameter.
+        d_um: diameters of any shape, um.
+        wavelength_um: within the proxy's range, um.
+        angle_rad: angle of incidence in air, rad.
     """
     at = wavelength_um, angle_rad
     inside = np.clip(d_um, *proxy.domain_um)
@@ -342,13 +372,13 @@ def _levels(
 
 
 def prepare_response(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
-    """What pillars of these diameters (any shape) do under any change of the process,
-    made ready once for many.
+    """Response of pillars to the pillar-response errors, for many amounts of these.
 
-    Beyond the diameters that a solver was asked for, its last word goes on with the
-    proxy.
+    Where ``response`` has solved series of t, these replace the linear slopes of their
+    causes. Beyond the solved diameters, solved t over the proxy's t is that at the end.
 
     Args:
+        proxy: phase and |T| over the diameter.
         response: derivatives of ln t by the pillar-response errors.
         diameter_um: (*shape) diameters, um.
     """
@@ -365,14 +395,15 @@ def prepare_response(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answ
 
 
 def bias_ratio(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
-    """t of pillars whose edges have moved by a bias to sizes ``d_um``, over that of
-    pillars designed so.
+    """t of pillars whose edges moved by a bias to sizes ``d_um``, over t of that
+    design.
 
-    Of second order: the derivative is taken half-way. 1 for shapes that keep their
-    form.
+    exp(bias d ln t / d bias), the derivative taken half-way (second order). 1 for
+    shapes that keep their form.
 
     Args:
         response: derivatives of ln t by the pillar-response errors.
+        d_um: (*shape) sizes after the bias, um.
         bias_um: displacement of the diameter by moved edges, um.
     """
     rate = response.by_edges(np.asarray(d_um - np.asarray(bias_um) / 2))
@@ -389,21 +420,22 @@ def perturbed_transmission(
     bias_um: Array | float = 0.0,
     angle_rad: float = 0.0,
 ) -> Array:
-    """:func:`designed_transmission` under a change of the process: t exp(sum_c a_c d ln t / dc), or
-    as the solver has it.
+    """Complex t of pillars under fabrication errors: t exp(sum_c a_c d ln t / dc).
+
+    For causes with solved series, the series takes the place of the exponential. The
+    unperturbed t is :func:`designed_transmission`.
 
     Args:
-        answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
-            bias_um: what of the diameters is bias, of all edges equally, and no size of
-            the design (:func:`bias_ratio`).
         proxy: phase and |T| over the diameter.
+        response: derivatives of ln t by the pillar-response errors.
         d_um: (*shape) diameters, um.
         wavelength_um: vacuum wavelength, um.
+        answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
+        bias_um: part of the diameters that is a bias of all edges
+            (:func:`bias_ratio`).
         angle_rad: angle of incidence in air, rad.
     """
-    changed = prepare_response(proxy, response, d_um).factor(answers) * bias_ratio(
-        response, d_um, bias_um
-    )
-    return np.asarray(
-        designed_transmission(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed
-    )
+    factor = prepare_response(proxy, response, d_um).factor(answers)
+    changed = factor * bias_ratio(response, d_um, bias_um)
+    designed = designed_transmission(proxy, d_um, wavelength_um, angle_rad=angle_rad)
+    return np.asarray(designed * changed)

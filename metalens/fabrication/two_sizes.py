@@ -13,9 +13,9 @@ from metalens.fabrication.own import pair_rates
 from metalens.fabrication.perturbations import with_missing
 from metalens.lens import DiameterMap, Lens
 
-_PAIRS = 24  # that are solved
-_DARKEST = 1e-3  # |t| that a tangent beyond a table falls to at most
-_ENTRY_UM = 5e-5  # by which sizes differ that are of two kinds
+_PAIRS = 24  # pairs of sizes that are solved
+_DARKEST = 1e-3  # least |t| of a tangent beyond a table
+_ENTRY_UM = 5e-5  # resolution of sizes; equal rounded sizes are one kind
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -32,7 +32,7 @@ class PairTable:
 
     @classmethod
     def of(cls, lens: Lens) -> "PairTable":
-        """Of a lens, for its light at its wavelength.
+        """Splines of a lens's table, for its light at its wavelength.
 
         Raises:
             LensError: a lens whose pillars have one size.
@@ -57,21 +57,29 @@ class PairTable:
         )
 
     def t(self, width_um: Array, length_um: Array) -> Array:
-        """(*shape) of the table."""
+        """(*shape) complex t at sizes; beyond the table |t| and phase continue along
+        tangents.
+
+        |t| = |t_end| + Re(change conj(t_end)) / |t_end|, phase = arg t_end + Im(change
+        / t_end), with change = dx ∂t/∂x + dy ∂t/∂y. |t| stays within 1e-3 to 1.
+
+        Args:
+            width_um: (*shape) sizes along x, um.
+            length_um: (*shape) sizes along y, um.
+        """
         x = np.clip(width_um, self.x_um[0], self.x_um[-1])
         y = np.clip(length_um, self.y_um[0], self.y_um[-1])
         value = self._spline(x, y)
         if (x == width_um).all() and (y == length_um).all():
             return value
-        rate = (width_um - x) * self._spline(x, y, dx=1) + (
-            length_um - y
-        ) * self._spline(x, y, dy=1)
-        level = np.clip(
-            np.abs(value) + (rate * value.conj()).real / np.abs(value), _DARKEST, 1.0
-        )
-        return np.asarray(level * np.exp(1j * (np.angle(value) + (rate / value).imag)))
+        by_width = (width_um - x) * self._spline(x, y, dx=1)
+        change = by_width + (length_um - y) * self._spline(x, y, dy=1)
+        level = np.abs(value) + (change * value.conj()).real / np.abs(value)
+        phase = np.angle(value) + (change / value).imag
+        return np.asarray(np.clip(level, _DARKEST, 1.0) * np.exp(1j * phase))
 
     def _spline(self, x_um: Array, y_um: Array, *, dx: int = 0, dy: int = 0) -> Array:
+        """(*shape) complex t, or its derivative of order dx, dy, from both splines."""
         real, imaginary = (part.ev(x_um, y_um, dx=dx, dy=dy) for part in self.parts)
         return np.asarray(real + 1j * imaginary)
 
@@ -92,10 +100,9 @@ class Kinds:
     @classmethod
     def of(cls, diameters: DiameterMap) -> "Kinds":
         """Of a map; pillars of one size have a length of 0."""
-        used, count = np.unique(
-            _keys(diameters, slice(None), slice(None)), return_counts=True
-        )
-        empty = int(used[0] == 0)
+        all_sites = _keys(diameters, slice(None), slice(None))
+        used, count = np.unique(all_sites, return_counts=True)
+        empty = int(used[0] == 0)  # 1 where some site holds no pillar
         keys = used[empty:]
         return cls(
             (keys >> 32) * _ENTRY_UM,
@@ -110,8 +117,13 @@ class Kinds:
         rows: slice = slice(None),
         columns: slice = slice(None),
     ) -> Array:
-        """(y, x) kind of each site, from 0 on; as many as there are kinds where no
-        pillar stands.
+        """(y, x) int32 kind of each site, from 0; the number of kinds where no pillar
+        stands.
+
+        Args:
+            diameters: map of pillars of these kinds.
+            rows: of the map.
+            columns: of the map.
         """
         keys = _keys(diameters, rows, columns)
         return np.where(
@@ -120,7 +132,16 @@ class Kinds:
 
 
 def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
-    """(y, x) whole numbers that tell both sizes of every site; 0 for no pillar."""
+    """(y, x) integer key of both sizes of every site, in steps of 0.05 nm; 0 for no
+    pillar.
+
+    The width is in the upper 32 bits, the length in the lower (0 for one size).
+
+    Args:
+        diameters: map of the pillars.
+        rows: of the map.
+        columns: of the map.
+    """
     width = np.rint(
         np.asarray(diameters.diameter_um[rows])[:, columns] / _ENTRY_UM
     ).astype(np.int64)
@@ -151,20 +172,24 @@ class PairSensitivities:
 
     def at(self, width_um: Array, length_um: Array) -> Array:
         """(pillar-response errors, n) derivatives of ln t."""
-        found = _interpolate_rates(
+        rates = _interpolate_rates(
             (self.width_um, self.length_um), self.rates, (width_um, length_um)
         )
-        return with_missing(list(found))
+        return with_missing(list(rates))
 
 
 def pair_sensitivities(
     lens: Lens, *, count: int = _PAIRS
 ) -> dict[str, PairSensitivities]:
-    """For light along "x" and along "y": derivatives of ln t at up to ``count`` pairs
-    of the lens, far from each other.
+    """Derivatives of ln t at size pairs of the lens, for light along "x" and along "y".
 
-    Exact ones of RCWA at a fixed truncation; between the pairs by radial functions |r -
-    r_j| of both sizes.
+    Up to ``count`` pairs far from one another are solved by RCWA, by central
+    differences at a fixed truncation. Between the pairs: radial functions |r - r_j| of
+    both sizes.
+
+    Args:
+        lens: of pillars of two sizes.
+        count: most pairs that are solved.
 
     Raises:
         CellError, MaterialError: from the solver.
@@ -172,44 +197,64 @@ def pair_sensitivities(
     kinds = Kinds.of(lens.diameters)
     pairs = np.stack([kinds.width_um, kinds.length_um], 1)
     width, length = pairs[_farthest_points(pairs, int(kinds.count.argmax()), count)].T
-    found = pair_rates(lens, width, length)
+    solved = pair_rates(lens, width, length)
     return {
         light: PairSensitivities(
             width,
             length,
-            each.rates,
-            each.error + _held_out_error(width, length, each.rates),
+            rates.rates,
+            rates.error + _held_out_error(width, length, rates.rates),
         )
-        for light, each in found.items()
+        for light, rates in solved.items()
     }
 
 
 def _farthest_points(points: Array, first: int, count: int) -> list[int]:
-    """The first, then always the point that is farthest from all before it."""
+    """Indices of a farthest-point sample: each next point is farthest from all before
+    it.
+
+    Args:
+        points: (n, 2) points.
+        first: index of the first.
+        count: most points.
+    """
     chosen = [first]
-    away = np.linalg.norm(points - points[first], axis=1)
-    while len(chosen) < count and away.max() > 0:
-        chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    distance = np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < count and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(
+            distance, np.linalg.norm(points - points[chosen[-1]], axis=1)
+        )
     return chosen
 
 
 def _interpolate_rates(
     nodes: tuple[Array, Array], rates: Array, places: tuple[Array, Array]
 ) -> Array:
-    """(causes, places) rates between the nodes."""
+    """(causes, places) rates at size pairs, by linear radial basis functions.
+
+    Args:
+        nodes: (n,) widths and lengths that were solved, um.
+        rates: (causes, n) complex rates there.
+        places: (m,) widths and lengths, um.
+    """
     from scipy.interpolate import RBFInterpolator
 
-    return np.asarray(
-        RBFInterpolator(np.stack(nodes, 1), rates.T, kernel="linear", degree=0)(
-            np.stack(places, 1)
-        ).T
+    interpolate = RBFInterpolator(
+        np.stack(nodes, 1), rates.T, kernel="linear", degree=0
     )
+    return np.asarray(interpolate(np.stack(places, 1)).T)
 
 
 def _held_out_error(width_um: Array, length_um: Array, rates: Array) -> float:
-    """Largest rms error over causes, relative, of the second half of the pairs from the
-    first.
+    """Largest relative rms error over causes of rates predicted at held-out pairs.
+
+    The second half of the pairs is predicted from the first half.
+
+    Args:
+        width_um: (n,) sizes along x, um.
+        length_um: (n,) sizes along y, um.
+        rates: (causes, n) complex rates.
     """
     half = (len(width_um) + 1) // 2
     if half == len(width_um):
@@ -220,8 +265,8 @@ def _held_out_error(width_um: Array, length_um: Array, rates: Array) -> float:
         rates[:, fitted],
         (width_um[judged], length_um[judged]),
     )
-    off = np.linalg.norm(predicted - rates[:, judged], axis=1) / np.maximum(
-        np.linalg.norm(rates[:, judged], axis=1), 1e-9
-    )
-    known = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
-    return float((off * known).max())
+    residual = np.linalg.norm(predicted - rates[:, judged], axis=1)
+    scale = np.linalg.norm(rates[:, judged], axis=1)
+    relative = residual / np.maximum(scale, 1e-9)
+    nonzero = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
+    return float((relative * nonzero).max())

@@ -28,35 +28,36 @@ from metalens.view.panels import (
     classes_of,
 )
 
-MOST_SAMPLES = (
-    40_000_000  # float32 values of one figure: 160 MB before they are deflated
-)
+MOST_SAMPLES = 40_000_000  # float32 values of one figure: 160 MB before compression
 
 
 def library_panels(path: Path) -> list[Panel]:
-    """t, r and their error bars over every parameter, with the stretches that
-    resonances take.
+    """Curves of t, r, phase and error bar over the diameter; resonances are shaded.
 
     Args:
-        path: file to read or write.
+        path: of the library.
     """
-    made = libraries.load(path)
+    library = libraries.load(path)
     axes = [
-        SliderAxis("polarisation", list(made.polarization)),
-        SliderAxis("angle", np.degrees(made.angle_rad).tolist(), "deg"),
-        SliderAxis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+        SliderAxis("polarisation", list(library.polarization)),
+        SliderAxis("angle", np.degrees(library.angle_rad).tolist(), "deg"),
+        SliderAxis("wavelength", (1e3 * library.wavelength_um).tolist(), "nm"),
     ]
-    x, error = 1e3 * made.diameter_um, made.t_error
-    phase = np.unwrap(np.angle(made.t), axis=-1)
+    x = 1e3 * library.diameter_um
+    error = library.t_error
+    phase = np.unwrap(np.angle(library.t), axis=-1)
+    relative = error / np.maximum(np.abs(library.t), 1e-12)
+    phase_error = np.arcsin(np.minimum(1, relative))
     bands = [
-        (1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()
+        (1e3 * (diameter - width), 1e3 * (diameter + width))
+        for _, _, _, diameter, width in library.resonances.tolist()
     ]
     return [
         CurvePanel(
             "Transmission of the pillar",
             x,
             "diameter / nm",
-            {"|t|": np.abs(made.t), "|r|": np.abs(made.r)},
+            {"|t|": np.abs(library.t), "|r|": np.abs(library.r)},
             "magnitude",
             axes,
             {"|t|": error, "|r|": error},
@@ -70,12 +71,7 @@ def library_panels(path: Path) -> list[Panel]:
             {"phase": phase / (2 * math.pi)},
             "turns",
             axes,
-            {
-                "phase": np.arcsin(
-                    np.minimum(1, error / np.maximum(np.abs(made.t), 1e-12))
-                )
-                / (2 * math.pi)
-            },
+            {"phase": phase_error / (2 * math.pi)},
             bands,
         ),
         CurvePanel(
@@ -91,37 +87,39 @@ def library_panels(path: Path) -> list[Panel]:
 
 
 def axes_panels(path: Path) -> list[Panel]:
-    """Phase, level and error bar over both sizes; what is left out has phase and level
-    0.
+    """Images of phase, |t| and error bar over both sizes, and a table of held-out
+    pairs.
+
+    Excluded pairs of sizes have phase and |t| 0.
 
     Args:
-        path: file to read or write.
+        path: of the library.
     """
-    made = axes.load(path)
+    library = axes.load(path)
     names = [
         SliderAxis("polarisation", ["x", "y"]),
-        SliderAxis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+        SliderAxis("wavelength", (1e3 * library.wavelength_um).tolist(), "nm"),
     ]
-    own = np.stack([made.t[..., k, k] for k in (0, 1)]).swapaxes(
+    t = np.stack([library.t[..., k, k] for k in (0, 1)]).swapaxes(
         -1, -2
     )  # the size along x runs to the right
-    step = float(made.x_um[1] - made.x_um[0])
-    kept = made.usable.swapaxes(-1, -2)
-    middle = [1e3 * float(v[0] + v[-1]) / 2 for v in (made.x_um, made.y_um)]
+    step = float(library.x_um[1] - library.x_um[0])
+    usable = library.usable.swapaxes(-1, -2)
+    middle = [1e3 * float(v[0] + v[-1]) / 2 for v in (library.x_um, library.y_um)]
     words = (
         f"Along x the size along x, along y that along y, from their middles ({middle[0]:.4g} and {middle[1]:.4g} nm); "
-        f"{1 - made.usable.mean():.1%} is left out (error bars above {made.sweep.bar:g})."
+        f"{1 - library.usable.mean():.1%} is left out (error bars above {library.sweep.bar:g})."
     )
-    turns = np.where(kept, np.angle(own) / (2 * math.pi) % 1, 0.0)
-    held = [tuple(row) for row in (made.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]
+    turns = np.where(usable, np.angle(t) / (2 * math.pi) % 1, 0.0)
+    held_out = [tuple(row) for row in (library.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]
     return [
         ImagePanel("Phase", turns, names, step, "turns", words),
         ImagePanel(
-            "Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words
+            "Level", np.where(usable, np.abs(t), 0.0), names, step, "|t|", words
         ),
         ImagePanel(
             "Error bar",
-            made.t_error.swapaxes(-1, -2),
+            library.t_error.swapaxes(-1, -2),
             names[1:],
             step,
             "|t - exact| at most",
@@ -136,16 +134,16 @@ def axes_panels(path: Path) -> list[Panel]:
                 "error of the interpolation",
                 "error bar",
             ),
-            held,
+            held_out,
         ),
     ]
 
 
 def lens_panels(path: Path) -> list[Panel]:
-    """Every pillar, and what it does to the light.
+    """A map of every pillar with its phase and |T|, and the phase along the middle row.
 
     Args:
-        path: file to read or write.
+        path: of the lens.
     """
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
@@ -176,12 +174,12 @@ def lens_panels(path: Path) -> list[Panel]:
 
 
 def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
-    """Phase along the middle row."""
+    """Phase modulo one turn along the middle row of pillars."""
     middle = diameter[len(diameter) // 2]
-    held = middle > 0
+    pillars = middle > 0
     phase = lens.phase_rad()[len(diameter) // 2]
-    x = lens.diameters.x_um[held]
-    wrapped = (phase[held] / (2 * math.pi)) % 1
+    x = lens.diameters.x_um[pillars]
+    wrapped = (phase[pillars] / (2 * math.pi)) % 1
     return CurvePanel(
         "Phase along the middle row",
         x,
@@ -192,21 +190,22 @@ def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
 
 
 def psf_panels(path: Path) -> list[Panel]:
-    """PSFs with sliders over all that they depend on, and the error by cause.
+    """PSFs with sliders over angle, depth and so on, and the error by cause.
 
     Args:
-        path: file to read or write.
+        path: of the PSFs.
     """
     stack = psf.load(path)
     return [*_psfs([stack], [path.stem]), _budgets([stack], ["error"])]
 
 
 def lights_panels(path: Path) -> list[Panel]:
-    """The PSF files of a folder, a slider over them: one lens in light of several
-    wavelengths or polarisations.
+    """PSFs of all files of a folder with a slider over the files.
+
+    One lens in light of several wavelengths or polarisations.
 
     Args:
-        path: file to read or write.
+        path: of the folder.
 
     Raises:
         StoreError: a file that is no PSF stack, or of other depths, angles or samples
@@ -240,31 +239,38 @@ def _light(stack: psf.PsfStack) -> str:
 
 
 def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
-    """Stacks on one grid, with a slider over them where there are several."""
+    """Images of PSF stacks on one grid, and their peak and energy over depth.
+
+    A slider over the stacks where there are several. Of large stacks every n-th depth
+    is shown.
+
+    Args:
+        stacks: of equal shape.
+        lights: name of each.
+    """
     first = stacks[0]
-    some = slice(
+    shown = slice(
         None, None, math.ceil(len(stacks) * first.intensity.size / MOST_SAMPLES)
     )  # of the depths
     values = np.stack(
-        [np.asarray(stack.intensity)[..., some, :, :] for stack in stacks]
+        [np.asarray(stack.intensity)[..., shown, :, :] for stack in stacks]
     )
-    energy = np.stack([np.asarray(stack.energy_um2)[..., some] for stack in stacks])
-    depth = 1e-3 * first.depths_um[some]
-    names = [SliderAxis("depth", depth.tolist(), "mm")]
+    energy = np.stack([np.asarray(stack.energy_um2)[..., shown] for stack in stacks])
+    depth = 1e-3 * first.depths_um[shown]
+    sliders = [SliderAxis("depth", depth.tolist(), "mm")]
     if values.ndim >= 5:
-        names.insert(
+        sliders.insert(
             0, SliderAxis("field angle", [_angle(pair) for pair in first.angles_rad])
         )
-    while values.ndim - 3 > len(names):
-        names.insert(
-            0,
-            SliderAxis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))),
-        )
+    while values.ndim - 3 > len(sliders):
+        count = values.shape[values.ndim - 3 - len(sliders)]
+        sliders.insert(0, SliderAxis("lens", list(range(count))))
     if len(stacks) > 1:
-        names.insert(0, SliderAxis("light", lights))
+        sliders.insert(0, SliderAxis("light", lights))
     else:
         values, energy = values[0], energy[0]
-    peak, names = float(values.max()), at_brightest(names, values)
+    peak = float(values.max())
+    sliders = at_brightest(sliders, values)
     lines = {
         "peak": values.max(axis=(-2, -1)) / peak,
         "light in the window": energy / energy.max(),
@@ -274,66 +280,77 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
         ImagePanel(
             "Point spread function",
             values / peak,
-            names,
+            sliders,
             first.step_um,
             "of the highest peak",
             f"Samples of {first.step_um:g} um; stated relative error {worst.error:.1e} ({worst.reason}).",
             optics=True,
         ),
         CurvePanel(
-            "Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]
+            "Over depth", depth, "depth / mm", lines, "of the largest", sliders[:-1]
         ),
     ]
 
 
 def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
-    """The error of the PSFs by cause; what is not known of a cause is a dash."""
-    held = [dataclasses.asdict(stack.budget) for stack in stacks]
+    """Table of the relative L2 error of the PSFs by cause, one column for every stack.
+
+    A dash where the error by a cause is not known.
+
+    Args:
+        stacks: with their error budgets.
+        names: of the columns.
+    """
+    budgets = [dataclasses.asdict(stack.budget) for stack in stacks]
     rows = [
         (
             report.in_words(cause),
-            *("–" if math.isnan(one[cause]) else one[cause] for one in held),
+            *(
+                "–" if math.isnan(budget[cause]) else budget[cause]
+                for budget in budgets
+            ),
         )
-        for cause in held[0]
+        for cause in budgets[0]
     ]
     words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
     return TablePanel("Budget of the error", ("cause", *names), rows, words)
 
 
 def far_field_panels(path: Path) -> list[Panel]:
-    """Light over direction cosines, what cones about the axis hold, and the beams.
+    """Image of the light over direction cosines, its share within cones, table of
+    beams.
 
     Args:
-        path: file to read or write.
+        path: of the far field.
     """
     stored = store.load(path, "far-field")
-    held, about = stored.arrays, stored.attributes
-    share = np.asarray(held["share"], float)
-    sine = np.asarray(held["sine"])
-    angles = held["angles_deg"]
+    arrays, attributes = stored.arrays, stored.attributes
+    share = np.asarray(arrays["share"], float)
+    sine = np.asarray(arrays["sine"])
+    angles = arrays["angles_deg"]
     step = float(sine[1] - sine[0])
-    names = [SliderAxis("light from", [_degrees(pair) for pair in angles])]
+    sliders = [SliderAxis("light from", [_degrees(pair) for pair in angles])]
     edges = np.degrees(
-        np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1)))
+        np.arcsin(np.minimum(1.0, step * np.arange(1, arrays["rings"].shape[-1] + 1)))
     )
     beams = [
         (_degrees(angles[int(i)]), x, y, part)
-        for i, x, y, part in held["beams"].tolist()
+        for i, x, y, part in arrays["beams"].tolist()
     ]
     words = (
-        f"Direction cosines along x and y of light of {1e3 * float(about['wavelength_um']):g} nm, in squares "
-        f"{step:.3g} wide; relative error {float(np.max(held['error'])):.1e}."
+        f"Direction cosines along x and y of light of {1e3 * float(attributes['wavelength_um']):g} nm, in squares "
+        f"{step:.3g} wide; relative error {float(np.max(arrays['error'])):.1e}."
     )
     passed = ", ".join(
         f"{_degrees(pair)}: {part:.3f}"
-        for pair, part in zip(angles, held["transmitted"], strict=True)
+        for pair, part in zip(angles, arrays["transmitted"], strict=True)
     )
-    cone = {"share": np.cumsum(held["rings"], axis=-1)}
+    cone = {"share": np.cumsum(arrays["rings"], axis=-1)}
     return [
         ImagePanel(
             "Far field",
             share / share.max(),
-            names,
+            sliders,
             step,
             "of the brightest",
             words,
@@ -345,7 +362,7 @@ def far_field_panels(path: Path) -> list[Panel]:
             "angle / deg",
             cone,
             "share of the light that passes",
-            names,
+            sliders,
         ),
         TablePanel(
             "Beams",
@@ -357,49 +374,49 @@ def far_field_panels(path: Path) -> list[Panel]:
 
 
 def near_field_panels(path: Path) -> list[Panel]:
-    """Both cuts and the maps of a pillar's field: |E|, |H| and the parts of E, and the refractive index.
+    """Images of |E|, |H|, the components of E and the index, on both cuts and the maps.
 
     Args:
-        path: file to read or write.
+        path: of the near field.
     """
     stored = store.load(path, "near-field")
-    held, about = stored.arrays, stored.attributes
-    step = float(about["step_um"])
-    heights = SliderAxis("height", (1e3 * held["heights_um"]).tolist(), "nm")
-    out: list[Panel] = []
+    arrays, attributes = stored.arrays, stored.attributes
+    step = float(attributes["step_um"])
+    heights = SliderAxis("height", (1e3 * arrays["heights_um"]).tolist(), "nm")
+    panels: list[Panel] = []
     for name, title in (
         ("xz", "Along x and z"),
         ("yz", "Along y and z"),
         ("xy", "Across, along x and y"),
     ):
-        e, h = np.abs(held[f"{name}/e"]), np.abs(held[f"{name}/h"])
-        shown = np.stack(
+        e, h = np.abs(arrays[f"{name}/e"]), np.abs(arrays[f"{name}/h"])
+        parts_of_field = np.stack(
             [
                 np.sqrt((e**2).sum(axis=0)),
                 *e,
                 np.sqrt((h**2).sum(axis=0)),
-                held[f"{name}/index"].real,
+                arrays[f"{name}/index"].real,
             ]
         )
-        up = shown if name == "xy" else shown[..., ::-1, :]
+        upright = parts_of_field if name == "xy" else parts_of_field[..., ::-1, :]
         parts = SliderAxis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
         words = (
-            f"For light of {1e3 * float(about['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance "
-            f"of vacuum); relative error {float(about[f'error_{name}']):.1e} (root mean square)."
+            f"For light of {1e3 * float(attributes['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance "
+            f"of vacuum); relative error {float(attributes[f'error_{name}']):.1e} (root mean square)."
         )
         if name != "xy":
-            words += f" Light goes upwards; z from {held['z_um'][0]:.4g} to {held['z_um'][-1]:.4g} um, 0 at the foot."
-        out.append(
+            words += f" Light goes upwards; z from {arrays['z_um'][0]:.4g} to {arrays['z_um'][-1]:.4g} um, 0 at the foot."
+        panels.append(
             ImagePanel(
                 title,
-                up,
+                upright,
                 [parts, heights] if name == "xy" else [parts],
                 step,
                 "",
                 words,
             )
         )
-    return out
+    return panels
 
 
 def _angle(pair: Array) -> str:
@@ -412,13 +429,15 @@ def _degrees(pair: Array) -> str:
 
 
 def plain_panels(path: Path) -> list[Panel]:
-    """Any artefact: its arrays as images or curves, its attributes as a table.
+    """Arrays of any artefact as images or curves, and its attributes as a table.
+
+    Images for arrays of 8 by 8 or more, curves for (n,) of 8 or more.
 
     Args:
-        path: file to read or write.
+        path: of the artefact.
     """
     stored = store.load(path)
-    out: list[Panel] = []
+    panels: list[Panel] = []
     for name, array in sorted(stored.arrays.items()):
         if (
             array.dtype.kind not in "fiu"
@@ -431,7 +450,7 @@ def plain_panels(path: Path) -> list[Panel]:
                 SliderAxis(f"axis {i}", list(range(n)))
                 for i, n in enumerate(array.shape[:-2])
             ]
-            out.append(
+            panels.append(
                 ImagePanel(
                     name,
                     _finite(array),
@@ -442,7 +461,7 @@ def plain_panels(path: Path) -> list[Panel]:
                 )
             )
         elif array.ndim == 1 and len(array) >= 8:
-            out.append(
+            panels.append(
                 CurvePanel(
                     name, np.arange(len(array)), "index", {name: _finite(array)}, ""
                 )
@@ -452,7 +471,7 @@ def plain_panels(path: Path) -> list[Panel]:
         (name, f"{a.dtype} {tuple(a.shape)}")
         for name, a in sorted(stored.arrays.items())
     ]
-    return [*out, TablePanel("Content", ("name", "value"), rows)]
+    return [*panels, TablePanel("Content", ("name", "value"), rows)]
 
 
 def _finite(array: Array) -> Array:

@@ -37,9 +37,10 @@ def write_page(
     """Write the page.
 
     Args:
-        path: file to read or write.
-        title: file and kind. panels: in order. about: header and provenance, shown at
-            the end.
+        path: of the page.
+        title: file and kind.
+        panels: in order.
+        about: header and provenance, shown at the end.
 
     Raises:
         OSError: the target cannot be written.
@@ -50,7 +51,13 @@ def write_page(
 def page_html(
     title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None
 ) -> str:
-    """The page as text; no address in it leads out of the file."""
+    """The page as HTML text, without references outside the file.
+
+    Args:
+        title: file and kind.
+        panels: in order.
+        about: header and provenance, shown at the end.
+    """
     from jinja2 import Environment
 
     content = {
@@ -86,19 +93,20 @@ _PACKED: dict[type, tuple[str, ...]] = {
 
 
 def _plain(value: Any) -> Any:
-    """A panel, or a part of one, as JSON has it: records by their fields, maps of
-    classes packed.
+    """A panel, or a part of one, as JSON has it.
+
+    Records become dictionaries of their fields with their type; 2-D arrays and the
+    fields of :data:`_PACKED` are packed.
     """
     if isinstance(value, OutlinePanel):
         return _outline(value)
     if dataclasses.is_dataclass(value):
         packed = _PACKED.get(type(value), ())
-        return {"type": type(value).__name__} | {
-            field.name: (_packed if field.name in packed else _plain)(
-                getattr(value, field.name)
-            )
-            for field in dataclasses.fields(value)
-        }
+        content: dict[str, Any] = {"type": type(value).__name__}
+        for field in dataclasses.fields(value):
+            encode = _packed if field.name in packed else _plain
+            content[field.name] = encode(getattr(value, field.name))
+        return content
     if isinstance(value, Mapping):
         return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, np.ndarray) and value.ndim == 2:
@@ -109,14 +117,16 @@ def _plain(value: Any) -> Any:
 
 
 def _packed(value: Any) -> dict[str, Any]:
+    """Arrays packed in single precision, by name where there are several."""
     if isinstance(value, Mapping):
         return {name: _packed(part) for name, part in value.items()}
     return pack_array(np.asarray(value, np.float32))
 
 
 def _outline(outline: OutlinePanel) -> dict[str, Any]:
-    """Places by rising y, then x, as steps: those of a lattice repeat and deflate to a
-    fraction of a byte.
+    """A polygon and its copies as JSON has it, places as steps by rising y, then x.
+
+    Steps of a lattice repeat, so that they deflate to a fraction of a byte.
     """
     places = outline.places[np.lexsort((outline.places[:, 0], outline.places[:, 1]))]
     steps = np.diff(places, axis=0, prepend=np.zeros((1, 2), places.dtype))

@@ -21,12 +21,12 @@ from metalens.design.free_form.settings import ResolvedFisherSettings, between_m
 from metalens.image import Field, Pupil
 from metalens.image import pupil as pupils
 
-# foci that simple lenses are tuned over: shares of the range of depths in 1/z, from its
-# near end
-FOCI, HELIX_FOCI = (-0.87, 1.77), (-0.37, 1.21)
-ZONES = (1, 2, 3, 4, 5, 6)
-SHOWN = 3  # times as wide as a PSF in the picture is the window
-STRIP = 6  # depths of them
+# range of foci of the simple lenses: shares of the depth range in 1/z, 0 the near end
+FOCI = (-0.87, 1.77)  # of the hyperbolic lens
+HELIX_FOCI = (-0.37, 1.21)  # of the double helix
+ZONES = (1, 2, 3, 4, 5, 6)  # of the double helix
+SHOWN = 3  # width of the window over that of a PSF in the picture
+STRIP = 6  # depths of the PSFs in the picture
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,16 +52,15 @@ class JudgedLens:
 def judge_designs(
     made: FisherPhase, pupil: Pupil, settings: ResolvedFisherSettings
 ) -> tuple[JudgedLens, ...]:
-    """The design, and the best hyperbolic lens and double helix for the same pixels,
-    depths and angles.
+    """Figures of the design and of the best hyperbolic lens and double helix.
+
+    All for the same pixels, depths and angles, at 11 depths, averaged over positions of
+    the pixels.
 
     Args:
         made: the designed phase.
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
-
-    Returns:
-        Scores at 11 depths, averaged over positions of the pixels.
     """
     phase = phase_on(pupil, made)
     score = _score(phase, made.focus_um, pupil, settings)
@@ -86,7 +85,7 @@ def tune_baselines(
 def _score(
     phase: Tensor, focus_um: float, pupil: Pupil, settings: ResolvedFisherSettings
 ) -> DesignScore:
-    """Over (angles, depths), also of one angle."""
+    """Figures of a phase, of shape (angles, depths) for one angle too."""
     score = score_phase(phase, pupil, focus_um=focus_um, settings=settings)
     rows = len(settings.angles_deg), -1
     return DesignScore(score.information.reshape(rows), score.encircled.reshape(rows))
@@ -100,8 +99,17 @@ def _tune(
     *,
     count: int,
 ) -> JudgedLens:
-    """Most informative simple lens over zones (0: hyperbolic) and focus: a scan at equal
-    steps of 1/z, then twice a finer one around the best.
+    """Most informative simple lens over zones and focus.
+
+    For each number of zones: a scan at equal steps of 1/z, then two refinements at half
+    the step on both sides of the best.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+        zones: numbers of zones of the double helix; 0 for the hyperbolic lens.
+        shares: range of the focus as shares of the depth range in 1/z.
+        count: foci of the scan.
     """
     near, far = settings.depths_mm
     low, high = between_mm((1e3 * near, 1e3 * far), *shares)
@@ -114,7 +122,7 @@ def _tune(
         kind = f"helix of {rings} zone{'s' * (rings > 1)}" if rings else "hyperbolic"
         return JudgedLens(f"{kind}, {focus_mm:.1f} mm", phase, focus_um, score, rings)
 
-    tried: list[JudgedLens] = []
+    candidates: list[JudgedLens] = []
     for rings in zones:
         step = (1 / low - 1 / high) / (count - 1)
         inverse = np.linspace(1 / low, 1 / high, count).tolist()
@@ -124,8 +132,8 @@ def _tune(
             step /= 2
             foci = [1 / (1e3 / best.focus_um + side * step) for side in (-1, 1)]
             lenses += [judge(rings, focus) for focus in foci if low <= focus <= high]
-        tried += lenses
-    return max(tried, key=lambda lens: lens.information)
+        candidates += lenses
+    return max(candidates, key=lambda lens: lens.information)
 
 
 def report_values(
@@ -159,10 +167,10 @@ def report_values(
 def report_picture(
     lenses: tuple[JudgedLens, ...], pupil: Pupil, settings: ResolvedFisherSettings
 ) -> bytes:
-    """Information and energy over depth at the first angle, and PSFs of the lenses
-    through the range.
+    """PNG of information and energy over depth at the first angle, and PSFs over depth.
 
     Args:
+        lenses: judged designs.
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
     """
@@ -216,4 +224,5 @@ def report_picture(
 
 
 def _depths(lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings) -> Any:
+    """Depths in mm of the figures."""
     return np.linspace(*settings.depths_mm, lenses[0].score.information.shape[1])

@@ -26,25 +26,21 @@ from metalens.image import pupil as pupils
 RATE = 0.15  # first step of Adam, rad
 NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
-CHECKS = 20  # iterations between two honest looks
-CLIMB_IMAGES = (
-    4  # of a step, at least two an angle: more noise, but more steps in the same time
-)
-DIRECTIONS = 4  # of the field, that the steps draw from
-STILL = torch.tensor(
-    [[-0.25, 0.25], [0.25, -0.25]]
-)  # positions of the pixels where nothing is drawn
+CHECKS = 20  # iterations between two evaluations of the deterministic figures
+CLIMB_IMAGES = 4  # images of a gradient step, at least two for every field angle
+DIRECTIONS = 4  # azimuths of the field from which the steps draw
+# (y, x) positions of the pixel grid, in pixels, where nothing is random
+STILL = torch.tensor([[-0.25, 0.25], [0.25, -0.25]])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DesignScore:
-    """Honest figures of a phase on the quick pupil model.
+    """Figures of a phase on the quick pupil model.
 
-    information: (depths,) I(z) per mm², averaged over sub-pixel positions, with several
-    field angles (angles, depths);
-        minus Eq. 6 (one value) for scenes.
+    information: (depths,), with several field angles (angles, depths), I(z) per mm²
+        averaged over sub-pixel positions; minus Eq. 6 (one value) for scenes.
     encircled: of the same shape (for scenes at their depths), share of the light
-    through the aperture in the radius.
+        through the aperture in the radius.
     """
 
     information: Tensor
@@ -52,22 +48,31 @@ class DesignScore:
 
 
 class Objective(Protocol):
-    """Something to climb."""
+    """An objective of the gradient ascent."""
 
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Loss and encircled energy at some depths; without a generator the same
-        function at every call.
+        """Loss, and encircled energy at some depths.
+
+        Without a generator the same function at every call.
+
+        Args:
+            phase_rad: (nodes, nodes) phase without its focus, rad.
+            focus_um: source distance of the hyperbolic part, um.
+            generator: of random depths, fields and positions.
         """
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """Honest figures."""
+        """Figures of a phase without randomness."""
 
 
 class AxialObjective:
-    """Minus the log of I(z) at random depths, field directions and positions of the
-    pixels; equally for every angle.
+    """Minus the log of the axial information I(z), averaged over depths and pixel
+    positions.
+
+    The mean is over random depths, azimuths of the field and positions of the pixel
+    grid; every field angle has the same weight.
     """
 
     def __init__(self, pupil: Pupil, settings: ResolvedFisherSettings) -> None:
@@ -76,9 +81,18 @@ class AxialObjective:
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """See :class:`Objective`."""
+        """Loss and encircled energy at some depths, see :class:`Objective`.
+
+        With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
+        log(mean I), I per mm² of the images, the means over depths.
+
+        Args:
+            phase_rad: (nodes, nodes) phase without its focus, rad.
+            focus_um: source distance of the hyperbolic part, um.
+            generator: of random depths, fields and positions; None for fixed ones.
+        """
         settings = self.settings
-        depths, fields, positions = self._drawn(generator)
+        depths, fields, positions = self._sample_views(generator)
         near, far = _stacks(
             phase_rad,
             self.pupil,
@@ -89,37 +103,37 @@ class AxialObjective:
             settings.climb_window_um,
         )
         total = phase_rad.new_zeros(())
+        options = _information_options(settings)
         for y, x in (positions * settings.pixel_um).tolist():
-            value = pixel_information(near, far, shift_um=(y, x), **_counted(settings))
+            value = pixel_information(near, far, shift_um=(y, x), **options)
             value = value.reshape(-1, len(settings.angles_deg))
-            spread = torch.log(value + 1e-4).mean()
-            mean = torch.log(value.mean(0) + 1e-4).mean()
-            total = total - (settings.even * spread + (1 - settings.even) * mean) / len(
-                positions
-            )
-        return total, encircled_energy(
+            mean_log = torch.log(value + 1e-4).mean()
+            log_mean = torch.log(value.mean(0) + 1e-4).mean()
+            gain = settings.even * mean_log + (1 - settings.even) * log_mean
+            total = total - gain / len(positions)
+        energy = encircled_energy(
             near, settings.sample_um, radius_um=settings.radius_um
         )
+        return total, energy
 
-    def _drawn(
+    def _sample_views(
         self, generator: torch.Generator | None
     ) -> tuple[Tensor, list[Field], Tensor]:
-        """Depths and fields (angles in turn) of the images, and positions of the
-        pixels.
+        """Source depths, fields and pixel positions of one step.
+
+        Without a generator: 7 even depths at every angle, no randomness. Otherwise
+        depths are stratified over the range, azimuths are multiples of 90 degrees.
+
+        Returns:
+            (images,) depths in um, as many fields with the angles in turn, and (2, 2)
+            positions (y, x) of the pixel grid in pixels.
         """
-        angles, (low, high) = (
-            self.settings.angles_deg,
-            (1e3 * d for d in self.settings.depths_mm),
-        )
+        angles = self.settings.angles_deg
+        low, high = (1e3 * d for d in self.settings.depths_mm)
         if generator is None:
-            depths = torch.linspace(
-                low, high, 7, dtype=torch.float64
-            ).repeat_interleave(len(angles))
-            return (
-                depths,
-                [Field(math.radians(a)) for _ in range(7) for a in angles],
-                STILL,
-            )
+            depths = torch.linspace(low, high, 7, dtype=torch.float64)
+            fields = [Field(math.radians(a)) for _ in range(7) for a in angles]
+            return depths.repeat_interleave(len(angles)), fields, STILL
         count = max(2, math.ceil(CLIMB_IMAGES / len(angles))) * len(angles)
         strata = torch.randperm(count, generator=generator) + torch.rand(
             count, generator=generator
@@ -147,55 +161,50 @@ def score_phase(
     settings: ResolvedFisherSettings,
     depths: int = 11,
 ) -> DesignScore:
-    """Information and encircled energy of a phase on the pupil's nodes, at ``depths``
-    depths of the range.
+    """Axial information (per mm²) and encircled energy of a phase over the depth range.
 
-    Off axis in the directions of +x and +y: mean information, least energy.
+    Off axis, mean information and least energy of the azimuths +x and +y. The figures
+    have shape (depths,), with several field angles (angles, depths).
 
     Args:
-        phase_rad: phase, rad.
+        phase_rad: (nodes, nodes) phase on the pupil without its focus, rad.
+        pupil: sampled pupil of the lens.
         focus_um: source distance in focus, um.
         settings: resolved settings of the design.
+        depths: number of even depths over ``settings.depths_mm``.
     """
     low, high = (1e3 * d for d in settings.depths_mm)
-    where = torch.linspace(low, high, depths, dtype=torch.float64)
+    depths_um = torch.linspace(low, high, depths, dtype=torch.float64)
+    phase = phase_rad.detach()
+    width = settings.window_um
+    options = _information_options(settings)
     values, energies = [], []
     for angle in settings.angles_deg:
-        seen = []
+        information, encircled = [], []
         for turn in (0.0, 0.25) if angle > 0 else (0.0,):
             fields = [_field(angle, turn)] * depths
             near, far = _stacks(
-                phase_rad.detach(),
-                pupil,
-                focus_um,
-                where,
-                fields,
-                settings,
-                settings.window_um,
+                phase, pupil, focus_um, depths_um, fields, settings, width
             )
-            value = axial_information(near, far, **_counted(settings))
-            seen.append(
-                (
-                    value,
-                    encircled_energy(
-                        near, settings.sample_um, radius_um=settings.radius_um
-                    ),
-                )
+            information.append(axial_information(near, far, **options))
+            encircled.append(
+                encircled_energy(near, settings.sample_um, radius_um=settings.radius_um)
             )
-        values.append(torch.stack([value for value, _ in seen]).mean(0))
-        energies.append(torch.stack([energy for _, energy in seen]).amin(0))
+        values.append(torch.stack(information).mean(0))
+        energies.append(torch.stack(encircled).amin(0))
     if len(values) == 1:
         return DesignScore(values[0], energies[0])
     return DesignScore(torch.stack(values), torch.stack(energies))
 
 
-def _counted(settings: ResolvedFisherSettings) -> dict[str, Any]:
-    """How Eq. 11 counts, as arguments."""
+def _information_options(settings: ResolvedFisherSettings) -> dict[str, Any]:
+    """Arguments of the information of Eq. 11: lengths in um, and the normalisation."""
     return {"step_um": settings.step_um, "sample_um": settings.sample_um, "pixel_um": settings.pixel_um,
             "normalisation": settings.normalisation}  # fmt: skip
 
 
 def _field(angle_deg: float, turn: float) -> Field:
+    """Field at an angle in degrees and an azimuth in turns (0 on the axis)."""
     return Field(math.radians(angle_deg), 2 * math.pi * turn if angle_deg > 0 else 0.0)
 
 
@@ -208,6 +217,17 @@ def _stacks(
     settings: ResolvedFisherSettings,
     window_um: float,
 ) -> tuple[Tensor, Tensor]:
+    """PSFs (n, y, x) at source depths, and at depths larger by ``settings.step_um``.
+
+    Args:
+        phase_rad: (nodes, nodes) phase on the pupil without its focus, rad.
+        pupil: sampled pupil of the lens.
+        focus_um: source distance in focus, um.
+        depths_um: (n,) source depths, um.
+        fields: field of every depth.
+        settings: resolved settings of the design.
+        window_um: width of the PSFs, at most the period of the pupil's grid.
+    """
     sample = settings.sample_um
     samples = int(min(window_um, pupil.period_um) / sample)
     both = torch.cat([depths_um, depths_um + settings.step_um])
@@ -218,15 +238,17 @@ def _stacks(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FisherPhase:
-    """A designed phase.
+    """A designed free-form phase.
 
     controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every
-    node of the pupil.
+        node of the pupil.
     focus_um: source distance of the hyperbolic part.
     zones: rings of the double helix below, 0 for none.
-    score: of this phase. starts: (information, least encircled energy) that each start
-    reached.
-    converged: whether the encircled energy is kept at every depth. reason: in words.
+    cells: whether the controls are one value for every node.
+    score: of this phase.
+    starts: (information, least encircled energy) of each start.
+    converged: whether the encircled energy is kept at every depth.
+    reason: in words.
     """
 
     controls: Tensor
@@ -246,34 +268,44 @@ def fisher_profile(
     settings: FisherSettings | None = None,
     objective: Objective | None = None,
 ) -> tuple[PhaseOf, FisherPhase]:
-    """The whole lens phase (focus and free form) as a function of position, and how it
-    was found.
+    """The whole lens phase in rad, focus and free form, as a function of position.
 
-    ``focus.source_distance_um`` is used where the settings leave depths and foci to the
-    lens.
+    phase(x, y) = hyperbolic phase + free form + vortices of the double helix.
 
     Args:
+        focus: source and sensor distances; its source distance is used where the
+            settings leave depths and foci to the lens.
         radius_um: radius of the aperture, um.
+        settings: of the search; None for the defaults.
+        objective: in place of the axial information.
+
+    Returns:
+        The phase of x (columns,) and y (rows,) in um, and the designed phase.
     """
-    asked = (settings or FisherSettings()).about(focus, radius_um)
-    pupil = design_pupil(focus, radius_um, asked)
-    found = optimize_free_form(pupil, asked, objective=objective)
-    base = replace(focus, source_distance_um=found.focus_um)
-    extra = free_form(found.controls.numpy(), pupil, cells=found.cells)
+    resolved = (settings or FisherSettings()).about(focus, radius_um)
+    pupil = design_pupil(focus, radius_um, resolved)
+    design = optimize_free_form(pupil, resolved, objective=objective)
+    base = replace(focus, source_distance_um=design.focus_um)
+    extra = free_form(design.controls.numpy(), pupil, cells=design.cells)
 
     def phase(x_um: Array, y_um: Array) -> Array:
         smooth = hyperbolic_phase(x_um, y_um[:, None], base) + extra(x_um, y_um)
         return np.asarray(
             smooth
-            + vortex_phase(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones)
+            + vortex_phase(x_um, y_um[:, None], radius_um=radius_um, zones=design.zones)
         )
 
-    return phase, found
+    return phase, design
 
 
 def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
-    """The free-form part as a function of position: a spline of its controls, or one
-    value a node of the pupil.
+    """The free-form phase in rad as a function of x and y in um.
+
+    Args:
+        controls: (n, n) B-spline coefficients over the aperture, rad; with ``cells``
+            the phase of every node of the pupil, which the nearest node gives.
+        pupil: sampled pupil of the lens, its nodes even in direction cosine.
+        cells: whether the controls are one value for every node.
     """
 
     def smooth(x_um: Array, y_um: Array) -> Array:
@@ -320,15 +352,20 @@ def optimize_free_form(
     *,
     objective: Objective | None = None,
 ) -> FisherPhase:
-    """Best of several starts; deterministic for a seed.
+    """Free-form phase of most information: the best of several starts of gradient
+    ascent.
+
+    Starts that keep the encircled energy come before all others. The starts' foci are
+    spread evenly over ``settings.focus_mm``. Deterministic for a seed.
 
     Args:
         pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
         objective: by default the axial information; :mod:`codesign.evaluate.scenes` has
             Eq. 6 on scenes.
 
     Raises:
-        ConfigError: the settings ask for scenes and no such objective is given.
+        ConfigError: scenes in the settings, without their objective.
     """
     if objective is None:
         if settings.objective != "axial":
@@ -337,7 +374,7 @@ def optimize_free_form(
             )
         objective = AxialObjective(pupil, settings)
     best: FisherPhase | None = None
-    reached = []
+    figures = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
         focus = 1e3 * (
@@ -345,18 +382,18 @@ def optimize_free_form(
         )
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
         zones = settings.zones[start % len(settings.zones)]
-        made = _climb(pupil, settings, objective, focus, zones, generator)
-        information = float(made.score.information.mean())
-        least = float(made.score.encircled.min())
-        reached.append((information, least))
-        if best is None or (made.converged, information) > (
+        result = _climb(pupil, settings, objective, focus, zones, generator)
+        information = float(result.score.information.mean())
+        least = float(result.score.encircled.min())
+        figures.append((information, least))
+        if best is None or (result.converged, information) > (
             best.converged,
             float(best.score.information.mean()),
         ):
-            best = made
+            best = result
     if best is None:
         raise ConfigError("no start was tried")
-    return replace(best, starts=tuple(reached))
+    return replace(best, starts=tuple(figures))
 
 
 def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
@@ -386,29 +423,31 @@ def vortex_phase(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> A
 
 
 def bspline_weights(position: Array, count: int) -> Array:
-    """(n, count) cubic B-spline weights of positions in [-1, 1] (held at the ends),
-    uniform knots.
+    """(n, count) weights of uniform cubic B-splines at positions in [-1, 1].
+
+    Positions beyond the ends take the weights of the end. Every row sums to 1.
 
     Args:
-        position: places in units of the control points.
+        position: (n,) positions over the aperture radius.
+        count: number of control points, 4 or more.
     """
-    place = (np.clip(position, -1, 1) + 1) / 2 * (count - 3)
-    first = np.clip(np.floor(place).astype(int), 0, count - 4)
-    t = place - first
-    parts = (
-        (1 - t) ** 3,
-        3 * t**3 - 6 * t**2 + 4,
-        -3 * t**3 + 3 * t**2 + 3 * t + 1,
-        t**3,
+    scaled = (np.clip(position, -1, 1) + 1) / 2 * (count - 3)
+    first = np.clip(np.floor(scaled).astype(int), 0, count - 4)
+    u = scaled - first
+    cubics = (
+        (1 - u) ** 3,
+        3 * u**3 - 6 * u**2 + 4,
+        -3 * u**3 + 3 * u**2 + 3 * u + 1,
+        u**3,
     )
     weights = np.zeros((len(position), count))
-    for k, part in enumerate(parts):
-        weights[np.arange(len(position)), first + k] = part / 6
+    for k, cubic in enumerate(cubics):
+        weights[np.arange(len(position)), first + k] = cubic / 6
     return weights
 
 
 class _Best:
-    """The best iterate seen: first whether it keeps the energy, then its information."""
+    """The best iterate: first whether it keeps the energy, then its information."""
 
     def __init__(
         self, objective: Objective, settings: ResolvedFisherSettings, focus_um: float
@@ -418,14 +457,23 @@ class _Best:
         self.controls: Tensor | None = None
         self.score: DesignScore | None = None
 
-    def look(self, controls: Tensor, phase: Tensor) -> float:
-        """Judge an iterate; returns the energy that is to spare."""
-        seen = self.objective.judge(phase.detach(), self.focus_um)
-        spare = float(seen.encircled.min()) - self.settings.encircled
-        rank = (spare >= -5e-4, float(seen.information.mean()))
+    def update(self, controls: Tensor, phase: Tensor) -> float:
+        """Judge an iterate and keep it if best; least encircled energy minus the bound.
+
+        Args:
+            controls: of the last grid.
+            phase: (nodes, nodes) phase of these, rad.
+        """
+        score = self.objective.judge(phase.detach(), self.focus_um)
+        margin = float(score.encircled.min()) - self.settings.encircled
+        rank = (margin >= -5e-4, float(score.information.mean()))
         if self.controls is None or rank > self.rank:
-            self.rank, self.controls, self.score = rank, controls.detach().clone(), seen
-        return spare
+            self.rank, self.controls, self.score = (
+                rank,
+                controls.detach().clone(),
+                score,
+            )
+        return margin
 
 
 def _climb(
@@ -436,8 +484,24 @@ def _climb(
     zones: int,
     generator: torch.Generator,
 ) -> FisherPhase:
-    controls = _begun(settings, zones, generator)
-    total, done, margin = settings.iterations, 0, 0.01
+    """Gradient ascent (Adam) of the objective from one random start, coarse to fine.
+
+    Stage by stage the controls are refined to the next grid. A penalty holds the
+    encircled energy above ``settings.encircled`` plus a margin, which follows the
+    deterministic figures. Only iterates of the last grid are judged.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+        objective: loss and figures.
+        focus_um: source distance of the hyperbolic part, um.
+        zones: rings of the double helix; 0 for none.
+        generator: of random numbers.
+    """
+    controls = _initial_controls(settings, zones, generator)
+    total = settings.iterations
+    done = 0
+    margin = 0.01  # encircled energy beyond the bound
     best = _Best(objective, settings, focus_um)
     for grid, count in zip(settings.grids, _shares(settings), strict=True):
         if grid == 0:
@@ -447,20 +511,19 @@ def _climb(
         controls = controls.detach().requires_grad_(True)
         rate = RATE if grid else NODE_RATE
         build = _Phase(pupil, grid, zones)
-        step = torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
+        optimizer = torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
         for _ in range(count):
-            for group in step.param_groups:
+            for group in optimizer.param_groups:
                 group["lr"] = _rate(rate, done, total)
             loss, energy = objective.loss(build(controls), focus_um, generator)
-            loss = loss + _penalty(
-                torch.relu(settings.encircled + margin - energy), done / total
-            )
-            step.zero_grad()
+            missing = torch.relu(settings.encircled + margin - energy)
+            loss = loss + _penalty(missing, done / total)
+            optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            step.step()
+            optimizer.step()
             done += 1
             if grid == settings.grids[-1] and (done % CHECKS == 0 or done == total):
-                spare = best.look(controls, build(controls))
+                spare = best.update(controls, build(controls))
                 margin = _margin(margin, spare)
         controls = controls.detach()
     if best.controls is None or best.score is None:
@@ -482,11 +545,12 @@ def _climb(
     )
 
 
-def _begun(
+def _initial_controls(
     settings: ResolvedFisherSettings, zones: int, generator: torch.Generator
 ) -> Tensor:
-    """Controls of the coarsest grid at random; on a double helix a tenth of the spread,
-    which leaves its vortices.
+    """(n, n) random controls of the coarsest grid in rad, normal with ``spread_rad``.
+
+    On a double helix a tenth of the spread, which keeps its vortices.
     """
     spread = settings.spread_rad * (0.1 if zones else 1.0)
     size = settings.grids[0]
@@ -494,36 +558,48 @@ def _begun(
 
 
 def _rate(first: float, done: int, total: int) -> float:
-    """Step of Adam, rad, after so many of all iterations: half a cosine down to 2 mrad."""
+    """Step of Adam, rad, after so many of all iterations: half a cosine down to 2
+    mrad.
+    """
     return first * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
 
 
 def _penalty(missing: Tensor, share: float) -> Tensor:
-    """Of encircled energy that is missing: five times as strong at the end as at the
-    beginning.
+    """Penalty of missing encircled energy m: 10 (1 + 4 share) (mean(m) + 8 mean(m²)).
+
+    Args:
+        missing: energy below the bound, 0 or more.
+        share: of the iterations that are done; the penalty grows fivefold.
     """
     return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
 
 
 def _margin(margin: float, spare: float) -> float:
-    """What is asked for beyond the bound: more where an honest look has less than
-    0.0015 to spare, within limits.
+    """Next margin above the energy bound, so that the figures exceed it by 0.0015.
+
+    Proportional feedback by 0.35, within -0.03 to 0.05.
+
+    Args:
+        margin: encircled energy beyond the bound that the penalty asks for.
+        spare: least encircled energy of the last judged iterate minus the bound.
     """
     return min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
 
 
 def _shares(settings: FisherSettings) -> list[int]:
     """Iterations of every stage: in proportion to its grid, at least one."""
-    whole = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
+    weight = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
     early = [
-        max(1, settings.iterations * grid // whole) for grid in settings.grids[:-1]
+        max(1, settings.iterations * grid // weight) for grid in settings.grids[:-1]
     ]
     return [*early, max(1, settings.iterations - sum(early))]
 
 
 class _Phase:
-    """Controls to the phase on the pupil's nodes: of a spline, or themselves for a grid
-    of 0.
+    """Linear map from controls to the phase on the pupil's nodes, rad.
+
+    A spline of ``grid`` controls across the aperture, or for a grid of 0 the controls
+    themselves, plus the vortices of a double helix.
     """
 
     def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:

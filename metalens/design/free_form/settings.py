@@ -7,14 +7,9 @@ from metalens.core.errors import ConfigError
 from metalens.design.profiles import Focus
 from metalens.lens import reach
 
-WINDOW, CLIMB = (
-    42.4,
-    2 / 3,
-)  # width of the PSFs in wavelength / NA; of the window, while climbing
-FOCI = (
-    0.29,
-    0.71,
-)  # of the range of depths in 1/z, from its near end: where the hyperbolic part is focused
+WINDOW = 42.4  # width of the PSFs in wavelength / NA
+CLIMB = 2 / 3  # of that width, in the iterations of the search
+FOCI = (0.29, 0.71)  # of the hyperbolic part: shares of the depth range in 1/z
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +66,11 @@ class FisherSettings:
     orthogonality: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse settings out of range.
+
+        Raises:
+            ConfigError: naming the setting and what is needed.
+        """
         if self.depths_mm is not None and not 0 < self.depths_mm[0] < self.depths_mm[1]:
             raise ConfigError(f"depths_mm = {self.depths_mm}: need 0 < least < largest")
         if self.focus_mm is not None and not 0 < self.focus_mm[0] <= self.focus_mm[1]:
@@ -105,8 +105,12 @@ class FisherSettings:
             )
 
     def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":
-        """These for a lens of this radius, its depths, foci and disc where they were
-        left out.
+        """Settings for one lens, with its depths, foci and disc where they were left
+        out.
+
+        Args:
+            focus: wavelength, distances and films of the lens.
+            radius_um: radius of its aperture, um.
 
         Raises:
             ConfigError: pixels larger than the window of this lens.
@@ -118,31 +122,32 @@ class FisherSettings:
             focus.source_distance_um,
             focus.layers,
         )
-        near, far = (
-            (1e3 * z for z in self.depths_mm)
-            if self.depths_mm
-            else reach.depth_range_um(lens)
-        )
+        if self.depths_mm:
+            near, far = (1e3 * z for z in self.depths_mm)
+        else:
+            near, far = reach.depth_range_um(lens)
         pixel = self.pixel_um or reach.pixel_um(lens)
         window = reach.window_um(lens, (near, far), airy=WINDOW)
-        climbed = CLIMB * window
-        if 3 * pixel > climbed:
+        climb_window = CLIMB * window
+        if 3 * pixel > climb_window:
             raise ConfigError(
-                f"pixel_um = {pixel}: need at most {climbed / 3:.3g} um for a lens whose spots are seen in a "
-                f"window of {climbed:g} um"
+                f"pixel_um = {pixel}: need at most {climb_window / 3:.3g} um for a lens whose spots are seen in a "
+                f"window of {climb_window:g} um"
             )
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        own |= {
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {
             "depths_mm": (near * 1e-3, far * 1e-3),
             "radius_um": self.radius_um or reach.disc_um(lens),
         }
-        own["focus_mm"] = self.focus_mm or between_mm((near, far), *FOCI)
-        own |= {
+        values["focus_mm"] = self.focus_mm or between_mm((near, far), *FOCI)
+        values |= {
             "pixel_um": pixel,
             "sample_um": reach.sample_um(lens, pixel),
             "step_um": reach.depth_step_um(lens, near),
         }
-        return ResolvedFisherSettings(**own, window_um=window, climb_window_um=climbed)
+        return ResolvedFisherSettings(
+            **values, window_um=window, climb_window_um=climb_window
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +178,16 @@ class ResolvedFisherSettings(FisherSettings):
 def between_mm(
     depths_um: tuple[float, float], first: float, last: float
 ) -> tuple[float, float]:
-    """Depths at two shares of the range in 1/z, from its near end: 0 is near, 1 far;
-    below 0 nearer. 2 digits.
+    """Depths in mm at two shares of a depth range in 1/z, rounded to 2 digits, in
+    order.
+
+    Share 0 is the near end, 1 the far end, below 0 nearer still. Limited to ten times
+    the far depth.
 
     Args:
-        depths_um: source depths from the lens, um.
+        depths_um: near and far source depth from the lens, um.
+        first: share of the first depth.
+        last: share of the second depth.
     """
     near, far = (1e3 / z for z in depths_um)
     ends = (1 / max(near + share * (far - near), 0.1 * far) for share in (first, last))
