@@ -136,7 +136,8 @@ def _discs(
     lens: Lens, process: Process, size_um: Array, _: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of round pillars at sites, and which of them each is."""
-    step, height = process.rules.diameter_step_nm, lens.cell.height_um
+    step = process.rules.diameter_step_nm
+    height = lens.cell.height_um
     drawn = np.rint(process.written_diameter_nm(size_um / nm) / step).astype(np.int64)
     sizes, kind = np.unique(drawn, return_inverse=True)
     made_nm = process.made_diameter_nm(sizes * step)
@@ -172,7 +173,8 @@ def _shapes(
     lens: Lens, process: Process, size_um: Array, sites: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of pillars of any shape and rotation at sites, and which each is."""
-    grid, step = lens.diameters, process.rules.diameter_step_nm
+    grid = lens.diameters
+    step = process.rules.diameter_step_nm
 
     def drawn_steps(size_um: Array) -> Array:
         drawn = process.bias.drawn_nm(np.asarray(size_um, float) / nm)
@@ -195,7 +197,8 @@ def _section(
     cell: Cell, process: Process, drawn_nm: int, length_nm: int, turn: int
 ) -> SolidSection:
     """Section of a drawn size, length (0: set by the shape) and rotation (in steps)."""
-    bias, angle = process.bias, turn * process.rules.angle_step_deg
+    bias = process.bias
+    angle = turn * process.rules.angle_step_deg
     width = float(bias.made_nm(np.array(float(drawn_nm))))
     length = float(bias.made_nm(np.array(float(length_nm)))) if length_nm else 0.0
     shape = cell_of_sizes(cell, width, length) if length else cell
@@ -232,7 +235,8 @@ def check_count(pillars: SolidTile, form: str) -> None:
     Raises:
         ProcessError: with the side of a square that would do.
     """
-    limit, found = MAX_PILLARS[form], len(pillars.kind)
+    limit = MAX_PILLARS[form]
+    found = len(pillars.kind)
     if found > limit:
         side = (math.isqrt(limit) - 2) * math.sqrt(pillars.site_um2)
         raise ProcessError(
@@ -257,7 +261,9 @@ def mesh_section(
         for low, high in zip(section.foot.parts, section.top.parts, strict=True)
     ]
     foot, top = (np.concatenate([pair[end] for pair in contours]) for end in (0, 1))
-    total, start, faces = len(foot), 0, []
+    total = len(foot)
+    start = 0
+    faces = []
     for low, _ in contours:
         here = start + np.arange(len(low))
         after = start + (np.arange(len(low)) + 1) % len(low)
@@ -344,7 +350,9 @@ def write_step(path: str | Path, pillars: SolidTile) -> None:
     colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
     root = shapes.NewShape()
     _set_name(root, "metalens tile")
-    x, y, margin = pillars.x_um, pillars.y_um, pillars.pitch_um
+    x = pillars.x_um
+    y = pillars.y_um
+    margin = pillars.pitch_um
     size = float(np.ptp(x)) + margin, float(np.ptp(y)) + margin, 1.0
     corner = float(x.min()) - margin / 2, float(y.min()) - margin / 2, -1.0
     slab = Solid.make_box(*size).wrapped

@@ -123,7 +123,8 @@ def wafer_cell(
         ProcessError: a part with a cell of that name.
     """
     layers = JobLayers(frozenset(), dict(one.doses), dict(one.layer_names))
-    cells, here = dict(one.cells), list(steps)
+    cells = dict(one.cells)
+    here = list(steps)
     if marks is not None:
         here += _take(marks, layers, cells)
     return _joined(name, cells, here, layers)

@@ -239,7 +239,8 @@ def moved_cell(
         polygons.setdefault(layers.get(layer, layer), []).extend(shapes)
     for layer, some in cell.circles.items():
         circles.setdefault(layers.get(layer, layer), []).extend(some)
-    placed, pillars = cell.kept(), cell.pillars
+    placed = cell.kept()
+    pillars = cell.pillars
     if pillars is not None:
         children = tuple(names.get(child, "") for child in pillars.children)
         pillars = dataclasses.replace(pillars, children=children)

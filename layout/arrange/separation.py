@@ -166,7 +166,8 @@ def _between(
             if len(first)
             else second[:0]
         )
-        least, box = math.inf, np.zeros(4)
+        least = math.inf
+        box = np.zeros(4)
         for each in second if len(first) else ():
             distance = box_distance(first, each)
             n = int(distance.argmin())

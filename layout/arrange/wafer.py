@@ -97,7 +97,8 @@ def chord_um(wafer: WaferSettings) -> float:
     """Distance of the flat from the middle of the wafer; the radius where there is
     none.
     """
-    radius, half = 500 * wafer.diameter_mm, 500 * wafer.flat_mm
+    radius = 500 * wafer.diameter_mm
+    half = 500 * wafer.flat_mm
     return math.sqrt(radius**2 - half**2)
 
 
@@ -192,7 +193,8 @@ def _steps(found: WaferDies, units_per_um: float) -> tuple[int, int]:
     """From die to die in units, along x and y; 0 where there is one column or row."""
     steps = []
     for axis in (0, 1):
-        index, place = found.index[:, axis], found.place_um[:, axis]
+        index = found.index[:, axis]
+        place = found.place_um[:, axis]
         low, high = int(index.argmin()), int(index.argmax())
         count = int(index[high] - index[low])
         steps.append(

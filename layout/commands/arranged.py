@@ -70,7 +70,8 @@ def _refuse_negative(work: FloorplanWork) -> None:
     """Raises: ProcessError: gaps are drawn, and something stands on the die that the
     frame of a lens does not include.
     """
-    record, size = work.record, work.record.wafer
+    record = work.record
+    size = work.record.wafer
     alone = all(record.furnished(part) for part in record.lens) and not record.cell
     alone &= record.die is None and not (size and size.marks)
     if work.process.tone == "negative" and not alone:
@@ -82,7 +83,8 @@ def _refuse_negative(work: FloorplanWork) -> None:
 
 def _whole(work: FloorplanWork) -> MaskLibrary:
     """The die of the record, or its wafer."""
-    record, layers = work.record, work.process.layers
+    record = work.record
+    layers = work.process.layers
     _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
@@ -108,7 +110,9 @@ def _parts(
 
     All that is corrected here is drawn first, so that it shares one series of doses.
     """
-    record, process, size = work.record, work.process, work.record.wafer
+    record = work.record
+    process = work.process
+    size = work.record.wafer
     files = [joined.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
     drawings = []
     for part in record.lens:
@@ -184,7 +188,8 @@ def _lens_part(
 
 def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
     """What stands around the lenses: checked and verified; read back with the die."""
-    name, process = plan.name, work.process
+    name = plan.name
+    process = work.process
     with work.stages(f"{name}: check"):
         work.judge_rules(name, check_plan(plan, process.rules))
     if work.corrected and process.exposure.csv is None:
@@ -351,7 +356,8 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
     """The job sheet: what stands where, and its doses; what is said of each lens lies
     in its folder.
     """
-    process, size = work.process, work.record.wafer
+    process = work.process
+    size = work.record.wafer
     lines = [
         f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
         work.verdict,

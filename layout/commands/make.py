@@ -180,7 +180,8 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
 
 
 def _write_masks(job: LayoutJob, target: Path) -> None:
-    options, plan = job.options, job.plan
+    options = job.options
+    plan = job.plan
     if options.writes_oasis:
         path = target / "mask.oas"
         with job.stages("write OASIS"):
@@ -208,7 +209,8 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
     """STL and STEP of the pillars in the window."""
     from layout import solids
 
-    options, window = job.options, job.options.window
+    options = job.options
+    window = job.options.window
     tile = solids.cut_tile(
         job.source,
         job.process,

@@ -99,7 +99,8 @@ def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> No
 
 
 def _lead(job: LayoutJob) -> str:
-    source, classes = job.source, job.plan.classes
+    source = job.source
+    classes = job.plan.classes
     own = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
     die = ""
     if job.drc.shapes != own:
@@ -151,7 +152,8 @@ def _rules(found: DrcReport) -> Section:
 
 
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    rules, classes = job.process.rules, job.plan.classes
+    rules = job.process.rules
+    classes = job.plan.classes
     if not classes[0].round:
         shape = job.source.cell.shape
         area = [made.twice_area / 2 for made in classes]
@@ -166,7 +168,8 @@ def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
             f"for. {len(area)} classes of {min(area):,.0f} to {max(area):,.0f} nm².",
         )
     shapes = {made.diameter_units: made for made in classes}
-    grid, unit = job.plan.grid, job.plan.grid * job.plan.unit_nm
+    grid = job.plan.grid
+    unit = job.plan.grid * job.plan.unit_nm
     made = [
         polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)
     ]

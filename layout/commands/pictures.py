@@ -78,7 +78,8 @@ def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
     scale = plan.unit_nm * 1e-3
     sizes_nm = [made.diameter_nm for made in plan.classes]
     for ax, window in zip(axes[0], windows, strict=True):
-        shapes, sizes = [], []
+        shapes = []
+        sizes = []
         for lattice in plan.lattices:
             for k, x, y in sites_in(plan, lattice, window):
                 for corners in plan.classes[k - 1].polygons:
@@ -93,7 +94,9 @@ def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
         drawn.set_clim(min(sizes_nm), max(sizes_nm))
         ax.grid(False)
         ax.add_collection(drawn)
-        u, v, half = window.x_um, window.y_um, window.size_um / 2
+        u = window.x_um
+        v = window.y_um
+        half = window.size_um / 2
         ax.set(xlim=(u - half, u + half), ylim=(v - half, v + half), aspect="equal")
         ax.set(xlabel="x / µm", ylabel="y / µm")
         ax.set_title(f"{window.size_um:g} µm at ({u:.6g}, {v:.6g})")
@@ -255,7 +258,8 @@ def plot_wafer(size: WaferSettings, dies: WaferDies, box_um: Array) -> bytes:
         "linewidths": 0.4,
     }
     ax.add_collection(PolyCollection(shapes, **style))
-    turn, radius = np.linspace(0, 2 * np.pi, 400), size.diameter_mm / 2
+    turn = np.linspace(0, 2 * np.pi, 400)
+    radius = size.diameter_mm / 2
     for r, line in ((radius, "-"), (radius - size.edge_exclusion_mm, ":")):
         ax.plot(r * np.cos(turn), r * np.sin(turn), line, color="#444", lw=1)
     for mark in size.marks:

@@ -66,12 +66,14 @@ class StageTimes:
     ) -> None:
         self.seconds: dict[str, float] = {}
         self.rows = RowProgress()
-        self._say, self._waits = say, (first_s, next_s)
+        self._say = say
+        self._waits = (first_s, next_s)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         """Time what happens inside as ``stage``."""
-        start, over = time.perf_counter(), threading.Event()
+        start = time.perf_counter()
+        over = threading.Event()
         self.rows.end = 0
         ticker = threading.Thread(
             target=self._tick, args=(stage, start, over), daemon=True

@@ -133,7 +133,8 @@ def _oasis(path: str | Path, data: Array) -> Iterator[FormatFinding]:
     start.real()
     end = start if start.unsigned() == 0 else ByteCursor(str(path), data, at=at + 1)
     for table, kinds in _TABLES:
-        strict, offset = end.unsigned(), end.unsigned()
+        strict = end.unsigned()
+        offset = end.unsigned()
         if (
             strict
             and offset

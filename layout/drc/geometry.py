@@ -117,7 +117,8 @@ def measure_polygon(
     found = find_sharp_corners(contours)
     convex_contour = []
     for number, points in enumerate(contours):
-        outer, hole = is_convex(points), is_convex(points[::-1])
+        outer = is_convex(points)
+        hole = is_convex(points[::-1])
         convex_contour.append(np.full(len(points), number if outer or hole else -1))
         if outer:
             found.append(
@@ -350,7 +351,8 @@ def _measure_separation(
         two = edges[start[second[n]] : start[second[n] + 1]].copy()
         two[:, 0::2] += offset[n, 0]
         two[:, 1::2] += offset[n, 1]
-        nearest, facing = np.inf, np.inf
+        nearest = np.inf
+        facing = np.inf
         for i in range(len(one)):
             for j in range(len(two)):
                 square = edge_distance_squared(one[i], two[j])

@@ -190,8 +190,11 @@ class _LayerCheck:
         max_elements: int,
         rule_names: dict[str, str] | None = None,
     ) -> None:
-        self.content, self.layers, self.rules = content, layers, rules
-        self.metric, self.max_elements = metric, max_elements
+        self.content = content
+        self.layers = layers
+        self.rules = rules
+        self.metric = metric
+        self.max_elements = max_elements
         self.rule_names = rule_names or {}
         self.layer = min(layers)[0]
         self.width = rules.minimum_feature_nm / content.unit_nm
@@ -391,7 +394,8 @@ class _LayerCheck:
         references.
         """
         for number, members in group_equal(placed.element):
-            element, places = self.elements[number], placed.xy[members]
+            element = self.elements[number]
+            places = placed.xy[members]
             if element.turn is None:
                 report.shapes += len(members)
                 self._check_polygon(number, places, report)
@@ -437,7 +441,8 @@ class _LayerCheck:
 
     def _check_polygon(self, number: int, places: Array, report: DrcReport) -> None:
         """Widths and notches of one polygon at (n, 2) places."""
-        element, unit = self.elements[number], self.content.unit_nm
+        element = self.elements[number]
+        unit = self.content.unit_nm
         tolerance = (
             GRID_TOLERANCE * unit
             if element.rounded and element.designed is element.contours
@@ -480,7 +485,8 @@ class _LayerCheck:
             pairs, distance, projected = self._close_pairs(placed)
         for number, members in group_equal(placed.element):
             self._check_polygon(number, placed.xy[members], report)
-        unit, limit = self.content.unit_nm, report.limits["space"]
+        unit = self.content.unit_nm
+        limit = report.limits["space"]
         rounded = np.array([element.rounded for element in self.elements], bool)[
             placed.element
         ]

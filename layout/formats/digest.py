@@ -44,10 +44,8 @@ class RunningDigest:
     """Running sums over placements; children are numbered from any integer."""
 
     def __init__(self) -> None:
-        self._sums, self._hashes = (
-            np.zeros((_ROOM, 4), np.int64),
-            np.zeros(_ROOM, np.uint64),
-        )
+        self._sums = np.zeros((_ROOM, 4), np.int64)
+        self._hashes = np.zeros(_ROOM, np.uint64)
 
     def take(self, child: Array, x: Array, y: Array, turn: Array) -> None:
         """Add placements: (n,) numbers, places and turns (0: as it is)."""
@@ -125,7 +123,8 @@ def _sites(
         y = y0 - row * down
         for column in range(block.shape[1]):
             if block[row, column]:
-                k, x = 2 * block[row, column], x0 + column * pitch
+                k = 2 * block[row, column]
+                x = x0 + column * pitch
                 sums[k, 0] += 1
                 sums[k, 1] += x
                 sums[k, 2] += y

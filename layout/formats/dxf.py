@@ -68,7 +68,8 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
         for n, (layer, name) in enumerate(names.items()):
             made = drawing.layers.add(name, color=1 + n % _COLOURS)
             made.description = f"{layer[0]}/{layer[1]}"
-        space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
+        space = drawing.modelspace()
+        scale = plan.unit_nm * 1e-3
         for layer, shapes in _drawn(plan, window).polygons.items():
             for points in shapes:
                 space.add_lwpolyline(

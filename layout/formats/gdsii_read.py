@@ -60,13 +60,11 @@ class _Reader:
     """A cursor over the records."""
 
     def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
-        self.path, self.data, self.at, self.limit, self.keep = (
-            path,
-            data,
-            0,
-            limit,
-            keep,
-        )
+        self.path = path
+        self.data = data
+        self.at = 0
+        self.limit = limit
+        self.keep = keep
         self.begin = 0  # of the latest record
         self.placed = 0
         self.number_of: dict[str, int] = {}  # structures by first reference
@@ -81,7 +79,8 @@ class _Reader:
         """Kind and data of the next record, which must be one of ``wanted`` (any, if
         none is named).
         """
-        self.begin, left = self.at, len(self.data) - self.at
+        self.begin = self.at
+        left = len(self.data) - self.at
         if left < 4:
             raise self.fail(
                 f"the file ends within a record ({left} bytes left); it is cut"
@@ -115,7 +114,8 @@ class _Reader:
             kind, data = self.next()
         if kind != gds.UNITS or len(data) != 16:
             raise self.fail("UNITS of two numbers is missing")
-        user, meters = gds.to_float(data[:8]), gds.to_float(data[8:])
+        user = gds.to_float(data[:8])
+        meters = gds.to_float(data[8:])
         if not (1e-15 < meters < 1 and user > 0):
             raise self.fail(f"database unit of {meters} m")
         cells: dict[str, MaskCell] = {}

@@ -241,8 +241,10 @@ def _fill(
     """References of the sites from (row, column) on, until the buffer is full; (next
     row, column, references).
     """
-    size, wide = templates.shape[1], xs.shape[1]
-    head, used = size - 3 * wide, 0
+    size = templates.shape[1]
+    wide = xs.shape[1]
+    head = size - 3 * wide
+    used = 0
     while row < block.shape[0]:
         while column < block.shape[1]:
             kind = block[row, column]

@@ -65,7 +65,8 @@ def write_fields(steps: Sequence[WriteStep], path: str | Path) -> None:
         steps: of a lens, or of all parts of an arrangement.
         path: of the CSV file.
     """
-    text, parts = io.StringIO(), any(step.part for step in steps)
+    text = io.StringIO()
+    parts = any(step.part for step in steps)
     out = csv.writer(text, lineterminator="\n")
     out.writerow([*FIELD_HEAD, "part"] if parts else FIELD_HEAD)
     for number, step in enumerate(steps, 1):

@@ -178,7 +178,8 @@ class PillarSites:
 
     def sums(self) -> dict[str, tuple[int, ...]]:
         """{cell: count, sums of x and y, turned, hash} of those that occur."""
-        array, digest = self.lattice, RunningDigest()
+        array = self.lattice
+        digest = RunningDigest()
         for first, block in array.blocks():
             y = array.y0 - first * array.down
             digest.sites(block, array.x0, y, (array.pitch, array.down))

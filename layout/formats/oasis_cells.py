@@ -66,7 +66,9 @@ class CellReader:
     """Reads the records of one cell."""
 
     def __init__(self, cell: OpenCell, budget: ReadBudget) -> None:
-        self.cell, self.budget, self.modal = cell, budget, ModalState()
+        self.cell = cell
+        self.budget = budget
+        self.modal = ModalState()
 
     def record(self, c: ByteCursor, kind: int) -> bool:
         """Read the record of this kind that stands at the cursor; False where cells
@@ -122,11 +124,9 @@ class CellReader:
                 child, x, y, turn = (row.copy() for row in out[:, :count])
                 self._count(c, count)
                 self.cell.held.add(child, x, y, turn.astype(np.uint8))
-                m.placement_x, m.placement_y, m.child = (
-                    int(state[0]),
-                    int(state[1]),
-                    int(state[3]),
-                )
+                m.placement_x = int(state[0])
+                m.placement_y = int(state[1])
+                m.child = int(state[3])
             m.relative = bool(state[2])
             if not moved:
                 return
@@ -169,7 +169,8 @@ class CellReader:
         return moved.x + moved.x.dtype.type(x), moved.y + moved.y.dtype.type(y)
 
     def _placement(self, c: ByteCursor, kind: int) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         if info & 0x80:
             m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
         child = m.child
@@ -226,7 +227,8 @@ class CellReader:
         )
 
     def _rectangle(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x40:
             m.width = c.within(c.unsigned())
@@ -239,14 +241,16 @@ class CellReader:
         self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
 
     def _polygon(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x20:
             m.points = c.points()
         self._polygons(c, info, self._need(c, m.points, "point list"), "POLYGON")
 
     def _path(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x40:
             m.half_width = c.within(c.unsigned())
@@ -272,7 +276,8 @@ class CellReader:
         return c.coordinate()
 
     def _trapezoid(self, c: ByteCursor, kind: int) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         self._size(c, info)
         a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
@@ -297,7 +302,8 @@ class CellReader:
             self.modal.height = c.within(c.unsigned())
 
     def _compact(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x80:
             m.kind = c.unsigned()
@@ -315,7 +321,8 @@ class CellReader:
         self._polygons(c, info, trapezoids.compact_trapezoid(kind, w, h), "CTRAPEZOID")
 
     def _circle(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x20:
             m.radius = c.within(c.unsigned())
@@ -340,7 +347,8 @@ class CellReader:
 
     def _text(self, c: ByteCursor) -> None:
         """Texts are counted, no more."""
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         if info & 0x40:
             _ = c.unsigned() if info & 0x20 else c.string()
         for bit in (1, 2):

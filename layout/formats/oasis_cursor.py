@@ -39,7 +39,10 @@ class ByteCursor:
         end: int | None = None,
         block: int = -1,
     ) -> None:
-        self.path, self.data, self.at, self.block = path, data, at, block
+        self.path = path
+        self.data = data
+        self.at = at
+        self.block = block
         self.end = len(data) if end is None else end
         self.begin = at  # of the latest record
 
@@ -139,7 +142,8 @@ class ByteCursor:
         """A point list, from (0, 0) on: (n, 2), as it closes to a polygon, or as a path
         has it.
         """
-        form, count = self.unsigned(), self.unsigned()
+        form = self.unsigned()
+        count = self.unsigned()
         if form > 5:
             raise self.fail(f"point list of type {form}, need 0 to 5")
         if not 0 < count <= self.left:
@@ -170,7 +174,8 @@ class ByteCursor:
             size = self.signed()
             return (size, 0) if n % 2 == form else (0, size)
         if form in (2, 3):
-            word, bits = self.unsigned(), form
+            word = self.unsigned()
+            bits = form
             dx, dy = DIRECTIONS[word & (1 << bits) - 1]
             return dx * (word >> bits), dy * (word >> bits)
         return self.delta()

@@ -66,7 +66,9 @@ class _Reader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
     def __init__(self, cursor: ByteCursor, limit: int, keep: int | None) -> None:
-        self.file, self.budget, self.keep = cursor, ReadBudget(limit), keep
+        self.file = cursor
+        self.budget = ReadBudget(limit)
+        self.keep = keep
         self.cell: CellReader | None = None
         self.cells: list[OpenCell] = []
         self.names: dict[int, str] = {}
@@ -84,7 +86,8 @@ class _Reader:
         if self.end_at is None:
             raise c.fail("the file ends without END; it is cut")
         self._check_end(offsets_here)
-        cells, names = self._contents(), self.layer_names
+        cells = self._contents()
+        names = self.layer_names
         return MaskLibrary("", cells, unit_nm, names, kind="OASIS")
 
     def _start(self) -> tuple[float, bool]:
@@ -158,7 +161,8 @@ class _Reader:
             raise c.fail("a compressed block within another")
         if c.unsigned() != 0:
             raise c.fail("a compressed block of an unknown method, need deflate")
-        size, packed = c.unsigned(), c.unsigned()
+        size = c.unsigned()
+        packed = c.unsigned()
         if packed > c.left or size > packed * _LARGEST_RATIO + 64:
             raise c.fail(
                 f"compressed block of {packed} bytes for {size}, with {c.left} left in the file"

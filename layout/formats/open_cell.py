@@ -79,14 +79,16 @@ class PlacementSums:
                 for part in zip(*self.parts[self.merged :], strict=True)
             )
             self.parts[self.merged :] = [(child, x, y, turn)]
-            self.merged, self.small = self.merged + 1, 0
+            self.merged = self.merged + 1
+            self.small = 0
 
     def columns(self) -> tuple[Array, Array, Array, Array]:
         """child, x, y, turn of all that is kept; the parts are let go, one column after
         the other.
         """
         columns = [list(part) for part in zip(*self.parts, strict=True)]
-        self.parts, made = [], []
+        self.parts = []
+        made = []
         while columns:
             made.append(np.concatenate(columns.pop(0)))
         return made[0], made[1], made[2], made[3]
@@ -147,7 +149,9 @@ class OpenCell:
         def named(numbers: Array) -> tuple[str, ...]:
             return tuple(own[k] if k < 0 else table[k] for k in numbers.tolist())
 
-        placed, sums, digest = NOTHING, None, self.held.digest
+        placed = NOTHING
+        sums = None
+        digest = self.held.digest
         if digest is not None:
             placed = dataclasses.replace(NOTHING, children=named(digest.children))
             sums = digest.of(digest.children)

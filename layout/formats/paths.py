@@ -37,7 +37,8 @@ def path_outline(
     p = p[np.r_[True, (np.diff(p, axis=0) != 0).any(1)]]
     along = np.diff(p, axis=0)
     if not len(along):
-        p, along = np.vstack([p, p]), np.array([[1.0, 0.0]])
+        p = np.vstack([p, p])
+        along = np.array([[1.0, 0.0]])
     long = np.hypot(*along.T)
     along = along / np.where(long > 0, long, 1.0)[:, None]
     if not rounded:

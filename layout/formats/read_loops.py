@@ -44,7 +44,8 @@ def _srefs(
     each stands first.
     """
     child, x, y = out[0], out[1], out[2]
-    names, mask = 0, slots.shape[0] - 1
+    names = 0
+    mask = slots.shape[0] - 1
     for n in range(out.shape[1]):
         p = at + n * size
         q = p + size - 16
@@ -82,7 +83,8 @@ def _srefs(
             key = (key * 131 + int(data[i])) & 0x7FFFFFFF
         slot = (key ^ key >> 15) & mask
         while slots[slot] >= 0:
-            other, same = first[slots[slot]], True
+            other = first[slots[slot]]
+            same = True
             for i in range(q - p - 8):
                 if data[other + i] != data[p + 8 + i]:
                     same = False
@@ -148,7 +150,11 @@ def scan_placements(
     Returns:
         (position of the first record that is something else or broken, placements read)
     """
-    count, child, x, y, turn = 0, out[0], out[1], out[2], out[3]
+    count = 0
+    child = out[0]
+    x = out[1]
+    y = out[2]
+    turn = out[3]
     while at < end and count < out.shape[1]:
         kind = data[at]
         if kind == 15 or kind == 16:
@@ -162,7 +168,9 @@ def scan_placements(
             or data[at + 1] & 0xC0 == 0x80
         ):
             break
-        info, p, number = data[at + 1], at + 2, state[3]
+        info = data[at + 1]
+        p = at + 2
+        number = state[3]
         if info & 0x80:
             number, p = unsigned_at(data, p, end)
         dx, dy = 0, 0
@@ -181,7 +189,8 @@ def scan_placements(
         state[0], state[1], state[3] = new_x, new_y, number
         child[count], x[count], y[count] = number, new_x, new_y
         turn[count] = (info >> 1 & 3) | (info & 1) << 2
-        count, at = count + 1, p
+        count = count + 1
+        at = p
     return at, count
 
 
@@ -209,7 +218,8 @@ def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) ->
                 return -1
             dy = -(word >> 1) if word & 1 else word >> 1
         else:
-            direction, size = word >> 1 & 7, word >> 4
+            direction = word >> 1 & 7
+            size = word >> 4
             dx = (
                 0
                 if direction == 1 or direction == 3

@@ -114,7 +114,8 @@ def with_isolation(
     Args:
         diameters: designed sizes.
     """
-    design, bias = diameters.diameter_um, process.bias
+    design = diameters.diameter_um
+    bias = process.bias
     reach = (
         isolation.isolation_halo(diameters.steps_um[1], bias.range_um)
         if bias.isolated_nm

@@ -107,7 +107,8 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
         process: layers.
         radius_um: of the opening.
     """
-    layer, unit = process.layers.aperture, DatabaseUnits(plan)
+    layer = process.layers.aperture
+    unit = DatabaseUnits(plan)
     figure = FigureCell(
         "APERTURE",
         {layer: (aperture_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
@@ -132,7 +133,8 @@ def add_wafer_mark(
         mark_um: arm length.
         width_um: line width.
     """
-    unit, layers = DatabaseUnits(plan), process.layers
+    unit = DatabaseUnits(plan)
+    layers = process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
     some = [
         _variant(made, "witness", f"W{n}", layers.witness, 1.0)
@@ -227,7 +229,8 @@ def _tests(
     inner = unit(radius_um + CLEAR_UM)
     outer = die.right - unit(process.die.street_um + CLEAR_UM)
     middle = (inner + outer) // 2
-    lattices, windows = [], []
+    lattices = []
+    windows = []
     for name, sites, x in (
         ("DOSETEST", dose_map, -middle),
         ("WITNESS", witness_map, middle),
@@ -322,7 +325,8 @@ def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
     """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with
     spaces between, on a lattice.
     """
-    step, wide = side + _SPACE, 2 if lattice.centred else 1
+    step = side + _SPACE
+    wide = 2 if lattice.centred else 1
     sites = np.zeros(
         (numbers.shape[0] * step - _SPACE, wide * (numbers.shape[1] * step - _SPACE)),
         np.uint16,

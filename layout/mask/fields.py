@@ -172,7 +172,8 @@ def _counted(made: DrawnClasses, rows: Array, columns: Array) -> Array:
 def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
     """Field borders along one axis, from which lattice lines hold pillars."""
     held = np.flatnonzero(occupied)
-    first, span = int(held[0]), int(held[-1] - held[0] + 1)
+    first = int(held[0])
+    span = int(held[-1] - held[0] + 1)
     count = -(-span // sites)
     if settings.mode == "floating":
         return np.asarray(first + np.arange(count + 1) * span // count)

@@ -61,11 +61,9 @@ class DatabaseUnits:
     """From micrometres to database units on the grid."""
 
     def __init__(self, plan: MaskPlan) -> None:
-        self.per_um, self.grid, self.pitch = (
-            1e3 / plan.unit_nm,
-            plan.grid,
-            plan.lattices[0].constant,
-        )
+        self.per_um = 1e3 / plan.unit_nm
+        self.grid = plan.grid
+        self.pitch = plan.lattices[0].constant
 
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid
@@ -164,7 +162,8 @@ def wafer_cross(
         mark_um: arm length.
         width_um: line width.
     """
-    arm, half = unit(mark_um / 2), unit(width_um / 2)
+    arm = unit(mark_um / 2)
+    half = unit(width_um / 2)
     inner = arm // _FINE // unit.grid * unit.grid * 2
     thin = _thin(half, unit)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
@@ -201,7 +200,8 @@ def vernier_scales(
         raise ProcessError(
             f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
         )
-    long, clear = BARS * (pitch + step) + pitch // 2, unit(CLEAR_UM)
+    long = BARS * (pitch + step) + pitch // 2
+    clear = unit(CLEAR_UM)
     arm = unit(process.die.mark_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM)
     high = unit(_LONG_UM + 2 * _GAP_UM)
@@ -220,7 +220,8 @@ def vernier_scales(
             f"the die is too narrow for VERNIERS: {need:.0f} um are needed; raise die.margin_um or die.size_um, or set "
             "die.verniers = false"
         )
-    drawn, openings = [], []
+    drawn = []
+    openings = []
     for at, turned in ((level, False), (upright, True)):
         one, two = _vernier(unit, pitch, step)
         drawn += [_placed(bar, at, turned) for bar in one]

@@ -39,7 +39,8 @@ def shape_classes(
             grid or the bias closes.
         LensError: no pillar.
     """
-    d, cell = source.diameters, source.cell
+    d = source.diameters
+    cell = source.cell
     turns = _turns(cell, d, process)
     counts: dict[int, int] = {}
     for _, block in _keys(d, process, turns):
@@ -153,7 +154,8 @@ def _class(
         if holes
         else ()
     )
-    layer, units = process.layers.pillar, round(drawn / unit_nm)
+    layer = process.layers.pillar
+    units = round(drawn / unit_nm)
     return PillarClass(
         name, float(drawn), units, layer, outline, pieces, round=False, holes=holes
     )

@@ -157,7 +157,8 @@ def _surroundings(
         for shapes in figure.polygons.values()
         for shape in shapes
     ]
-    taken, made = list(boxes), []
+    taken = list(boxes)
+    made = []
     for figure in drawn:
         left = {}
         for layer, shapes in figure.polygons.items():

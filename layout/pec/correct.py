@@ -221,8 +221,11 @@ class WantedDoses:
         Where the edge is so soft that the tolerance moves it by more than a nanometre
         of width, less is allowed.
         """
-        table, tolerance = self.table, settings.tolerance
-        least, largest, finest = np.inf, 0.0, 0.0
+        table = self.table
+        tolerance = settings.tolerance
+        least = np.inf
+        largest = 0.0
+        finest = 0.0
 
         def take(dose: Array, share: Array) -> None:
             nonlocal least, largest, finest
@@ -335,7 +338,8 @@ def _backgrounds(
     field = _relaxed(reach, mass, THRESHOLD * goal, marks=marks)
     near: list[Array] = []
     for _ in range(12 if middles else 0):
-        near, taken = [], np.zeros(grid.shape)
+        near = []
+        taken = np.zeros(grid.shape)
         for lattice, middle in zip(lattices, middles, strict=True):
             index = np.concatenate([block for _, block in lattice.blocks()])
             across = grid.x.at(lattice.columns_um)
@@ -473,7 +477,9 @@ def _touching(boxes: Array) -> Array:
     order = np.argsort(boxes[:, axis], kind="stable")
     swept = boxes[order]
     ends = np.searchsorted(swept[:, axis], swept[:, 2 + axis], side="right")
-    other, first, second = 1 - axis, [], []
+    other = 1 - axis
+    first = []
+    second = []
     for n, end in enumerate(ends.tolist()):
         ahead = swept[n + 1 : end]
         met = (ahead[:, other] <= swept[n, 2 + other]) & (
@@ -559,11 +565,13 @@ def _classes(
     for k, j in used.tolist():
         datatypes.setdefault(plan.classes[k - 1].role, set()).add(j)
     lookup = np.zeros(occurs.shape, np.uint8 if len(used) <= 255 else np.uint16)
-    classes, names = [], {}
+    classes = []
+    names = {}
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
         old = plan.classes[k - 1]
-        kind, level = old.role, float(ladder.factors[j])
+        kind = old.role
+        level = float(ladder.factors[j])
         layer = (bases[kind][0], bases[kind][1] + sorted(datatypes[kind]).index(j))
         names[layer] = layer_title({"dose": "dose_test"}.get(kind, kind), level)
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
@@ -592,7 +600,8 @@ def _figures(
     """The exposed figures in pieces, each on the datatype of its dose, and the doses of
     these.
     """
-    plan, marks = wanted.plan, wanted.marks
+    plan = wanted.plan
+    marks = wanted.marks
     level = ladder.nearest(marks.doses(wanted.far))
     table = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
     on = np.array([table[f][m] for f, m in marks.figure.tolist()], np.int64)

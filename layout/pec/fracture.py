@@ -90,7 +90,8 @@ def fracture_boxes(
     pairs = pairs_near(every, np.zeros(len(every)), around)
     first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
     done: list[_Pieces] = []
-    count, outer = 0, np.ones((len(boxes), 4), bool)
+    count = 0
+    outer = np.ones((len(boxes), 4), bool)
     open_ = _Pieces(whole, outer, np.arange(len(boxes)))
     while len(open_.box):
         _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
@@ -151,8 +152,11 @@ def _uncover(
         for side in range(4):  # left, bottom, right, top
             if not outer[n, side]:
                 continue
-            across, along, at = side % 2, 1 - side % 2, box[n, side]
-            low, reached = box[n, along], box[n, along] - 1
+            across = side % 2
+            along = 1 - side % 2
+            at = box[n, side]
+            low = box[n, along]
+            reached = box[n, along] - 1
             while reached < low < box[n, along + 2]:
                 reached = low
                 for m in neighbours:

@@ -124,7 +124,8 @@ def gather_to_nodes(
     (rows,), (rows, 4) nodes and weights
     of the rows, xn, xw of the columns; out: (fields, y, x).
     """
-    fields, wide = out.shape[0], out.shape[2]
+    fields = out.shape[0]
+    wide = out.shape[2]
     line = np.zeros((fields, wide))
     for row in range(block.shape[0]):
         line[:] = 0

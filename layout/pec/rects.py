@@ -64,7 +64,8 @@ def pairs_near(
         point: sum of Gaussians.
     """
     order = np.lexsort((boxes_um[:, 0], group))
-    boxes, group = np.ascontiguousarray(boxes_um[order]), group[order]
+    boxes = np.ascontiguousarray(boxes_um[order])
+    group = group[order]
     starts = np.flatnonzero(
         np.r_[np.ones(len(group[:1]), bool), group[1:] != group[:-1], True]
     )
@@ -164,7 +165,8 @@ def _sum(
     across, along = np.empty(x.shape[1]), np.empty(y.shape[1])
     for n in range(start, stop):
         for k in range(widths.shape[0]):
-            reach, scale = 6 * widths[k], 1 / widths[k]
+            reach = 6 * widths[k]
+            scale = 1 / widths[k]
             left, right = x[n].min() - reach, x[n].max() + reach
             bottom, top = y[n].min() - reach, y[n].max() + reach
             for m in range(first[n], last[n]):

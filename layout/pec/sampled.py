@@ -99,7 +99,8 @@ def _distant(scene: ExposedLattices, sites: tuple[Array, Array]) -> Array:
     """(samples,) background from all that is more than 5 sites away, by the direct sum
     of Gaussians.
     """
-    lens, area = scene.bodies[0], scene.drawn.area_um2
+    lens = scene.bodies[0]
+    area = scene.drawn.area_um2
     at_x = lens.columns_um[sites[1]]
     at_y = lens.rows_um(0, lens.rows)[sites[0]]
     ranges = [*_terms(scene.ranges.far), *_terms(scene.ranges.middle)]
@@ -157,11 +158,14 @@ def _close(
     Gaussians of their second moments where the point exposure is far wider than these.
     """
     (index, given), (row, column) = block, site
-    body, drawn, point = scene.bodies[0], scene.drawn, scene.point
+    body = scene.bodies[0]
+    drawn = scene.drawn
+    point = scene.point
     others = index > 0
     others[row, column] = False
     i, j = np.nonzero(others)
-    entry, dose = index[i, j], given[i, j]
+    entry = index[i, j]
+    dose = given[i, j]
     # rows run towards -y
     place = np.column_stack([(j - column) * body.pitch_um, (row - i) * body.down_um])
     away = np.hypot(*place.T)

@@ -30,7 +30,8 @@ def printable_limits(
             keeps both rules on this pitch.
     """
     process = load_process(path)
-    rules, pitch = process.rules, pitch_um / nm
+    rules = process.rules
+    pitch = pitch_um / nm
     least = max(4 * rules.grid_nm, rules.diameter_step_nm)
     sizes = np.arange(
         least, min(pitch, least + _MOST_STEPS * rules.diameter_step_nm), 1
@@ -61,7 +62,8 @@ def printable_limits(
             f"{path}: no pillar keeps {rules.minimum_feature_nm:g} nm and leaves {rules.minimum_gap_nm:g} nm on a "
             f"pitch of {pitch:.4g} nm; widen the pitch or change the process"
         )
-    step, alone = rules.diameter_step_nm, process.bias.isolated_nm
+    step = rules.diameter_step_nm
+    alone = process.bias.isolated_nm
     low = float(process.made_diameter_nm(drawn[fine][0] - 0.45 * step)) + max(
         0.0, alone
     )

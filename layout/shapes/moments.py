@@ -18,7 +18,9 @@ def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
     Args:
         contours: of one polygon.
     """
-    area, first, second = 0.0, np.zeros(2), 0.0
+    area = 0.0
+    first = np.zeros(2)
+    second = 0.0
     for a in contours:
         b = np.roll(a, -1, axis=0)
         cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]

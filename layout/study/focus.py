@@ -74,7 +74,8 @@ class FocusSums:
             moments: (maps, nodes y, nodes x) from :meth:`project`.
             shift_um: (x, y) by which the pillars stand off their sites.
         """
-        window, k = self.window, self.case.wavenumber
+        window = self.window
+        k = self.case.wavenumber
         nodes_x = self.nodes_x_um + shift_um[0]
         nodes_y = self.nodes_y_um[:, None] + shift_um[1]
         slow = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])

@@ -161,7 +161,8 @@ def reduction_error(model: SpreadModel, lenses: Sequence[Draw]) -> float:
     """
     worst = 0.0
     for draw in lenses:
-        state, along = draw.state(), np.array([0.0, 1.0, -1.0])
+        state = draw.state()
+        along = np.array([0.0, 1.0, -1.0])
         bias = state.bias_um(
             along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad)
         )

@@ -73,7 +73,8 @@ def simulate_stitching(
     x, y = offsets[..., 0], offsets[..., 1]
     factors = np.stack([x, y, x**2 / 2, y**2 / 2, x * y], axis=1).reshape(draws, -1)
     light = still + np.tensordot(factors, terms.reshape(-1, *still.shape), axes=1)
-    perfect, psf = abs(still) ** 2, abs(light) ** 2
+    perfect = abs(still) ** 2
+    psf = abs(light) ** 2
     change = np.sqrt(((psf - perfect) ** 2).sum((1, 2)) / (perfect**2).sum())
     moved = (
         np.hypot(

@@ -32,7 +32,8 @@ class LensRows:
         Raises:
             ProcessError: a predicted pillar as wide as the pitch.
         """
-        made, was = self._size_um, designed.diameters
+        made = self._size_um
+        was = designed.diameters
         if was.plain and made.max() >= was.pitch_um:
             raise ProcessError(
                 f"a pillar is predicted {made.max():.3f} um wide, as wide as the "

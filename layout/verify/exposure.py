@@ -89,7 +89,8 @@ def verify_exposure(
     point = point_exposure(process.exposure)
     scene = read_scene(content, plan, doses, process)
     field = _Field.of(scene, point)
-    total, box = VerificationTally.empty(), _box(scene.bodies, ())
+    total = VerificationTally.empty()
+    box = _box(scene.bodies, ())
     judged = (scene.dose > 0) & (scene.layer != process.layers.dose[0])
     count = 0
     for rows in _develop(scene, field, plan, process):
@@ -135,7 +136,8 @@ def read_scene(
     Raises:
         ProcessError: a class that is not one outline, or no pillar with a dose.
     """
-    layers, unit = process.layers, content.unit_nm * nm
+    layers = process.layers
+    unit = content.unit_nm * nm
     skipped = {layers.aperture[0], layers.outline[0], layers.fields[0]}
     undosed: set[LayerNumber] = set()
 
@@ -377,7 +379,8 @@ def _sampled(
         lambda number, first, block: scene.dose[block],
     )
     rows, columns, exact = sampled.exact_edges(exposed, samples)
-    worst, judged = 0.0, scene.dose[_entries(scene, rows, columns)] > 0
+    worst = 0.0
+    judged = scene.dose[_entries(scene, rows, columns)] > 0
     off = float(np.abs(exact / THRESHOLD - 1)[judged].max(initial=0.0))
     for row in np.unique(rows).tolist():
         mine = rows == row

@@ -137,7 +137,9 @@ def _near(at_um: Array, polygons: ExposedPolygons, reach: float) -> tuple[Array,
             for c, m in zip(polygons.corners, middle, strict=True)
         ]
     )
-    tree, ones, twos = cKDTree(at_um), [], []
+    tree = cKDTree(at_um)
+    ones = []
+    twos = []
     for n, found in enumerate(tree.query_ball_point(middle, radius + reach)):
         ones.append(np.asarray(found, np.int64))
         twos.append(np.full(len(found), n))
