@@ -292,28 +292,30 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
             "are drawn); draw the pillars, or set exposure.correct = false"
         )
     unit = plan.unit_nm * nm
-    lattices = [dataclasses.replace(l, unit_um=unit) for l in plan.lattices]
+    lattices = [dataclasses.replace(lattice, unit_um=unit) for lattice in plan.lattices]
     point = psf.point_exposure(exposure)
-    goal = np.array([1.0, *(made.goal for made in plan.classes)])
+    goal = np.array([1.0, *(pillar.goal for pillar in plan.classes)])
     kinds = _drawn(plan, unit)
-    number = bodies.count_pillars(lattices, len(goal))
+    counts = bodies.count_pillars(lattices, len(goal))
     densest = min(lattices, key=lambda lattice: lattice.nearest_um)
-    ranges = bodies.split_ranges(point, kinds, number, densest)
+    ranges = bodies.split_ranges(point, kinds, counts, densest)
     table = bodies.exposure_table(
-        kinds, goal, number, point=point, ranges=ranges, body=densest
+        kinds, goal, counts, point=point, ranges=ranges, body=densest
     )
-    boxes, figure, group = _pieces(plan, lattices, point, exposure.tolerance)
-    width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
-    ends = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
-    box = (*ends[:, :2].min(0).tolist(), *ends[:, 2:].max(0).tolist())
-    grid = NodeGrid.over(box, width)
-    close = PointExposure(
+    boxes, figure, shape = _pieces(plan, lattices, point, exposure.tolerance)
+    narrowest_um = (
+        float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
+    )
+    boxes_um = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
+    die_box = (*boxes_um[:, :2].min(0).tolist(), *boxes_um[:, 2:].max(0).tolist())
+    grid = NodeGrid.over(die_box, narrowest_um)
+    near_and_middle = PointExposure(
         np.r_[ranges.near.widths_um, ranges.middle.widths_um],
         np.r_[ranges.near.weights, ranges.middle.weights],
     )
-    own = rects.self_exposure(boxes * unit, group, close)
-    spots = rects.rectangle_samples(boxes * unit, width / _SPOTS)
-    marks = ExposedMarks(grid, boxes, figure, *own, spots)
+    edges = rects.self_exposure(boxes * unit, shape, near_and_middle)
+    spots = rects.rectangle_samples(boxes * unit, narrowest_um / _SPOTS)
+    marks = ExposedMarks(grid, boxes, figure, *edges, spots)
     far, near = _backgrounds(lattices, table, ranges, marks)
     return WantedDoses(plan, lattices, table, ranges, far, near, marks)
 
@@ -581,7 +583,7 @@ def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
         if figure.name in EXPOSED
         for layer in figure.polygons
     }
-    kept_doses, kept_names = (
+    other_doses, other_names = (
         {layer: value for layer, value in values.items() if layer not in replaced}
         for values in (plan.doses, plan.layer_names)
     )
@@ -597,11 +599,11 @@ def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
         lattices=lattices,
         figures=figures,
         doses={
-            **kept_doses,
+            **other_doses,
             **{pillar.layer: pillar.dose for pillar in classes},
             **mark_doses,
         },
-        layer_names={**kept_names, **names, **titles},
+        layer_names={**other_names, **names, **titles},
     )
 
 

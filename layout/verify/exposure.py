@@ -211,10 +211,10 @@ def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
         for place in zip(stack.x, stack.y, strict=True)
     ]
     contours = drawn if len(drawn) == 1 else region.union_contours(drawn)
-    outer_contours = sum(polygon.twice_area(contour) > 0 for contour in contours)
-    if outer_contours != 1 or len({stack.layer for stack in stacks}) > 1:
+    outer = sum(polygon.twice_area(contour) > 0 for contour in contours)
+    if outer != 1 or len({stack.layer for stack in stacks}) > 1:
         raise ProcessError(
-            f"class {name} of pillars draws {outer_contours} outlines; it is not verified as one"
+            f"class {name} of pillars draws {outer} outlines; it is not verified as one"
         )
     return [np.asarray(contour, float) for contour in contours]
 
