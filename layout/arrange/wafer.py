@@ -67,19 +67,19 @@ def usable_dies(
     index = np.column_stack([columns, rows])
     place = index * wafer.pitch_um + wafer.offset_um
     boxes = place[:, [0, 1, 0, 1]] + die_um
-    kept = _usable(wafer, boxes)
+    usable = _usable(wafer, boxes)
     for mark in wafer.marks:
         half = wafer.mark_um / 2 + around_marks_um
         x, y = 1e3 * mark.x_mm, 1e3 * mark.y_mm
-        kept &= (
+        usable &= (
             box_distance(boxes, np.array([x - half, y - half, x + half, y + half])) > 0
         )
-    if not kept.any():
+    if not usable.any():
         raise ProcessError(
             f"no die of {right - left:.0f} x {top - bottom:.0f} um fits on the wafer; change wafer.offset_um, "
             "wafer.edge_exclusion_mm or wafer.diameter_mm"
         )
-    return WaferDies(index[kept], place[kept])
+    return WaferDies(index[usable], place[usable])
 
 
 def refuse_marks_off(wafer: WaferSettings) -> None:
@@ -103,11 +103,20 @@ def chord_um(wafer: WaferSettings) -> float:
 
 
 def _usable(wafer: WaferSettings, boxes: Array) -> Array:
-    """(n,) whether boxes (n, 4) lie whole on the usable part."""
+    """(n,) whether a box lies whole on the usable part of the wafer.
+
+    Usable is what is ``edge_exclusion_mm`` from the circle, the flat and the notch.
+
+    Args:
+        wafer: diameter, flat, notch and exclusion.
+        boxes: (n, 4) left, bottom, right, top, um.
+    """
     radius = 500 * wafer.diameter_mm
     exclusion = 1e3 * wafer.edge_exclusion_mm
-    far = np.hypot(np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1))
-    inside = (far <= radius - exclusion + 1e-6) & (
+    farthest = np.hypot(
+        np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1)
+    )
+    inside = (farthest <= radius - exclusion + 1e-6) & (
         boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6
     )
     if wafer.notch_mm:
@@ -129,11 +138,13 @@ def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
     corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius
     left, bottom, right, _ = boxes.T
     x = np.maximum(np.maximum(left, -right), 0.0)  # of the point nearest to the axis
-    up = bottom - corner
-    side = (x + up) / math.sqrt(2)  # from the line of a wall, above 0 outside
-    along = (x - up) / math.sqrt(2)  # down the wall from the corner
-    away = np.where(along >= 0, np.maximum(side, 0.0), np.hypot(x, np.maximum(up, 0)))
-    return np.asarray(away - radius)
+    height = bottom - corner
+    from_wall = (x + height) / math.sqrt(2)  # from the line of a wall, above 0 outside
+    down_wall = (x - height) / math.sqrt(2)  # down the wall from the corner
+    distance = np.where(
+        down_wall >= 0, np.maximum(from_wall, 0.0), np.hypot(x, np.maximum(height, 0))
+    )
+    return np.asarray(distance - radius)
 
 
 def step_and_repeat(
@@ -153,27 +164,35 @@ def step_and_repeat(
     for row, members in itertools.groupby(
         zip(rows, columns, strict=True), key=lambda pair: pair[0]
     ):
-        line = [column for _, column in members]
+        row_columns = [column for _, column in members]
         breaks = [
             0,
-            *(n for n in range(1, len(line)) if line[n] != line[n - 1] + 1),
-            len(line),
+            *(
+                n
+                for n in range(1, len(row_columns))
+                if row_columns[n] != row_columns[n - 1] + 1
+            ),
+            len(row_columns),
         ]
-        spans[row] = [(line[a], line[b - 1] + 1) for a, b in itertools.pairwise(breaks)]
-    at = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
+        spans[row] = [
+            (row_columns[start], row_columns[stop - 1] + 1)
+            for start, stop in itertools.pairwise(breaks)
+        ]
+    die_number = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
     open_runs: dict[tuple[int, int], int] = {}
-    made: list[tuple[tuple[int, int], int, int]] = []
+    blocks: list[tuple[tuple[int, int], int, int]] = []
     for row in range(min(spans), max(spans) + 2):
-        here = set(spans.get(row, ()))
-        made += [
-            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - here)
+        runs = set(spans.get(row, ()))
+        blocks += [
+            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - runs)
         ]
-        open_runs.update(dict.fromkeys(here - open_runs.keys(), row))
+        open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
     step = _steps(found, units_per_um)
     copies = []
-    for (first, end), low, high in made:
+    for (first, end), low, high in blocks:
         x, y = (
-            round(v * units_per_um) for v in found.place_um[at[first, low]].tolist()
+            round(v * units_per_um)
+            for v in found.place_um[die_number[first, low]].tolist()
         )
         copies.append(
             CellReference(

@@ -52,13 +52,15 @@ def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses
     """
     counts = np.zeros(1 << 16, np.int64)
 
-    def counted() -> Iterator[tuple[int, Array]]:
+    def count_blocks() -> Iterator[tuple[int, Array]]:
         for first, block in drawn_blocks(diameters, process):
-            found = np.bincount(block.ravel())
-            counts[: len(found)] += found
+            block_counts = np.bincount(block.ravel())
+            counts[: len(block_counts)] += block_counts
             yield first, block
 
-    drawn = hold_on_disk(diameters.diameter_um.shape, np.dtype(np.uint16), counted())
+    drawn = hold_on_disk(
+        diameters.diameter_um.shape, np.dtype(np.uint16), count_blocks()
+    )
     if counts[1:].sum() == 0:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     used = np.flatnonzero(counts)
@@ -90,9 +92,9 @@ def drawn_blocks(
     pitch = diameters.pitch_um
     step = process.rules.diameter_step_nm
     table = np.arange(round(pitch * _FINE / nm) + 2) / _FINE
-    straight = np.rint(process.written_diameter_nm(table) / step)
-    straight[0] = 0
-    lookup = np.clip(straight, 0, 65535).astype(np.uint16)
+    drawn_steps = np.rint(process.written_diameter_nm(table) / step)
+    drawn_steps[0] = 0
+    lookup = np.clip(drawn_steps, 0, 65535).astype(np.uint16)
     for first, block, alone in with_isolation(diameters, process):
         drawn = lookup.take(
             np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32)
@@ -116,24 +118,24 @@ def with_isolation(
     """
     design = diameters.diameter_um
     bias = process.bias
-    reach = (
+    halo = (
         isolation.isolation_halo(diameters.steps_um[1], bias.range_um)
         if bias.isolated_nm
         else 0
     )
-    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * reach)
+    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * halo)
     for first in range(0, design.shape[0], size):
         end = min(first + size, design.shape[0])
-        begin = max(0, first - reach)
-        around = np.asarray(design[begin : end + reach])
-        here = slice(first - begin, end - begin)
+        extended_first = max(0, first - halo)
+        extended = np.asarray(design[extended_first : end + halo])
+        own_rows = slice(first - extended_first, end - extended_first)
         alone = None
-        if reach:
+        if halo:
             lattice = diameters.lattice.centred
             alone = isolation.isolation_map(
-                around > 0, diameters.steps_um, bias.range_um, centred=lattice
-            )[here]
-        yield first, around[here], alone
+                extended > 0, diameters.steps_um, bias.range_um, centred=lattice
+            )[own_rows]
+        yield first, extended[own_rows], alone
 
 
 def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) -> None:
@@ -141,17 +143,29 @@ def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) 
     rows, columns = np.nonzero((alone > 0) & (design > 0))
     if not len(rows):
         return
-    wanted = process.written_diameter_nm(
+    drawn_nm = process.written_diameter_nm(
         design[rows, columns] / nm, alone[rows, columns]
     )
     drawn[rows, columns] = np.clip(
-        np.rint(wanted / process.rules.diameter_step_nm), 0, 65535
+        np.rint(drawn_nm / process.rules.diameter_step_nm), 0, 65535
     )
 
 
 def _refuse_impossible(
     drawn: Array, design: Array, first: int, pitch_um: float, step: int
 ) -> None:
+    """Refuse drawn pillars as wide as the pitch, or of diameter 0.
+
+    Args:
+        drawn: (rows, columns) drawn diameters in steps.
+        design: (rows, columns) designed diameters, um.
+        first: number of the first row.
+        pitch_um: of the lattice.
+        step: diameter step, nm.
+
+    Raises:
+        ProcessError: such a pillar, with row and column.
+    """
     widest = int(drawn.max(initial=0)) * step * nm
     if widest >= pitch_um:
         row, column = divmod(int(drawn.argmax()), drawn.shape[1])
@@ -159,9 +173,9 @@ def _refuse_impossible(
             f"drawn diameter at row {first + row}, column {column} is {widest:g} um, need less than the pitch of "
             f"{pitch_um:g} um; cap the diameters or check the bias"
         )
-    vanished = (drawn == 0) & (design > 0)
-    if vanished.any():
-        row, column = (int(i) for i in np.argwhere(vanished)[0])
+    has_vanished = (drawn == 0) & (design > 0)
+    if has_vanished.any():
+        row, column = (int(i) for i in np.argwhere(has_vanished)[0])
         raise ProcessError(
             f"pillar at row {first + row}, column {column}, {design[row, column]} um wide, would be drawn "
             f"with diameter 0 (step {step} nm); raise the smallest diameter or check the bias"

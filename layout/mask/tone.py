@@ -26,16 +26,16 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
         ProcessError: a pillar wider than its lattice square, lattices of different
             pitches.
     """
-    kinds = {
+    pitches = {
         (lattice.pitch, lattice.down, lattice.centred) for lattice in plan.lattices
     }
-    if len(kinds) > 1:
+    if len(pitches) > 1:
         raise ProcessError(
-            f"tone 'negative' with lattices of pitches {sorted({each[0] for each in kinds})}: put them on masks of "
+            f"tone 'negative' with lattices of pitches {sorted({pitch[0] for pitch in pitches})}: put them on masks of "
             "their own"
         )
     square = _square(plan.lattices[0], plan.grid)
-    classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
+    classes = tuple(_around(pillar, square, plan.grid) for pillar in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     clear = [
         box
@@ -47,10 +47,10 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     ]
     if clear:
         figures.append(FigureCell("CLEAR", {process.layers.pillar: tuple(clear)}))
-    kept = [
+    unexposed = [
         figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)
     ]
-    return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
+    return plan.replace(classes=classes, figures=(*unexposed, *figures), standing=plan)
 
 
 def lattice_box(lattice: PillarArray, grid: int) -> Array:
@@ -85,52 +85,68 @@ def _square(lattice: PillarArray, grid: int) -> tuple[int, int, int, int]:
 
 
 def _around(
-    made: PillarClass, square: tuple[int, int, int, int], grid: int
+    pillar: PillarClass, square: tuple[int, int, int, int], grid: int
 ) -> PillarClass:
-    (left, bottom), (right, top) = made.outline.min(0), made.outline.max(0)
+    """A pillar class that draws its lattice square without the pillar.
+
+    Args:
+        pillar: class of the standing pillars.
+        square: left, bottom, right, top about the site.
+        grid: step of the coordinates.
+
+    Raises:
+        ProcessError: the pillar is wider than the square.
+    """
+    (left, bottom), (right, top) = pillar.outline.min(0), pillar.outline.max(0)
     if left < square[0] or bottom < square[1] or right > square[2] or top > square[3]:
         raise ProcessError(
-            f"class {made.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
+            f"class {pillar.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
             f"{square[2] - square[0]} by {square[3] - square[1]}: tone 'negative' draws what is left of the square; "
             "widen the pitch"
         )
-    left_over = region.subtract_contours(
-        [rectilinear.box_corners(np.array(square))], made.contours
+    remainder = region.subtract_contours(
+        [rectilinear.box_corners(np.array(square))], pillar.contours
     )
     return dataclasses.replace(
-        made, drawn=tuple(region.without_holes(left_over, grid=grid))
+        pillar, drawn=tuple(region.without_holes(remainder, grid=grid))
     )
 
 
 def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
-    """Rectangles over what no pillar's square covers: equal runs of neighbouring rows
-    together.
+    """Rectangles over the squares of sites without pillar.
 
-    left_of, top_of: edges of a square about its site. In columns of the grid: a brick
-    covers two of them.
+    Equal runs of empty columns in neighbouring rows are one rectangle. On a centred
+    lattice a square covers two columns.
+
+    Args:
+        lattice: of pillars.
+        left_of: left edge of a square about its site.
+        top_of: top edge.
     """
-    made: list[Array] = []
-    open_runs: dict[tuple[int, int], int] = {}
+    rectangles: list[Array] = []
+    first_row_of_run: dict[tuple[int, int], int] = {}
 
     def close(run: tuple[int, int], end: int) -> Array:
         left, right = (lattice.x0 + column * lattice.pitch + left_of for column in run)
         top, bottom = (
             lattice.y0 - row * lattice.down + top_of
-            for row in (open_runs.pop(run), end)
+            for row in (first_row_of_run.pop(run), end)
         )
         return rectilinear.box_corners(np.array([left, bottom, right, top]))
 
-    wide = 2 if lattice.centred else 1
+    site_columns = 2 if lattice.centred else 1
     for first, block in lattice.blocks():
-        free = np.ones((len(block), lattice.columns + wide - 1), bool)
-        for part in range(wide):
-            free[:, part : part + lattice.columns] &= block == 0
+        free = np.ones((len(block), lattice.columns + site_columns - 1), bool)
+        for offset in range(site_columns):
+            free[:, offset : offset + lattice.columns] &= block == 0
         for row, empty in enumerate(free, first):
             edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
             runs = set(zip(edges[::2], edges[1::2], strict=True))
-            made += [close(run, row) for run in sorted(open_runs.keys() - runs)]
-            open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
-    return made + [close(run, lattice.rows) for run in sorted(open_runs)]
+            rectangles += [
+                close(run, row) for run in sorted(first_row_of_run.keys() - runs)
+            ]
+            first_row_of_run.update(dict.fromkeys(runs - first_row_of_run.keys(), row))
+    return rectangles + [close(run, lattice.rows) for run in sorted(first_row_of_run)]
 
 
 def _surroundings(

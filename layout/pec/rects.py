@@ -286,40 +286,48 @@ def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
 def _free(
     boxes: Array,
     starts: Array,
-    near: Array,
+    neighbours: Array,
     step: float,
-    part: Array,
-    piece: Array,
+    parts: Array,
+    pieces: Array,
     sides: Array,
 ) -> int:
-    """Fill in the free parts of all sides (across, from, to), longer than a step; how
-    many there are.
+    """Number of uncovered parts of all sides; the parts themselves are written out.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top, um.
+        starts: (n + 1,) first entry of each box in ``neighbours``.
+        neighbours: numbers of the boxes around each.
+        step: shorter parts are left out; also how far outside a side another box must
+            reach to cover it, um.
+        parts: (room, 3) output: coordinate across the side, and from, to along it.
+        pieces: (room,) output: box of each part.
+        sides: (room,) output: 0 left, 1 bottom, 2 right, 3 top.
     """
     count = 0
     for n in range(boxes.shape[0]):
-        neighbours = boxes[near[starts[n] : starts[n + 1]]]
+        around = boxes[neighbours[starts[n] : starts[n + 1]]]
         for side in range(4):  # left, bottom, right, top
             across, along = side % 2, 1 - side % 2
-            at = boxes[n, side]
-            outside = at - step if side < 2 else at + step
-            over = neighbours[
-                (neighbours[:, across] <= outside)
-                & (neighbours[:, across + 2] >= outside)
+            position = boxes[n, side]
+            outside = position - step if side < 2 else position + step
+            covering = around[
+                (around[:, across] <= outside) & (around[:, across + 2] >= outside)
             ]
-            over = over[np.argsort(over[:, along])]
+            covering = covering[np.argsort(covering[:, along])]
             low, high = boxes[n, along], boxes[n, along + 2]
-            for k in range(over.shape[0] + 1):
-                end = over[k, along] if k < over.shape[0] else high
+            for number in range(covering.shape[0] + 1):
+                end = covering[number, along] if number < covering.shape[0] else high
                 if low < high and min(end, high) - low > step:
-                    part[count, 0], part[count, 1], part[count, 2] = (
-                        at,
+                    parts[count, 0], parts[count, 1], parts[count, 2] = (
+                        position,
                         low,
                         min(end, high),
                     )
-                    piece[count], sides[count] = n, side
+                    pieces[count], sides[count] = n, side
                     count += 1
-                if k < over.shape[0]:
-                    low = max(low, over[k, along + 2])
+                if number < covering.shape[0]:
+                    low = max(low, covering[number, along + 2])
     return count
 
 
