@@ -87,7 +87,7 @@ def of_plan(
             if figure.name not in UNDRAWN:
                 boxes[_exposure(layer, process)] += boxes_of_shapes
     boxes_of_exposure = {
-        kind: _stacked(boxes_of_shapes) for kind, boxes_of_shapes in boxes.items()
+        exposure: _stacked(listed) for exposure, listed in boxes.items()
     }
     library = dataclasses.replace(library, cells=cells)
     extent = box_around(_stacked(all_boxes))

@@ -92,15 +92,15 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
     with work.stages("room between parts"):
         work.near = separation.check_separation(work.placed, work.process)
     spaces = [
-        f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
-        for v in work.near
+        f"{violation.text}: {violation.value / 1e3:.3f} um apart, need {violation.limit / 1e3:.4g}"
+        for violation in work.near
     ]
     more = len(spaces) - _LISTED
     work.failures += spaces[:_LISTED] + ([f"{more} more"] if more > 0 else [])
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    one = joined.die_cell(name, work.placed, kept=kept)
-    return one if record.wafer is None else _stepped(work, record.wafer, one, marks)
+    die = joined.die_cell(name, work.placed, kept=kept)
+    return die if record.wafer is None else _stepped(work, record.wafer, die, marks)
 
 
 def _parts(
@@ -156,15 +156,17 @@ def _parts(
             ).plan
         )
     with work.stages("dose"):
-        solved = make.correct_doses(plans, process, corrected=work.corrected)
-    mark = _frame_part(work, solved.pop()[0]) if has_marks else None
+        solved_plans = make.correct_doses(plans, process, corrected=work.corrected)
+    mark = _frame_part(work, solved_plans.pop()[0]) if has_marks else None
     placed = [
-        joined.PartPlacement(_lens_part(work, drawing, one), part.at)
-        for part, drawing, one in zip(record.lens, drawings, solved, strict=False)
+        joined.PartPlacement(_lens_part(work, drawing, solved_plan), part.at)
+        for part, drawing, solved_plan in zip(
+            record.lens, drawings, solved_plans, strict=False
+        )
     ]
     placed += files
     if record.die is not None:
-        around = _frame_part(work, solved[-1][0])
+        around = _frame_part(work, solved_plans[-1][0])
         placed.append(joined.PartPlacement(around, (Placement(),)))
     return placed, mark
 
@@ -194,11 +196,13 @@ def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
         work.judge_rules(name, check_plan(plan, process.rules))
     if work.corrected and process.exposure.csv is None:
         with work.stages(f"{name}: verify exposure"):
-            found = verify_exposure(library_of(plan), plan, plan.doses, process)
-        if not found.ok:
+            exposure_report = verify_exposure(
+                library_of(plan), plan, plan.doses, process
+            )
+        if not exposure_report.ok:
             work.failures.append(
-                f"{name}: exposure off by {100 * found.worst_exposure:.2g} % and "
-                f"{found.worst_nm:.2g} nm"
+                f"{name}: exposure off by {100 * exposure_report.worst_exposure:.2g} % and "
+                f"{exposure_report.worst_nm:.2g} nm"
             )
     return parts.of_plan(name, plan, process, corrected=work.corrected)
 
@@ -213,7 +217,7 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
     limit = placement_limit(path)
     content = read_mask(path, limit)
     content.refuse_beyond(limit)
-    made = parts.of_file(
+    component = parts.of_file(
         part.name,
         path,
         content,
@@ -221,47 +225,52 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
         cell=part.cell,
         relative_dose=part.relative_dose,
     )
-    texts = made.library.skipped["text"]
-    for number, what in ((texts, "texts"), (made.empty, "shapes without area")):
+    text_count = component.library.skipped["text"]
+    for number, kind in (
+        (text_count, "texts"),
+        (component.empty, "shapes without area"),
+    ):
         if number:
             work.notes.append(
-                f"{number} {what} of {path.name} are left out: they draw nothing"
+                f"{number} {kind} of {path.name} are left out: they draw nothing"
             )
     if part.checked:
         layers = work.process.layers
         skip = {layers.outline[0], layers.fields[0]}
-        drawn = {number for number, _ in made.library.layers}
+        drawn = {number for number, _ in component.library.layers}
         with work.stages(f"{part.name}: check"):
             chosen = [(number, None) for number in sorted(drawn - skip)]
-            report = check_library(made.library, work.process.rules, layers=chosen)
+            report = check_library(component.library, work.process.rules, layers=chosen)
         work.judge_rules(part.name, report)
     else:
         work.unchecked.append(part.name)
-    if work.corrected and made.uncorrected:
-        names = ", ".join(f"{a}/{b}" for a, b in list(made.uncorrected)[:8])
-        doses = sorted({made.library.doses[layer] for layer in made.uncorrected})
+    if work.corrected and component.uncorrected:
+        names = ", ".join(f"{a}/{b}" for a, b in list(component.uncorrected)[:8])
+        doses = sorted(
+            {component.library.doses[layer] for layer in component.uncorrected}
+        )
         work.failures.append(
-            f"{part.name}: {sum(made.uncorrected.values()):,} shapes on {names}"
-            f"{', ...' * (len(made.uncorrected) > 8)} of {part.file} get the relative "
+            f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names}"
+            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the relative "
             f"dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
             "correction; correct the file and lay its doses.csv beside it, or set "
             "exposure.correct = false"
         )
-    return made
+    return component
 
 
 def _stepped(
     work: FloorplanWork,
     size: WaferSettings,
-    one: MaskLibrary,
+    die: MaskLibrary,
     mark: parts.DieComponent | None,
 ) -> MaskLibrary:
     """The wafer: as many whole dies as it holds, and its marks."""
-    scattered = separation.reach_um(work.process)
-    inner = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
-    need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
+    scatter_um = separation.reach_um(work.process)
+    exposed_box = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
+    need = max(scatter_um, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
-        between = pitch - float(inner[2 + axis] - inner[axis])
+        between = pitch - float(exposed_box[2 + axis] - exposed_box[axis])
         if between < need:
             work.failures.append(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
@@ -269,13 +278,13 @@ def _stepped(
             )
     box = separation.extent_of_copies(work.placed) / joined.PER_UM
     left, bottom, right, top = box.tolist()
-    margin = max(scattered, joined.MARGIN_UM)
+    margin = max(scatter_um, joined.MARGIN_UM)
     box_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
-    steps = wafer.step_and_repeat(one.name, work.dies, units_per_um=joined.PER_UM)
+    steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=joined.PER_UM)
     at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
     marks = None if mark is None else joined.PartPlacement(mark, at)
-    return joined.wafer_cell(work.record.name, one, steps, marks)
+    return joined.wafer_cell(work.record.name, die, steps, marks)
 
 
 def _write(work: FloorplanWork, made: MaskLibrary) -> None:
@@ -291,11 +300,11 @@ def _write(work: FloorplanWork, made: MaskLibrary) -> None:
             write(made, path)
         with work.stages(f"read back {name}"):
             content = read_mask(path, make.MOST_READ, keep=make.KEPT)
-            found = compare.mask_differences(made, content)
+            differences = compare.mask_differences(made, content)
         work.failures += [
-            f"{name} does not read back as planned: {text}" for text in found
+            f"{name} does not read back as planned: {text}" for text in differences
         ]
-        work.different |= {name} if found else set()
+        work.different |= {name} if differences else set()
         work.written[name] = path.stat().st_size
 
 
@@ -310,12 +319,12 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
     ]
     write_lyp(made, work.folder / "mask.lyp")
     handover.write_dose_table(made, work.process, work.folder / "doses.csv")
-    most = work.process.exposure.maximum_classes
+    limit = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
-    held = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
-    if held > most:
+    dose_count = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
+    if dose_count > limit:
         work.failures.append(
-            f"{held} doses on the mask, exposure.maximum_classes = {most}"
+            f"{dose_count} doses on the mask, exposure.maximum_classes = {limit}"
         )
     texts = {
         "process.toml": config.dumps(work.process),
@@ -337,6 +346,7 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
 
 
 def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
+    """Values of layout.json of an arrangement."""
     return {
         "ok": not work.failures,
         "failures": work.failures,
@@ -406,6 +416,7 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
 
 
 def _text(work: FloorplanWork, made: MaskLibrary) -> str:
+    """Summary for a person: verdict, notes, files and time."""
     target = work.options.output
     lines = [] if work.failures and not work.unchecked else [work.verdict]
     lines += work.notes

@@ -92,8 +92,8 @@ def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnL
         )
         transaction.check_room(options.output, _room(options, source))
     with stages("classes"):
-        made = build.draw_mask(source, process, name=options.name, furniture=furniture)
-    return DrawnLens(options, source, process, made, stages)
+        mask = build.draw_mask(source, process, name=options.name, furniture=furniture)
+    return DrawnLens(options, source, process, mask, stages)
 
 
 def correct_doses(
@@ -144,16 +144,18 @@ def make_mask(
 def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
     source = drawing.source
-    rules = drawing.process
+    process = drawing.process
     stages = drawing.stages
-    made = drawing.made
+    mask = drawing.made
     with stages("write fields"):
-        split = fields.split_write_fields(source.diameters, rules, drawn=made.cells)
-        plan = stages.rows.watched(with_fields(plan, split, rules))
+        write_fields = fields.split_write_fields(
+            source.diameters, process, drawn=mask.cells
+        )
+        plan = stages.rows.watched(with_fields(plan, write_fields, process))
     with stages("check"):
-        found = check_plan(plan, rules.rules, foot_nm=_feet(plan, source, rules))
+        drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
     return LayoutJob(
-        drawing.options, source, rules, made, dose, split, plan, found, stages
+        drawing.options, source, process, mask, dose, write_fields, plan, drc, stages
     )
 
 
@@ -180,6 +182,7 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
 
 
 def _write_masks(job: LayoutJob, target: Path) -> None:
+    """Write the mask files of the options, and read each back."""
     options = job.options
     plan = job.plan
     if options.writes_oasis:
@@ -229,6 +232,7 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
 
 
 def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> None:
+    """Read a mask file back: compare it with the plan, verify its exposure."""
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
@@ -256,9 +260,9 @@ def _verified(
     if job.verified:
         return next(iter(job.verified.values()))
     lattice = job.plan.lattices[0]
-    small = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
-    job.made_rows = LensRows(job.plan) if small else job.made_rows
-    keep = job.made_rows.take if small and job.made_rows else None
+    keeps_rows = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
+    job.made_rows = LensRows(job.plan) if keeps_rows else job.made_rows
+    keep = job.made_rows.take if keeps_rows and job.made_rows else None
     return verify_exposure(
         content,
         job.plan,
@@ -301,13 +305,13 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
         "files": job.written,
         "exposure": {
             name: {
-                "worst_relative": c.worst_exposure,
-                "field_error": c.error,
-                "worst_diameter_nm": c.worst_nm,
-                "pillars": c.pillars,
-                "edges": len(c.edges.x_um),
+                "worst_relative": verified.worst_exposure,
+                "field_error": verified.error,
+                "worst_diameter_nm": verified.worst_nm,
+                "pillars": verified.pillars,
+                "edges": len(verified.edges.x_um),
             }
-            for name, c in job.verified.items()
+            for name, verified in job.verified.items()
         },
         "differences": {
             name: list(outcome.differences) for name, outcome in job.compared.items()

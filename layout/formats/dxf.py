@@ -56,7 +56,9 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
             installed.
         OSError: the target cannot be written.
     """
-    sites = [s for lattice in plan.lattices for s in sites_in(plan, lattice, window)]
+    sites = [
+        site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
+    ]
     if len(sites) > MOST_PILLARS:
         raise ProcessError(
             f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
@@ -66,8 +68,8 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
     with _fixed_stamps():
         drawing = _ezdxf().new("R2000", units=_UM)
         for n, (layer, name) in enumerate(names.items()):
-            made = drawing.layers.add(name, color=1 + n % _COLOURS)
-            made.description = f"{layer[0]}/{layer[1]}"
+            dxf_layer = drawing.layers.add(name, color=1 + n % _COLOURS)
+            dxf_layer.description = f"{layer[0]}/{layer[1]}"
         space = drawing.modelspace()
         scale = plan.unit_nm * 1e-3
         for layer, shapes in _drawn(plan, window).polygons.items():
@@ -117,6 +119,7 @@ def dxf_differences(
 
 
 def _ezdxf() -> Any:
+    """The module ezdxf, which is an optional dependency."""
     try:
         import ezdxf
     except ImportError:
@@ -170,6 +173,7 @@ def sites_in(
 
 
 def _ceil(distance: float, pitch: int, count: int) -> int:
+    """Number of sites before a distance, from 0 to ``count``."""
     return int(np.clip(np.ceil(distance / pitch), 0, count))
 
 
@@ -177,10 +181,10 @@ def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
     """Everything that is written: the pillars of the window and all figures."""
     shapes: dict[LayerNumber, list[Array]] = {}
     for lattice in plan.lattices:
-        for k, x, y in sites_in(plan, lattice, window):
-            made = plan.classes[k - 1]
-            moved = [points + np.array([x, y]) for points in made.polygons]
-            shapes.setdefault(made.layer, []).extend(moved)
+        for number, x, y in sites_in(plan, lattice, window):
+            pillar = plan.classes[number - 1]
+            moved = [points + np.array([x, y]) for points in pillar.polygons]
+            shapes.setdefault(pillar.layer, []).extend(moved)
     for figure in plan.figures:
         for layer, polygons in figure.polygons.items():
             shapes.setdefault(layer, []).extend(polygons)
@@ -189,17 +193,17 @@ def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
 
 def _names(plan: MaskPlan) -> dict[LayerNumber, str]:
     """{(layer, datatype): DXF layer}, each its own."""
-    used = {made.layer for made in plan.classes} | {
+    used = {pillar.layer for pillar in plan.classes} | {
         layer for figure in plan.figures for layer in figure.polygons
     }
-    found: dict[LayerNumber, str] = {}
+    names: dict[LayerNumber, str] = {}
     for layer in sorted(used):
         name = (
             plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}")
             .upper()
             .replace(".", "_")
         )
-        found[layer] = (
-            name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
+        names[layer] = (
+            name if name not in names.values() else f"{name}_L{layer[0]}D{layer[1]}"
         )
-    return found
+    return names

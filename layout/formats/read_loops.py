@@ -31,80 +31,91 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
     first = np.empty(min(_MOST_NAMES, most), np.int64)
     slots = np.full(4 << len(first).bit_length(), -1, np.int32)
     count, names = _srefs(data, at, size, out, slots, first)
-    found = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
+    name_bytes = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
     child, x, y = out[:, :count]
-    return found, child, x, y, at + count * size
+    return name_bytes, child, x, y, at + count * size
 
 
 @compile_loop
 def _srefs(
     data: Array, at: int, size: int, out: Array, slots: Array, first: Array
 ) -> tuple[int, int]:
-    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where
-    each stands first.
+    """Read a run of plain SREF records of equal size.
+
+    Args:
+        data: bytes of the file.
+        at: first byte of the run.
+        size: bytes of each record, from SREF to ENDEL.
+        out: (3, n) output: index of the name, x and y of each.
+        slots: hash table of the names: index, or -1.
+        first: output, byte at which each name stands first.
+
+    Returns:
+        Number of references and of names; the run ends at any other record.
     """
     child, x, y = out[0], out[1], out[2]
     names = 0
     mask = slots.shape[0] - 1
     for n in range(out.shape[1]):
-        p = at + n * size
-        q = p + size - 16
+        start = at + n * size
+        coordinates = start + size - 16
         if not (
-            data[p] == 0
-            and data[p + 1] == 4
-            and data[p + 2] == 10
-            and data[p + 3] == 0
-            and data[p + 4] == 0
+            data[start] == 0
+            and data[start + 1] == 4
+            and data[start + 2] == 10
+            and data[start + 3] == 0
+            and data[start + 4] == 0
         ):
             return n, names
         if not (
-            data[p + 5] == size - 20
+            data[start + 5] == size - 20
             and size > 24
-            and data[p + 6] == 18
-            and data[p + 7] == 6
+            and data[start + 6] == 18
+            and data[start + 7] == 6
         ):
             return n, names
         if not (
-            data[q] == 0
-            and data[q + 1] == 12
-            and data[q + 2] == 16
-            and data[q + 3] == 3
+            data[coordinates] == 0
+            and data[coordinates + 1] == 12
+            and data[coordinates + 2] == 16
+            and data[coordinates + 3] == 3
         ):
             return n, names
         if not (
-            data[q + 12] == 0
-            and data[q + 13] == 4
-            and data[q + 14] == 17
-            and data[q + 15] == 0
+            data[coordinates + 12] == 0
+            and data[coordinates + 13] == 4
+            and data[coordinates + 14] == 17
+            and data[coordinates + 15] == 0
         ):
             return n, names
         key = 0
-        for i in range(p + 8, q):
+        for i in range(start + 8, coordinates):
             key = (key * 131 + int(data[i])) & 0x7FFFFFFF
         slot = (key ^ key >> 15) & mask
         while slots[slot] >= 0:
-            other = first[slots[slot]]
-            same = True
-            for i in range(q - p - 8):
-                if data[other + i] != data[p + 8 + i]:
-                    same = False
+            stored = first[slots[slot]]
+            is_equal = True
+            for i in range(coordinates - start - 8):
+                if data[stored + i] != data[start + 8 + i]:
+                    is_equal = False
                     break
-            if same:
+            if is_equal:
                 break
             slot = (slot + 1) & mask
         if slots[slot] < 0:
             if names == first.shape[0]:
                 return n, names
-            slots[slot], first[names] = names, p + 8
+            slots[slot], first[names] = names, start + 8
             names += 1
         child[n] = slots[slot]
-        x[n] = _big_endian(data, q + 4)
-        y[n] = _big_endian(data, q + 8)
+        x[n] = _big_endian(data, coordinates + 4)
+        y[n] = _big_endian(data, coordinates + 8)
     return out.shape[1], names
 
 
 @compile_loop
 def _big_endian(data: Array, at: int) -> int:
+    """Signed big-endian 32-bit number."""
     value = 0
     for i in range(4):
         value = value << 8 | (int(data[at + i]) + 0)  # 64 bits wide, compiled or not
@@ -169,16 +180,16 @@ def scan_placements(
         ):
             break
         info = data[at + 1]
-        p = at + 2
+        position = at + 2
         number = state[3]
         if info & 0x80:
-            number, p = unsigned_at(data, p, end)
+            number, position = unsigned_at(data, position, end)
         dx, dy = 0, 0
-        if p > 0 and info & 0x20:
-            dx, p = unsigned_at(data, p, end)
-        if p > 0 and info & 0x10:
-            dy, p = unsigned_at(data, p, end)
-        if p < 0 or number < 0:
+        if position > 0 and info & 0x20:
+            dx, position = unsigned_at(data, position, end)
+        if position > 0 and info & 0x10:
+            dy, position = unsigned_at(data, position, end)
+        if position < 0 or number < 0:
             break
         new_x = -(dx >> 1) if dx & 1 else dx >> 1
         new_y = -(dy >> 1) if dy & 1 else dy >> 1
@@ -190,7 +201,7 @@ def scan_placements(
         child[count], x[count], y[count] = number, new_x, new_y
         turn[count] = (info >> 1 & 3) | (info & 1) << 2
         count = count + 1
-        at = p
+        at = position
     return at, count
 
 
@@ -232,8 +243,8 @@ def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) ->
             )
         if abs(dx) > FARTHEST or abs(dy) > FARTHEST:
             return -1
-        far_x, far_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid
-        if abs(far_x) > FARTHEST or abs(far_y) > FARTHEST:
+        next_x, next_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid
+        if abs(next_x) > FARTHEST or abs(next_y) > FARTHEST:
             return -1
-        x[n], y[n] = far_x, far_y
+        x[n], y[n] = next_x, next_y
     return at

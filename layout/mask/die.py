@@ -183,7 +183,7 @@ def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> A
 
 
 def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
-    """Outline of the die about the lens axis; as large as needed where no size is set."""
+    """Outline of the die about the lens axis; without a set size, as large as needed."""
     die = process.die
     size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
     half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
@@ -263,13 +263,13 @@ def _tests(
             min(abs(box.left), abs(box.right)) < least_x
             or max(abs(box.left), abs(box.right)) > largest_x
         ):
-            need_um = (
+            need = (
                 (box.right - box.left) / unit.per_um
                 + 2 * CLEAR_UM
                 + process.die.street_um
             )
             raise ProcessError(
-                f"the die is too small for {name}: {need_um:.0f} um are needed between aperture and die edge; "
+                f"the die is too small for {name}: {need:.0f} um are needed between aperture and die edge; "
                 "raise die.margin_um or die.size_um"
             )
         lattices.append(lattice)

@@ -337,20 +337,22 @@ def pillar_classes(
         shape: ``round`` or ``shot``.
         prefix: first letter of the names.
     """
-    digits = max((len(str(int(d))) for d in diameters), default=1)
-    made = []
-    for d in diameters:
+    digits = max((len(str(int(diameter))) for diameter in diameters), default=1)
+    classes = []
+    for diameter in diameters:
         outline = (
-            polygon.pillar_polygon(int(d) / grid, vertices=vertices, shape=shape).points
+            polygon.pillar_polygon(
+                int(diameter) / grid, vertices=vertices, shape=shape
+            ).points
             * grid
         )
-        made.append(
+        classes.append(
             PillarClass(
-                f"{prefix}{int(d):0{digits}}",
-                float(d) * unit_nm,
-                int(d),
+                f"{prefix}{int(diameter):0{digits}}",
+                float(diameter) * unit_nm,
+                int(diameter),
                 layer,
                 outline,
             )
         )
-    return tuple(made)
+    return tuple(classes)

@@ -152,12 +152,20 @@ def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
 def _surroundings(
     plan: MaskPlan, process: Process, boxes: list[Array]
 ) -> list[FigureCell]:
-    """Windows without their marks and labels, and the rest of the die."""
+    """Figures around the lattices of a negative tone: windows, and the die frame.
+
+    The window of a figure is a box 5 um wider than each of its shapes, without the
+    shapes, on the layer of the figure. The frame is the die without lattices, windows
+    and shapes.
+
+    Returns:
+        Figures; none where the plan has no outline of a die.
+    """
     die = [
-        p
+        outline
         for figure in plan.figures
         if figure.name == "OUTLINE"
-        for p in figure.polygons[process.layers.outline]
+        for outline in figure.polygons[process.layers.outline]
     ]
     if not die:
         return []
@@ -173,26 +181,28 @@ def _surroundings(
         for shapes in figure.polygons.values()
         for shape in shapes
     ]
-    taken = list(boxes)
-    made = []
+    covered = list(boxes)
+    figures = []
     for figure in drawn:
-        left = {}
+        polygons = {}
         for layer, shapes in figure.polygons.items():
             window = region.overlap_contours(
-                region.subtract_contours([_grown(s, margin) for s in shapes], taken),
+                region.subtract_contours(
+                    [_grown(shape, margin) for shape in shapes], covered
+                ),
                 die,
             )
-            left[layer] = tuple(
+            polygons[layer] = tuple(
                 region.without_holes(
                     region.subtract_contours(window, standing), grid=plan.grid
                 )
             )
-            taken += [_grown(s, margin) for s in shapes]
-        made.append(FigureCell(figure.name, left))
-    rest = region.without_holes(
-        region.subtract_contours(die, [*taken, *standing]), grid=plan.grid
+            covered += [_grown(shape, margin) for shape in shapes]
+        figures.append(FigureCell(figure.name, polygons))
+    frame = region.without_holes(
+        region.subtract_contours(die, [*covered, *standing]), grid=plan.grid
     )
-    return [*made, FigureCell("FRAME", {process.layers.pillar: tuple(rest)})]
+    return [*figures, FigureCell("FRAME", {process.layers.pillar: tuple(frame)})]
 
 
 def _rim(boxes: list[Array], width: int, process: Process) -> FigureCell:
