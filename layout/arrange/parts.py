@@ -234,7 +234,7 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
 
     def rescaled(old: MaskCell) -> MaskCell:
         placed = old.kept()
-        x, y = (scaled(v).astype(np.int32) for v in (placed.x, placed.y))
+        x, y = (scaled(places).astype(np.int32) for places in (placed.x, placed.y))
         circles = {
             layer: [tuple(row) for row in scaled(np.array(shapes)).tolist()]
             for layer, shapes in old.circles.items()
@@ -242,7 +242,8 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
         return dataclasses.replace(
             old,
             polygons={
-                k: [scaled(p) for p in shapes] for k, shapes in old.polygons.items()
+                k: [scaled(points) for points in shapes]
+                for k, shapes in old.polygons.items()
             },
             circles=circles,
             placed=dataclasses.replace(placed, x=x, y=y),

@@ -95,8 +95,8 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
         f"{violation.text}: {violation.value / 1e3:.3f} um apart, need {violation.limit / 1e3:.4g}"
         for violation in work.near
     ]
-    more = len(spaces) - _LISTED
-    work.failures += spaces[:_LISTED] + ([f"{more} more"] if more > 0 else [])
+    unlisted = len(spaces) - _LISTED
+    work.failures += spaces[:_LISTED] + ([f"{unlisted} more"] if unlisted > 0 else [])
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
     die = joined.die_cell(name, work.placed, kept=kept)

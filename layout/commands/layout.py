@@ -36,6 +36,7 @@ def run(options: Options) -> int:
 
 
 def _text(job: LayoutJob, target: Path) -> str:
+    """Summary for a person: verdict, files, differences and first violations."""
     lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
@@ -50,8 +51,8 @@ def _text(job: LayoutJob, target: Path) -> str:
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]
     lines += [
-        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}) nm: {v.summary}"
-        for v in job.drc.violations[:10]
+        f"  {violation.rule} at ({violation.centre[0]:.0f}, {violation.centre[1]:.0f}) nm: {violation.summary}"
+        for violation in job.drc.violations[:10]
     ]
     lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")
     return "\n".join(lines)

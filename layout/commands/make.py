@@ -172,11 +172,17 @@ def _room(options: Options, source: Lens) -> int:
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
-    """(classes,) diameters at the foot of what the etch makes of each class; isolated
-    pillars count where wider.
+    """(classes,) larger diameter of foot and top of each class after the etch, nm.
+
+    Isolated pillars count where the bias makes them wider.
+
+    Args:
+        plan: drawn diameters.
+        source: with the height of the pillars.
+        rules: process.
     """
-    drawn = np.array([made.diameter_nm for made in plan.classes])
-    made = rules.made_diameter_nm(drawn) + max(0.0, rules.bias.isolated_nm)
+    drawn_nm = np.array([made.diameter_nm for made in plan.classes])
+    made = rules.made_diameter_nm(drawn_nm) + max(0.0, rules.bias.isolated_nm)
     top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
     return np.maximum(top, foot)
 
@@ -291,17 +297,17 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
     Args:
         job: that has been written.
     """
-    found = job.drc
+    drc = job.drc
     return {
         "ok": job.ok,
         "failures": job.failures,
-        "pillars": found.shapes,
+        "pillars": drc.shapes,
         "classes": len(job.plan.classes),
         "diameters": len(job.made.cells.diameters_nm),
-        **found.sizes,
-        "maximum_density": found.maximum_density,
-        "violations": found.counts,
-        "worst": found.worst,
+        **drc.sizes,
+        "maximum_density": drc.maximum_density,
+        "violations": drc.counts,
+        "worst": drc.worst,
         "files": job.written,
         "exposure": {
             name: {

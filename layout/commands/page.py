@@ -115,14 +115,14 @@ def _lead(job: LayoutJob) -> str:
 
 def _key_figures(job: LayoutJob) -> list[KeyFigure]:
     """Key figures of a mask: pillars, smallest sizes, violations, files."""
-    found = job.drc
-    counts = found.counts
+    drc = job.drc
+    counts = drc.counts
     as_planned = all(outcome.ok for outcome in job.compared.values())
     violations = sum(counts.values())
     too_close = counts["space"] + counts["overlap"]
-    gap, width = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
+    gap, width = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
     return [
-        KeyFigure("pillars", f"{found.shapes:,}"),
+        KeyFigure("pillars", f"{drc.shapes:,}"),
         KeyFigure("smallest gap", gap, too_close == 0),
         KeyFigure("thinnest pillar", width, counts["width"] == 0),
         KeyFigure("violations", f"{violations:,}", violations == 0),
@@ -157,6 +157,12 @@ def _rules(found: DrcReport) -> Section:
 
 
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
+    """Section on the drawn pillars: sizes and steps, and for discs a table of polygons.
+
+    Args:
+        job: of the command.
+        shots: pictures, from :func:`draw_pictures`.
+    """
     rules = job.process.rules
     classes = job.plan.classes
     if not classes[0].round:

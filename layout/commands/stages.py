@@ -87,7 +87,8 @@ class StageTimes:
             self.seconds[stage] = time.perf_counter() - start
 
     def _tick(self, stage: str, start: float, over: threading.Event) -> None:
-        wait, then = self._waits
+        """Report a stage that lasts: after the first wait, then at every next wait."""
+        wait, next_wait = self._waits
         while not over.wait(wait):
             self._say(f"{stage}: {time.perf_counter() - start:.0f} s{self.rows.text}")
-            wait = then
+            wait = next_wait

@@ -689,7 +689,7 @@ class _LayerCheck:
                 for u, v in xy[is_off].tolist()
             )
             violations = (
-                Violation("off-grid", found, 0.0, limit, cell) for found in boxes
+                Violation("off-grid", at_box, 0.0, limit, cell) for at_box in boxes
             )
             report.add(
                 "off-grid",

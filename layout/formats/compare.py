@@ -142,11 +142,11 @@ def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
 
 def _canonical_corners(points: Array) -> bytes:
     """Corners from the smallest on, counter-clockwise."""
-    p = np.asarray(points, np.int64)
-    if polygon.twice_area(p) < 0:
-        p = p[::-1]
-    first = int(np.lexsort((p[:, 1], p[:, 0]))[0])
-    return np.roll(p, -first, axis=0).tobytes()
+    corners = np.asarray(points, np.int64)
+    if polygon.twice_area(corners) < 0:
+        corners = corners[::-1]
+    first = int(np.lexsort((corners[:, 1], corners[:, 0]))[0])
+    return np.roll(corners, -first, axis=0).tobytes()
 
 
 def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
@@ -157,8 +157,8 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
         merged: all orientations together, as a reader sums them.
     """
     if cell.sums is not None:
-        every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
-        return {(child, None): tuple(sums) for child, *sums in every}
+        rows = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
+        return {(child, None): tuple(sums) for child, *sums in rows}
     digests: dict[Who, RunningDigest] = {}
     for child, turn, x, y in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)

@@ -55,9 +55,9 @@ class Orientation:
                 x, y = -y, x
             return x, y
         angle = math.radians(self.angle_deg)
-        c = self.scale * math.cos(angle)
-        s = self.scale * math.sin(angle)
-        turned = np.rint(c * x - s * y), np.rint(s * x + c * y)
+        cosine = self.scale * math.cos(angle)
+        sine = self.scale * math.sin(angle)
+        turned = np.rint(cosine * x - sine * y), np.rint(sine * x + cosine * y)
         return turned[0].astype(np.int64), turned[1].astype(np.int64)
 
     def after(self, inner: "Orientation") -> "Orientation":
@@ -133,10 +133,12 @@ class CellReference:
 
     def places(self) -> tuple[Array, Array]:
         """x and y of all instances, (count,) each, row by row."""
-        i, j = np.arange(self.columns), np.arange(self.rows)[:, None]
+        column, row = np.arange(self.columns), np.arange(self.rows)[:, None]
         x, y = (
-            at + i * a + j * u
-            for at, a, u in zip((self.x, self.y), self.across, self.up, strict=True)
+            origin + column * step + row * row_step
+            for origin, step, row_step in zip(
+                (self.x, self.y), self.across, self.up, strict=True
+            )
         )
         return x.ravel(), y.ravel()
 
@@ -350,9 +352,9 @@ class MaskLibrary:
     @property
     def skipped(self) -> Counter[str]:
         """Elements of the cells that draw nothing: {kind: number}, texts among them."""
-        found = sum((cell.skipped for cell in self.cells.values()), Counter())
+        skipped = sum((cell.skipped for cell in self.cells.values()), Counter())
         texts = sum(cell.texts for cell in self.cells.values())
-        return found + Counter(text=texts)
+        return skipped + Counter(text=texts)
 
     def cell(self, name: str) -> MaskCell:
         """The cell of a name.

@@ -106,6 +106,7 @@ class PillarArray:
     unit_um: float = 1e-3
 
     def __post_init__(self) -> None:
+        """Refuse an illegal name, and sites beyond 32 bits."""
         names.check_cell_name(self.name)
         right = self.x0 + self.columns * self.pitch
         bottom = self.y0 - self.rows * self.down
@@ -289,7 +290,11 @@ class MaskPlan:
     @property
     def cell_names(self) -> list[str]:
         """Pillar classes, figures, lattices, top: in the order of the file."""
-        return [*(made.name for made in self.classes), *self.placed_names, self.name]
+        return [
+            *(pillar.name for pillar in self.classes),
+            *self.placed_names,
+            self.name,
+        ]
 
     @property
     def placed_names(self) -> list[str]:
@@ -302,13 +307,15 @@ class MaskPlan:
     @property
     def layers(self) -> set[LayerNumber]:
         """All that are drawn on."""
-        used = {made.layer for made in self.classes}
-        return used | {layer for f in self.figures for layer in f.polygons}
+        used = {pillar.layer for pillar in self.classes}
+        return used | {layer for figure in self.figures for layer in figure.polygons}
 
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
         none = np.zeros(len(self.classes) + 1, np.int64)
-        return sum((l.counts(len(self.classes)) for l in self.lattices), none)
+        return sum(
+            (lattice.counts(len(self.classes)) for lattice in self.lattices), none
+        )
 
     def replace(self, **changes: object) -> "MaskPlan":
         """A copy with other values."""
