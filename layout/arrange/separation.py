@@ -79,12 +79,10 @@ def reach_um(process: Process) -> float:
 def check_separation(
     placed: Sequence[PartPlacement], process: Process
 ) -> list[Violation]:
-    """Pairs of parts that are nearer than the least gap, or than one's backscatter lets
-    the other's doses hold.
+    """Pairs of parts closer than the minimum gap, or within reach of scattered electrons.
 
-    Rectilinear shapes are taken as they are, lattices as boxes of some of their pillars
-    (squares of a 64th of the
-    lattice), any other shape as boxes around slices of it (5 um high, or a 64th).
+    Rectilinear shapes are taken as they are. A lattice is taken as boxes of tiles (a
+    64th of it each way), any other shape as boxes of slices (5 um high, or a 64th).
 
     Args:
         placed: parts on the die.
@@ -115,11 +113,11 @@ def check_separation(
 def extent_of_copies(
     placed: Sequence[PartPlacement], *, exposed: bool = False
 ) -> Array:
-    """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``:
-    of what is exposed alone.
+    """(4,) left, bottom, right, top around all copies, database units.
 
     Args:
         placed: parts on the die.
+        exposed: whether only exposed shapes count; else outlines count too.
     """
     boxes = []
     for copy in standing_parts(placed):

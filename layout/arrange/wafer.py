@@ -37,8 +37,9 @@ def usable_dies(
     wafer: its circle, the chord of the flat, the notch (:func:`notch_distance_um`).
 
     Args:
+        wafer: diameter, raster, marks and exclusion.
         die_um: left, bottom, right, top of all that a die draws, about its middle.
-        around_marks_um: kept free around the marks.
+        around_marks_um: distance from the marks that stays free.
 
     Raises:
         ProcessError: dies that overlap, or none that fits.
@@ -125,14 +126,15 @@ def _usable(wafer: WaferSettings, boxes: Array) -> Array:
 
 
 def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
-    """(n,) distances of boxes (n, 4) from the notch; 0 or less where they overlap.
+    """(n,) distance of boxes from the notch, um; 0 or less where they overlap.
 
-    SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` deep. That
-    is a sharp V with its corner at the middle of the bottom's circle, widened by the
-    radius; a box is nearest to it at a corner or an edge of either.
+    SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` in depth.
+    That is a sharp V, with its corner at the centre of the bottom's circle, widened by
+    the radius. A box is nearest to it at a corner or an edge of either.
 
     Args:
         wafer: with its notch.
+        boxes: (n, 4) left, bottom, right, top, um.
     """
     radius = 1e3 * NOTCH_RADIUS_MM
     corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius

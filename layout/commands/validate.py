@@ -37,13 +37,13 @@ class FormatFinding:
 def validate_mask(
     path: str | Path, content: MaskLibrary | None = None
 ) -> list[FormatFinding]:
-    """All findings about a GDSII or OASIS file, whose format its first bytes show; an
-    empty list is a clean file.
+    """All findings about a GDSII or OASIS file; an empty list is a clean file.
 
-    content: what was read of it, where it was read already.
+    The first bytes of the file tell its format.
 
     Args:
         path: of the file.
+        content: what was read of it; None: it is read here.
 
     Raises:
         MaskFileError: an empty file.

@@ -469,6 +469,7 @@ def encloses_point(edges: Array, x: float, y: float) -> bool:
     """Whether the winding number of a polygon about a point off its edges is not 0.
 
     Args:
+        edges: (m, 4) x1, y1, x2, y2.
         x: of the point.
         y: of the point.
     """
@@ -484,9 +485,11 @@ def encloses_point(edges: Array, x: float, y: float) -> bool:
 
 @compile_loop
 def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
-    """(n,) :func:`projected_distance` of pairs (n, 2) of edges.
+    """(n,) :func:`projected_distance` of pairs of edges.
 
     Args:
+        edges: (m, 4) x1, y1, x2, y2.
+        pairs: (n, 2) edge numbers.
         side: 1 through the interior, -1 through the exterior.
     """
     out = np.empty(len(pairs))

@@ -462,13 +462,16 @@ def _distinct_outlines(
 
 
 def lattice_vectors(lattice: PillarArray, reach: float) -> Array:
-    """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one
-    of each opposite pair.
+    """Lattice vectors shorter than ``reach``, one of each opposite pair.
 
-    The nearest sites on all sides are always among them.
+    The nearest sites on all sides are always included.
 
     Args:
         lattice: of the pillars.
+        reach: database units.
+
+    Returns:
+        (m, 2) columns to the right and rows up.
     """
     nearest = 2 if lattice.centred else 1
     across = max(nearest, int(reach // lattice.pitch))
@@ -689,6 +692,7 @@ def _check_merged(
 
     Args:
         polygons: (n, 2) corners each, database units.
+        rules: design rules; the limits of the report apply.
         names: rule that a measured "width" or "notch" is reported as, if another.
         layer: number of the layer, for the report.
         cell: what the polygons are, for the report.

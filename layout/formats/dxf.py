@@ -44,12 +44,15 @@ class DxfWindow:
 
 
 def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
-    """Write the pillars whose site lies in the window, and all figures; the number of
-    pillars.
+    """Write the pillars whose site lies in a window, and all figures, as DXF.
 
     Args:
         plan: of a die.
         path: of the file.
+        window: of the mask.
+
+    Returns:
+        Number of pillars.
 
     Raises:
         ProcessError: more than 200 000 pillars in the window, or ezdxf is not
@@ -147,11 +150,12 @@ def _fixed_stamps() -> Iterator[None]:
 def sites_in(
     plan: MaskPlan, lattice: PillarArray, window: DxfWindow
 ) -> Iterator[tuple[int, int, int]]:
-    """(class, x, y) of the pillars whose site lies in the window, database units.
+    """(class, x, y) of the pillars whose site lies in a window, database units.
 
     Args:
         plan: of a die.
         lattice: one of its lattices.
+        window: of the mask.
     """
     scale = 1e3 / plan.unit_nm
     half = window.size_um / 2

@@ -45,13 +45,13 @@ def read_gdsii(
 def parse_gdsii(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read_gdsii`, from the bytes of a GDSII stream as uint8; ``where`` names them
-    in errors.
+    """Read a GDSII stream from its bytes, as :func:`read_gdsii`.
 
     Args:
         data: bytes, uint8.
         limit: most placements that are read.
         keep: most placements of one structure that are kept; None: all.
+        where: name of the bytes in errors.
     """
     return _Reader(where, data, limit, keep).library()
 

@@ -89,11 +89,10 @@ def charge_uC(
     doses: Mapping[LayerNumber, float],
     process: Process,
 ) -> dict[str, float]:
-    """{step: charge} of the two steps: base dose times relative dose times area.
-
-    areas: um^2 of each layer.
+    """{step: charge in uC} of both steps: base dose times relative dose times area.
 
     Args:
+        areas: um^2 of each layer.
         doses: relative dose of each layer.
         process: base dose, and layer of the aperture.
     """

@@ -622,10 +622,11 @@ class PolygonStack:
 
 
 def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
-    """Every polygon below ``top``; true circles as polygons of 64 corners.
+    """Every polygon below a cell; true circles as polygons of 64 corners.
 
     Args:
         library: of the cells.
+        top: name of the cell.
 
     Raises:
         MaskFileError: as :meth:`MaskLibrary.walk`.

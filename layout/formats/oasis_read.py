@@ -51,13 +51,13 @@ def read_oasis(
 def parse_oasis(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read_oasis`, from the bytes of an OASIS file as uint8; ``where`` names them
-    in errors.
+    """Read an OASIS file from its bytes, as :func:`read_oasis`.
 
     Args:
         data: bytes, uint8.
         limit: most placements and copies that are read.
         keep: most placements of one cell that are kept; None: all.
+        where: name of the bytes in errors.
     """
     return _Reader(ByteCursor(where, data), limit, keep).whole_file()
 

@@ -78,6 +78,7 @@ def cell_name(number: int, name: str) -> bytes:
 
     Args:
         number: that references use.
+        name: of the cell.
     """
     return (
         bytes([oasis.CELLNAME_REF])

@@ -18,20 +18,18 @@ def path_outline(
     end: float = 0.0,
     rounded: bool = False,
 ) -> Array:
-    """(n, 2) polygon of a path, on whole units, corners and round ends as KLayout draws
-    them.
+    """(n, 2) polygon of a path on whole units; corners and ends as in KLayout.
 
-    Corners are mitred, on the outside no further than at a right angle: where the path
-    turns by more, each arm goes on
-    by half its width and the mitre is cut off between them. The formats leave both
-    open.
+    Corners are mitred, on the outside up to a right angle. Where the path turns by
+    more, each arm extends by half its width, and the mitre is cut off between them. The
+    formats leave both open.
 
     Args:
-        points: (m, 2), m >= 1; where all are equal, the path runs along x. begin, end:
-            lengths by which it goes
-            on beyond its ends.
-        rounded: with half circles at the ends.
+        points: (m, 2), m >= 1; where all are equal, the path runs along x.
         half_width: half the width, database units.
+        begin: length by which the path extends beyond its first point.
+        end: length by which it extends beyond its last point.
+        rounded: with half circles at the ends.
     """
     p = np.asarray(points, float)
     p = p[np.r_[True, (np.diff(p, axis=0) != 0).any(1)]]

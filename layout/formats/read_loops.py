@@ -13,10 +13,11 @@ _MOST_NAMES = 65536
 
 
 def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, int]:
-    """Plain GDSII references from byte ``at`` on, all with names of one length.
+    """Plain GDSII references in a row, all with names of one length.
 
     Args:
         data: bytes of the file.
+        at: first byte.
 
     Returns:
         (names, index into names, x, y, byte after the last); nothing where the next
@@ -124,11 +125,13 @@ def _big_endian(data: Array, at: int) -> int:
 
 @compile_loop
 def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
-    """A variable-length integer of at most 6 bytes and the position after it; -1 where
-    it is cut or longer.
+    """A variable-length integer of at most 6 bytes, and the position after it.
+
+    The position is -1 where the integer is cut or longer.
 
     Args:
         data: bytes.
+        at: first byte.
         end: of the bytes.
     """
     value, shift = 0, 0
@@ -146,17 +149,17 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
 def scan_placements(
     data: Array, at: int, end: int, state: Array, out: Array
 ) -> tuple[int, int]:
-    """OASIS placements by reference number without repetition, and switches of the
-    coordinate mode.
+    """Read OASIS placements by reference number without repetition.
 
-    out: (4, n) child, x, y, turn of each, filled.
-    state: (4,) placement x, y, whether relative, and the cell placed last (-1: none),
-    kept up to date.
+    Switches between absolute and relative coordinates are read too.
 
     Args:
         data: bytes.
         at: first byte.
         end: of the bytes.
+        state: (4,) x, y, whether relative, and cell of the last placement (-1: none);
+            updated.
+        out: (4, n) output: child, x, y, turn of each.
 
     Returns:
         (position of the first record that is something else or broken, placements read)
@@ -207,16 +210,18 @@ def scan_placements(
 
 @compile_loop
 def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
-    """Running sums of the g-deltas of a repetition; x[0], y[0] are given.
+    """Running sums of the g-deltas of a repetition.
 
     Args:
         data: bytes.
         at: first byte.
         end: of the bytes.
         grid: factor of all steps.
+        x: (n,) output; x[0] is set.
+        y: (n,) output; y[0] is set.
 
     Returns:
-        the position after the last, or -1 where the list is cut or leaves 32 bits.
+        Position after the last, or -1 where the list is cut or leaves 32 bits.
     """
     for n in range(1, x.shape[0]):
         word, at = unsigned_at(data, at, end)

@@ -134,15 +134,15 @@ def die_surroundings(
     clear_um: float,
     label: str,
 ) -> DrawnMask:
-    """Marks, label, dose test and witness cells of the pillars of ``source`` around a
-    die of other things.
-
-    clear_um: half the width, about the middle, that the test structures leave free.
+    """Marks, label, dose test and witness cells around a die of other things.
 
     Args:
+        source: lens whose pillars the test structures repeat.
         process: rules, layers and die.
         name: of the top cell.
         size_um: (x, y) of the die.
+        clear_um: half the width, about the middle, that the test structures leave free.
+        label: text on the die.
 
     Raises:
         ProcessError: as :func:`plan`.
@@ -174,9 +174,10 @@ def wafer_mark(
     mark_um: float,
     width_um: float,
 ) -> DrawnMask:
-    """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
+    """An alignment cross of a wafer, with witness cells.
 
     Args:
+        source: lens whose pillars the witness cells repeat.
         process: rules and layers.
         name: of the top cell.
         mark_um: arm length.

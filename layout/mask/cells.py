@@ -108,13 +108,15 @@ def drawn_blocks(
 def with_isolation(
     diameters: DiameterMap, process: Process
 ) -> Iterator[tuple[int, Array, Array | None]]:
-    """(first row, designed sizes, how alone each pillar stands) of blocks of rows of
-    some ``sites``.
-
-    The third is None where the process asks for none.
+    """Designed sizes and isolation of the pillars, in blocks of rows.
 
     Args:
         diameters: designed sizes.
+        process: bias of isolated pillars, and its range.
+
+    Yields:
+        (first row, sizes in um, isolation from 0 to 1); the third is None where the
+        process has no such bias.
     """
     design = diameters.diameter_um
     bias = process.bias

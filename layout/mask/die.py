@@ -38,17 +38,19 @@ def add_die_frame(
     label: str,
     around: bool = False,
 ) -> MaskPlan:
-    """``plan`` (the lens alone) with everything else that stands on its die.
+    """The plan of a lens with everything else on its die.
 
     Args:
-        radius_um: of the aperture. label: text, where the process gives none.
-        around: other things stand there, which ``radius_um`` from the middle leaves
-            room for along x.
+        plan: the lens alone.
+        process: layers and die.
+        radius_um: of the aperture.
+        label: text, where the process gives none.
+        around: whether the die holds other things, for which ``radius_um`` about the
+            middle stays free along x.
 
     Raises:
         ProcessError: the die is too small for the aperture and its test structures,
-            which would lie on each other, or
-            the label cannot be drawn.
+            which would overlap, or the label cannot be drawn.
     """
     unit = DatabaseUnits(plan)
     die = _outline(process, unit, radius_um)
@@ -101,9 +103,10 @@ def add_die_frame(
 
 
 def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
-    """``plan`` (the lens alone) with the opening of its aperture and nothing else.
+    """The plan of a lens with the opening of its aperture and nothing else.
 
     Args:
+        plan: the lens alone.
         process: layers.
         radius_um: of the opening.
     """
@@ -123,12 +126,12 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
 def add_wafer_mark(
     plan: MaskPlan, process: Process, *, mark_um: float, width_um: float
 ) -> MaskPlan:
-    """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells
-    between two of its arms.
+    """An alignment cross of a wafer about (0, 0), coarse and fine.
 
-    plan: of a lens, whose pillars the witness cells repeat.
+    Witness cells stand between two of its arms.
 
     Args:
+        plan: of a lens, whose pillars the witness cells repeat.
         process: layers.
         mark_um: arm length.
         width_um: line width.
@@ -171,12 +174,14 @@ def add_wafer_mark(
 
 
 def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
-    """Polygon of the area of a circle whose edges stay within half a grid step of it,
-    at most 8000 vertices.
+    """Polygon of the area of a circle, with edges within half a grid step of it.
+
+    It has at most 8000 vertices.
 
     Args:
         radius: database units.
         centre: x and y, database units.
+        grid: step of the coordinates.
     """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
     return polygon.disc_polygon(radius, centre, count, grid)

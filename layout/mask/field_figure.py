@@ -10,9 +10,10 @@ from layout.process.process import Process
 
 
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
-    """``plan`` with one rectangle for each write field, clipped to the lens.
+    """The plan with one rectangle for each write field, clipped to the lens.
 
     Args:
+        plan: with the lens as its first lattice.
         split: write fields of the lens.
         process: layers.
     """

@@ -33,9 +33,9 @@ def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, 
     """Rectangles of a line of text, small letters as capitals.
 
     Args:
-        x, y: lower left corner; square: side of one square of the letters, even; all in
-            database units.
         words: the line of text.
+        x, y: lower left corner, database units.
+        square: side of one square of the letters, even, database units.
 
     Raises:
         ProcessError: a character that the font does not hold.

@@ -188,12 +188,12 @@ def _thin(half: int, unit: DatabaseUnits) -> int:
 def vernier_scales(
     process: Process, unit: DatabaseUnits, die: MarkBox
 ) -> VernierScales:
-    """Verniers along x and y and a box in a box, from the upper right cross to the
-    left; none where none are wanted.
+    """Verniers along x and y and a box in a box, left of the upper right cross.
 
     Args:
-        process: pitch and step of the verniers.
+        process: pitch and step of the verniers, and whether there are any.
         unit: of the plan.
+        die: outline of the die.
 
     Raises:
         ProcessError: the die is too narrow for them, or the step of the vernier is

@@ -16,10 +16,12 @@ _WINDOW_UM = 5.0  # around marks and labels, on their own layer
 
 
 def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
-    """The mask that leaves standing what ``plan`` draws; the layers of a second step
-    (aperture) stay as they are.
+    """The mask that leaves standing what a plan draws: its gaps are drawn.
+
+    The layers of a second step (aperture) stay as they are.
 
     Args:
+        plan: of the standing pillars.
         process: layers.
 
     Raises:
@@ -54,10 +56,12 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
 
 
 def lattice_box(lattice: PillarArray, grid: int) -> Array:
-    """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
-    the ends of every other row).
+    """(4, 2) corners around all lattice squares together.
+
+    On a centred lattice the half squares at the ends of every other row are included.
 
     Args:
+        lattice: of pillars.
         grid: step of the coordinates.
     """
     left, bottom, right, top = _square(lattice, grid)

@@ -143,18 +143,19 @@ def exposure_table(
     ranges: ScatterRanges,
     body: PillarArray,
 ) -> ExposureTable:
-    """The table of a mask.
+    """What each entry of a mask exposes at its own edge, and what is sought there.
 
     Args:
-        body: the densest of the lattices.
         drawn: kinds of pillars.
-        goal: (entries,) wanted edge exposure over the threshold.
+        goal: (entries,) edge exposure sought, over the threshold.
         number: (entries,) pillars of each.
+        point: exposure of a beam.
         ranges: the same by reach.
+        body: the densest of the lattices.
 
     Raises:
         ProcessError: no pillar, or pillars so much finer than the point exposure that
-            their own dose hardly tells.
+            their own dose hardly changes their edge.
     """
     used = number > 0
     if not used.any():

@@ -266,8 +266,9 @@ class WantedDoses:
 
 
 def straight_edge_error(point: PointExposure) -> float:
-    """Relative error of the exposure that moves both edges of a line of dose 1 by what
-    rounded doses may.
+    """Relative change of exposure that changes the width of a line by 0.7 nm.
+
+    A line of dose 1 has the slope sum weights / (sqrt(pi) widths) at its edge.
 
     Args:
         point: narrow terms of the point exposure.

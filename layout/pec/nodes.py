@@ -136,11 +136,16 @@ def _sample(
 def gather_to_nodes(
     block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
-    """Add what the pillars of a block of rows carry to the nodes.
+    """Add what the pillars of a block of rows carry to the nodes, by cubic weights.
 
-    block: (rows, columns) entries; value: (fields, entries), 0 for none; yn, yw:
-    (rows,), (rows, 4) nodes and weights
-    of the rows, xn, xw of the columns; out: (fields, y, x).
+    Args:
+        block: (rows, columns) entries; 0: no pillar.
+        value: (fields, entries) amount that each entry carries.
+        yn: (rows,) first node of each row.
+        yw: (rows, 4) weights.
+        xn: (columns,) first node of each column.
+        xw: (columns, 4) weights.
+        out: (fields, y, x) sums, in place.
     """
     fields = out.shape[0]
     wide = out.shape[2]
@@ -163,14 +168,15 @@ def gather_to_nodes(
 def interpolate_from_nodes(
     field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
-    """The node field (y, x) at the sites of a block of rows: (rows, columns) float32.
+    """Interpolate a node field at the sites of a block of rows, by cubic weights.
 
     Args:
-        yn: (rows,) first nodes.
+        field: (y, x) values at the nodes.
+        yn: (rows,) first node of each row.
         yw: (rows, 4) weights.
-        xn: (columns,) first nodes.
+        xn: (columns,) first node of each column.
         xw: (columns, 4) weights.
-        out: is filled.
+        out: (rows, columns) float32, filled.
     """
     line = np.zeros(field.shape[1])
     for row in range(out.shape[0]):
@@ -211,14 +217,15 @@ def gaussian_convolution(
     point: PointExposure,
     hollow: bool,
 ) -> RadialConvolution:
-    """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5
-    widths out (exp(-25)).
+    """Convolution with a sum of Gaussians on a grid of nodes.
 
-    hollow: leave out what a node gives to itself.
+    kernel = sum weight / (pi width^2) exp(-r^2 / width^2), cut at 5 widths (exp(-25)).
 
     Args:
         shape: (y, x) nodes.
+        spacing_um: (y, x) distance of the nodes.
         point: sum of Gaussians.
+        hollow: whether a node gives nothing to itself.
     """
     from scipy import fft
 

@@ -69,12 +69,14 @@ def point_exposure(exposure: ExposureSettings) -> PointExposure:
 def fit_point_spread(
     radius_um: Array, density: Array, *, where: str = "point exposure"
 ) -> PointExposure:
-    """Gaussians of non-negative weight through a measured radial function, by relative
-    error at each sample.
+    """Gaussians of non-negative weight through a measured radial function.
+
+    Widths are fixed, four to an octave; weights follow from non-negative least squares
+    of the relative errors, weighted by the energy.
 
     Args:
-        radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above
-            0.
+        radius_um: (n,) rising, above 0.
+        density: (n,) energy density in any unit, above 0.
         where: name of the table in errors.
 
     Raises:
@@ -173,15 +175,15 @@ def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
 def disc_exposure(
     distance_um: Array | float, diameter_um: Array | float, width_um: float
 ) -> Array:
-    """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one
-    Gaussian. Exact.
+    """Exposure by one Gaussian around a disc of unit dose, exact.
 
-    The probability that a Gaussian displacement ends within the disc: non-central
-    chi-square of 2 degrees.
+    It is the probability that a Gaussian displacement ends within the disc: non-central
+    chi-square of 2 degrees of freedom.
 
     Args:
+        distance_um: from the centre.
         diameter_um: of the disc.
-        width_um: 1/e radius.
+        width_um: 1/e radius of the Gaussian.
     """
     from scipy.special import chndtr
 

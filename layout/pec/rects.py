@@ -137,16 +137,18 @@ def sums_of_boxes(
     pairs: tuple[Array, Array],
     point: PointExposure,
 ) -> Array:
-    """Exposure at the crossings of lines by those boxes of unit dose that ``pairs``
-    (sorted) hold for a row.
+    """Exposure at the crossings of lines by some boxes of unit dose, exact to rounding.
 
     Args:
-        x_um, y_um: (n, i) and (n, j) lines; row: (n,) whose boxes each of the n takes.
+        x_um: (n, i) x of the upright lines of each row.
+        y_um: (n, j) y of the level lines of each row.
+        row: (n,) box whose neighbours, by ``pairs``, expose each row.
         boxes_um: (m, 4) left, bottom, right, top.
+        pairs: first and second box of each pair, sorted.
         point: sum of Gaussians.
 
     Returns:
-        (n, j, i) exposure, exact to rounding.
+        (n, j, i) exposure.
     """
     first_box, second_box = pairs
     begin = np.searchsorted(first_box, row)

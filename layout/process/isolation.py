@@ -19,25 +19,22 @@ def isolation_map(
     *,
     centred: bool = False,
 ) -> Array:
-    """How alone each site is: 0 where all neighbours of its lattice stand, 1 where none
-    does (y, x), float32.
+    """(y, x) isolation of each site, float32: 0 with all neighbours, 1 with none.
 
-    Neighbours count by exp(-r^2 / range^2) from middle to middle, within 3 ranges along
-    each axis; the site itself does
-    not. Only tiles that are neither empty nor full with all their surroundings are
-    worked on.
+    isolation = 1 - sum of exp(-r^2 / range^2) over the pillars, over the same sum with
+    all sites filled. Neighbours count within 3 ranges along each axis, the site itself
+    does not. Tiles that are empty, or full with all their surroundings, are skipped.
 
     Args:
-        present: (y, x) true where a pillar stands. steps_um: (x, y) distance of
-            neighbouring columns and rows.
-        centred: every other place alone is a site, as on a hexagonal lattice
-            (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none,
-            or those with it even.
+        present: (y, x) true where a pillar stands.
+        steps_um: (x, y) distance of neighbouring columns and rows.
         range_um: of the bias of isolated pillars.
+        centred: every other place alone is a site, as on a hexagonal lattice
+            (:class:`metalens.lens.DiameterMap`): those with row + column odd are empty,
+            or those with it even.
 
     Raises:
-        ProcessError: a range so short that nobody has neighbours, and a lone pillar
-            nothing to lack.
+        ProcessError: a range so short that no site has neighbours.
     """
     from scipy.ndimage import correlate1d
 

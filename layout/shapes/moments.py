@@ -53,10 +53,11 @@ def perimeter(contours: Contours) -> float:
 
 
 def points_along_edges(contours: Contours, count: int) -> Array:
-    """(count, 2) places evenly along all edges.
+    """(count, 2) points at equal distances along all edges.
 
     Args:
         contours: of one polygon.
+        count: of the points.
     """
     start = np.concatenate(list(contours))
     edge = (

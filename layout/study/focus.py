@@ -176,15 +176,14 @@ def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> Focus
 def focus_window(
     lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0
 ) -> FocusWindow:
-    """A window around the axis that holds the blur at all depths and ``rings``
-    diffraction widths around it.
+    """A window around the axis that holds the blur at all depths.
 
     Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
 
-    depths_um: left out: the source distance of the design.
-
     Args:
         lens: as designed.
+        depths_um: of the source; None: the source distance of the design.
+        rings: diffraction widths around the blur.
     """
     depths = np.array(
         [lens.source_distance_um] if depths_um is None else depths_um, float

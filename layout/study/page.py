@@ -44,16 +44,17 @@ def answers_of(lens: Lens) -> Answers:
 def study_sections(
     lens: Lens, process: Process, plan: FieldPlan, answers: Answers
 ) -> list[Section]:
-    """Stitching and tolerance; half a minute for a 1 mm lens, most of it for the solver
-    and the Monte Carlo.
+    """Sections on stitching and tolerance.
 
-    Of pillars of two sizes two sections for light along x and two for light along y.
-
-    answers: :func:`answers_of` the lens.
+    Pillars of two sizes have two sections for light along x and two for light along y.
+    It takes half a minute for a 1 mm lens, most of it for the solver and the Monte
+    Carlo.
 
     Args:
+        lens: as designed.
         process: spread and write field.
         plan: write fields.
+        answers: :func:`answers_of` the lens.
     """
     if lens.pairs is None:
         return _of_light(lens, process, plan, answers[""])

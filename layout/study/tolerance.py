@@ -110,15 +110,18 @@ def analyse_tolerance(
     draws: int = 100,
     seed: int = 0,
 ) -> ToleranceReport:
-    """Effects of each cause at its standard deviation (``process.spread``), and Monte
-    Carlo over all of them.
+    """Effect of each cause at its standard deviation, and Monte Carlo over all of them.
+
+    The causes are those of ``process.spread``.
 
     Args:
-        sens: answers to height, wall and index; left out: from the RCWA solver.
-        depths_um: where the axial information is wanted; left out: both ends and the
-            middle of the depths at which
-            the lens blurs (:mod:`metalens.lens.reach`). The design source is always
-            looked at as well.
+        lens: as designed.
+        process: spread.
+        sens: sensitivities to height, wall and index; None: from the RCWA solver.
+        depths_um: of the axial information; left out: both ends and the middle of the
+            depths at which the lens blurs (:mod:`metalens.lens.reach`). The design
+            source is always studied too.
+        draws: of the Monte Carlo.
         seed: of the draws.
 
     Accuracy: see ``error`` of the report (measured); bands of percentiles carry the

@@ -70,21 +70,22 @@ def verify_exposure(
     height_um: float = 0.0,
     keep: Callable[[ExposedRows], None] | None = None,
 ) -> ExposureReport:
-    """Expose and etch a mask that was read back, whose pillars stand where ``plan`` has
-    them.
+    """Expose and etch a mask that was read back, in simulation.
 
     Args:
         content: read back; sums over its placements are enough.
-        doses: its dose table. height_um: of the pillars, for their feet.
-        keep: is given the rows of all lattices, in turn; memory is bounded.
+        plan: mask with the places of the pillars.
+        doses: its dose table.
         process: point exposure, bias, etch and layers.
+        height_um: of the pillars, for their feet.
+        keep: called with the rows of all lattices, in turn; memory is bounded.
 
     Accuracy: the field on nodes to some 1e-4 (the result states the difference from
     direct sums); widths by the slope at the drawn edge, 3 % of a shift of 4 nm.
 
     Raises:
-        ProcessError: no point exposure is given, no pillar has a dose, or a class is
-            not one outline.
+        ProcessError: the process has no point exposure, no pillar has a dose, or a
+            class is not one outline.
     """
     point = point_exposure(process.exposure)
     scene = read_scene(content, plan, doses, process)
@@ -131,6 +132,8 @@ def read_scene(
 
     Args:
         content: read back.
+        plan: mask with classes and lattices.
+        doses: relative dose of each layer.
         process: layers.
 
     Raises:

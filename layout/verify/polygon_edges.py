@@ -90,11 +90,11 @@ def _turns(contour: Array) -> Array:
 def exposure_at_edges(
     at_um: Array, polygons: ExposedPolygons, terms: Sequence[tuple[float, float]]
 ) -> Array:
-    """(n,) exposure at points by the polygons with their doses, for (range, weight) of
-    each Gaussian.
+    """(n,) exposure at points by polygons with their doses.
 
     Args:
         at_um: (n, 2) points.
+        polygons: corners and doses.
         terms: range and weight of each Gaussian.
     """
     total = np.zeros(len(at_um))
