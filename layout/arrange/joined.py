@@ -18,7 +18,7 @@ from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
 MARGIN_UM = 10.0  # around the marks of a wafer
-_SAME = 5e-7  # doses that are written alike
+_SAME = 5e-7  # difference of doses that are written as the same number
 _MOST_DATATYPE = 32767
 
 
@@ -52,8 +52,8 @@ def _copies(child: str, at: Placement) -> CellReference:
 class JobLayers:
     """(layer, datatype) of all parts together: one dose each.
 
-    doses: of those that are exposed. names: shown by viewers. kept: numbers that mean
-    something undosed.
+    doses: of those that are exposed. names: shown by viewers. kept: undosed layers,
+    whose numbers no dose may take.
     """
 
     kept: frozenset[LayerNumber]

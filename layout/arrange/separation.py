@@ -79,7 +79,7 @@ def reach_um(process: Process) -> float:
 def check_separation(
     placed: Sequence[PartPlacement], process: Process
 ) -> list[Violation]:
-    """Pairs of parts closer than the minimum gap, or within reach of scattered electrons.
+    """Pairs of parts closer than the gap rule, or in reach of scattered electrons.
 
     Rectilinear shapes are taken as they are. A lattice is taken as boxes of tiles (a
     64th of it each way), any other shape as boxes of slices (5 um high, or a 64th).

@@ -106,9 +106,10 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
 def _parts(
     work: FloorplanWork,
 ) -> tuple[list[joined.PartPlacement], parts.DieComponent | None]:
-    """What stands on the die, and the alignment mark of the wafer.
+    """Everything that stands on the die, and the alignment mark of the wafer.
 
-    All that is corrected here is drawn first, so that it shares one series of doses.
+    All lenses and frames are drawn first, and corrected together, so that they share
+    one series of doses.
     """
     record = work.record
     process = work.process
@@ -189,7 +190,7 @@ def _lens_part(
 
 
 def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
-    """What stands around the lenses: checked and verified; read back with the die."""
+    """What stands around the lenses as a part of the die, checked and verified."""
     name = plan.name
     process = work.process
     with work.stages(f"{name}: check"):
@@ -208,7 +209,15 @@ def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
 
 
 def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
-    """A cell of a file made elsewhere; its rules are those of where it will be."""
+    """A cell of a mask file as a part of the die, checked and with its doses.
+
+    Args:
+        work: of the command; receives notes and failures.
+        part: file, cell and relative dose.
+
+    Raises:
+        MaskFileError: the file is missing, too large or cannot be read.
+    """
     path = work.options.lens.parent / part.file
     if not path.is_file():
         raise MaskFileError(
@@ -265,7 +274,14 @@ def _stepped(
     die: MaskLibrary,
     mark: parts.DieComponent | None,
 ) -> MaskLibrary:
-    """The wafer: as many whole dies as it holds, and its marks."""
+    """The wafer: as many whole dies as it holds, and its marks.
+
+    Args:
+        work: of the command; receives the dies and failures.
+        size: of the wafer, raster and marks.
+        die: cells of a die.
+        mark: alignment mark; None: no marks.
+    """
     scatter_um = separation.reach_um(work.process)
     exposed_box = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
     need = max(scatter_um, work.process.rules.minimum_gap_nm / 1e3)
@@ -288,7 +304,7 @@ def _stepped(
 
 
 def _write(work: FloorplanWork, made: MaskLibrary) -> None:
-    """The files that were asked for, each read back."""
+    """Write the mask files of the options, and read each back."""
     writers: dict[str, Callable[[MaskLibrary, Path], None]] = {}
     if work.options.writes_oasis:
         writers["mask.oas"] = oasis_write.write_oasis
@@ -363,8 +379,9 @@ def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
 
 
 def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
-    """The job sheet: what stands where, and its doses; what is said of each lens lies
-    in its folder.
+    """Lines of the job sheet: parts, files, fields and doses.
+
+    The job sheet of each lens is in its own folder.
     """
     process = work.process
     size = work.record.wafer

@@ -48,7 +48,7 @@ MOST_MADE = (
 )  # sites of a lens whose predicted diameters are handed on as made.h5
 KEPT = (
     1 << 16
-)  # placements of a cell that are kept when a file is read back; of more only sums are
+)  # placements of a cell that are stored when a file is read back; of more only sums
 MOST_READ = 2**40
 SolvedPlan = tuple[MaskPlan, DoseLadder | None]  # dose None: every dose is 1
 
@@ -260,9 +260,7 @@ def _is_verifiable(job: LayoutJob) -> bool:
 def _verified(
     job: LayoutJob, content: MaskLibrary, table: Mapping[LayerNumber, float]
 ) -> ExposureReport:
-    """What a file makes that holds the plan's places; two files of the same polygons
-    make the same.
-    """
+    """Exposure report of a file; files of the same polygons share one report."""
     if job.verified:
         return next(iter(job.verified.values()))
     lattice = job.plan.lattices[0]

@@ -36,7 +36,7 @@ class RowProgress:
         return plan.replace(lattices=(lattice, *plan.lattices[1:]))
 
     def unwatched(self, plan: MaskPlan) -> MaskPlan:
-        """A watched plan as it was, for what is made beside the stages."""
+        """A watched plan as it was, for work outside the stages."""
         return (
             plan
             if self._lens is None

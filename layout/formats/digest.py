@@ -18,7 +18,7 @@ _FIRST, _SECOND, _THIRD = (
 )
 _ROOM = 256
 _MOST = 1 << 24  # children
-_OTHER = 8  # turns from here on are no quarter turns: alike in the hash
+_OTHER = 8  # turns from here on are no quarter turns: equal in the hash
 
 
 @dataclass(frozen=True, eq=False, slots=True)

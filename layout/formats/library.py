@@ -520,13 +520,13 @@ class MaskLibrary:
         return areas
 
     def refuse_beyond(self, limit: int) -> None:
-        """Refuse a mask that is too large to be taken apart.
+        """Refuse a mask that is too large to be expanded.
 
         Args:
-            limit: shapes; instances of a cell that holds nothing count as one each.
+            limit: shapes; instances of an empty cell count as one shape each.
 
         Raises:
-            MaskFileError: more than these; as :meth:`topological_order`.
+            MaskFileError: more shapes; as :meth:`topological_order`.
         """
         times = self.drawn_counts()
         total = sum(count * self.cells[name].shapes for name, count in times.items())

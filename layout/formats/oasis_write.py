@@ -290,8 +290,7 @@ def _put_signed(out: Array, at: int, value: int) -> int:
 
 @compile_loop
 def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
-    """Placements in their order: the first at its place, each other relative to the one
-    before; bytes used.
+    """Placements in order: the first absolute, each other relative to the previous.
 
     Args:
         child: (n,) reference numbers.
@@ -299,6 +298,9 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
         y: (n,) places.
         turn: (n,) quarter turns and mirror, 0 to 7.
         out: room for ``LARGEST_RECORD`` bytes a placement and 2 more.
+
+    Returns:
+        Bytes used.
     """
     out[0] = 15  # XYABSOLUTE
     at, last_x, last_y = 1, 0, 0

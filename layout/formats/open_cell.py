@@ -92,9 +92,7 @@ class PlacementSums:
             self.small = 0
 
     def columns(self) -> tuple[Array, Array, Array, Array]:
-        """child, x, y, turn of all that is kept; the parts are let go, one column after
-        the other.
-        """
+        """child, x, y, turn of all placements; the parts are released column by column."""
         columns = [list(part) for part in zip(*self.parts, strict=True)]
         self.parts = []
         joined = []

@@ -196,7 +196,7 @@ def wafer_mark(
 def _drawn(
     source: Lens | DiameterMap, process: Process
 ) -> tuple[cells.DrawnClasses, tuple[PillarClass, ...]]:
-    """The pillars as classes, and what is drawn for each."""
+    """The pillars of a lens as classes, and the polygons of each."""
     if isinstance(source, Lens):
         disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
         if source.diameters.angle_rad is not None or not disc:

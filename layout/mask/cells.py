@@ -24,9 +24,8 @@ class DrawnClasses:
     """Quantised drawn pillars.
 
     sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
-    whole nm, thinnest first.
-    counts: (k,) pillars of each class. rounding_nm: largest difference between wanted
-    and drawn diameter.
+    whole nm, thinnest first. counts: (k,) pillars of each class. rounding_nm: largest
+    difference between the exact and the drawn diameter.
     """
 
     sites: ScratchArray
@@ -86,8 +85,8 @@ def drawn_blocks(
 ) -> Iterator[tuple[int, Array]]:
     """(first row, drawn diameters in steps) of blocks of rows.
 
-    The bias is looked up in a table of 1/16 nm; isolation is worked out where the
-    process knows it.
+    The bias is looked up in a table of 1/16 nm. Isolation is computed where the process
+    has a bias for it.
     """
     pitch = diameters.pitch_um
     step = process.rules.diameter_step_nm

@@ -83,13 +83,12 @@ class FieldPlan:
 def split_write_fields(
     diameters: DiameterMap, process: Process, *, drawn: DrawnClasses | None = None
 ) -> FieldPlan:
-    """Fields for the pillars as they are drawn (bias taken off), found in blocks of
-    rows.
+    """Write fields for the pillars as they are drawn (bias taken off).
 
     Args:
-        drawn: the pillars of this map, quantised; left out: quantised here.
         diameters: of the lens.
         process: bias, steps and write field.
+        drawn: the pillars of this map, quantised; None: quantised here.
 
     Raises:
         ProcessError: a field smaller than the pitch; as

@@ -35,17 +35,14 @@ class PillarClass:
     """All pillars of one diameter (and dose): one cell of the mask.
 
     name: of the cell. diameter_nm, diameter_units: of the circle that ``outline``
-    stands for, as drawn.
-    layer: (layer, datatype). outline: (n, 2) of the pillar, convex or not,
-    counter-clockwise. drawn: polygons that are
-    written (the outline itself; in pieces where it has holes; or what is left of the
-    lattice square for a negative
-    tone). dose: relative to the base dose. goal: wanted exposure of the edge, relative
-    to dose-to-size (1 but in a dose
-    test). round: whether the outline stands for a circle of that diameter; else the
-    diameter is the size of the shape.
-    holes: what is left out of the outline, clockwise.
-    role: a pillar of the lens, of the dose test or of the witness cells.
+    stands for, as drawn. layer: (layer, datatype). outline: (n, 2) of the pillar,
+    convex or not, counter-clockwise. drawn: polygons that are written: the outline
+    itself; pieces where it has holes; or the lattice square without the pillar, for a
+    negative tone. dose: relative to the base dose. goal: exposure of the edge that is
+    sought, relative to dose to size (1 but in a dose test). round: whether the outline
+    stands for a circle of that diameter; else the diameter is the size of the shape.
+    holes: in the outline, clockwise. role: a pillar of the lens, of the dose test or of
+    the witness cells.
     """
 
     name: str
@@ -257,16 +254,12 @@ class MaskPlan:
     """Everything that goes into a mask file.
 
     name: of the top cell. unit_nm: database unit. grid: step of all coordinates, in
-    database units.
-    classes: pillar classes; number k of a lattice is ``classes[k - 1]``. lattices: the
-    lens first.
-    layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that
-    is exposed.
-    axis: of the lens in database units (off (0, 0) by at most half a grid step, where
-    the lattice cannot be centred
-    on the grid).
-    standing: for a negative tone, the mask of what stays; None where the drawn shapes
-    stay.
+    database units. classes: pillar classes; number k of a lattice is ``classes[k -
+    1]``. lattices: the lens first. layer_names: shown by viewers. doses: relative dose
+    of each (layer, datatype) that is exposed. axis: of the lens in database units (off
+    (0, 0) by at most half a grid step, where the lattice cannot be centred on the
+    grid). standing: for a negative tone, the mask of what stays; None where the drawn
+    shapes stay.
     """
 
     name: str

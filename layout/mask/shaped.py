@@ -27,7 +27,7 @@ _LENGTHS = 1 << 20  # above any drawn size in nm
 def shape_classes(
     source: Lens, process: Process, *, unit_nm: float
 ) -> tuple[DrawnClasses, tuple[PillarClass, ...]]:
-    """The pillars of a lens as classes, and what is drawn for each.
+    """The pillars of a lens as classes, with the polygons of each.
 
     Args:
         source: lens of shaped or rotated pillars.

@@ -22,12 +22,11 @@ COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at ea
 class ExposureTable:
     """What each entry exposes at unit dose; entry 0 is no pillar.
 
-    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur.
-    goal: (entries,) wanted exposure of the edge, in units of what clears.
-    own: (entries,) exposure at the edge by the pillar itself, less what the far field
-    counts for it.
-    slope: (entries,) its fall per um that the edges move out. count: (entries,) pillars
-    of each.
+    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur. goal:
+    (entries,) exposure of the edge that is sought, over the threshold. own: (entries,)
+    exposure at the edge by the pillar itself, less what the far field counts for it.
+    slope: (entries,) fall of the exposure per um that the edges move out. count:
+    (entries,) pillars of each.
     """
 
     drawn: DrawnKinds
@@ -53,13 +52,14 @@ class ExposureTable:
 class ScatterRanges:
     """The point exposure split by how far its Gaussians reach.
 
-    far: at least six times as wide as neighbours are apart, summed on nodes over the
-    whole die. middle: reach
-    neighbours only, summed on the sites of each lattice. near: reach no neighbour.
-    Widths of far and middle are widened
-    by the mean pillar: a disc adds R^2 / 2 to the squared width of a Gaussian, the ring
-    on which it is seen R^2; any
-    other shape the mean squared distances from its centre of its area and of its edges.
+    far: at least six times as wide as the distance of neighbours, summed on nodes over
+    the whole die. middle: reach neighbours only, summed on the sites of each lattice.
+    near: reach no neighbour.
+
+    Widths of far and middle are widened by the mean pillar. A disc adds R^2 / 2 to the
+    squared width of a Gaussian, and its edge, where the exposure is evaluated, R^2. Any
+    other shape adds the mean squared distances of its area and of its edges from its
+    centre.
     """
 
     far: PointExposure

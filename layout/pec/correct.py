@@ -103,7 +103,11 @@ class DoseLadder:
     needed: int
 
     def nearest(self, dose: Array) -> Array:
-        """Class of the nearest dose."""
+        """Class of the nearest dose on the logarithmic scale, uint8.
+
+        Args:
+            dose: relative doses of any shape.
+        """
         span = float(np.log(self.factors[-1] / self.factors[0]))
         per_log = (len(self.factors) - 1) / span if span > 0 else 0.0
         level = np.rint(np.log(np.maximum(dose, 1e-9) / self.factors[0]) * per_log)
@@ -113,10 +117,11 @@ class DoseLadder:
 def dose_ladder(
     spans: Sequence[tuple[float, float, float]], settings: ExposureSettings
 ) -> DoseLadder:
-    """The doses of a job, at most ``maximum_classes``.
+    """The doses of a job, at most ``maximum_classes``, in a geometric series.
 
-    A quarter of the tolerance is left for the background of rounded doses and for what
-    changes across a piece of a mark.
+    A quarter of the tolerance is reserved for the background of rounded doses, and for
+    what changes across a piece of a mark. With the ratio of :meth:`WantedDoses.spans`,
+    the step is 2 ln(1 + 0.75 / ratio).
 
     Args:
         spans: of all dies of a job, from :meth:`WantedDoses.spans`.
@@ -134,11 +139,11 @@ def dose_ladder(
 class ExposedMarks:
     """Marks and labels in pieces of one dose each, as masses on the nodes.
 
-    boxes: (pieces, 4) left, bottom, right, top, database units.
-    figure: (pieces, 2) number of the figure, and of the layer in it.
-    own: (pieces,) exposure of the outer edges by their own shape at unit dose.
-    points, piece: (n, 2) points on the outer edges, and (n,) whose they are.
-    spots: points, areas and pieces of what stands for the pieces on the nodes.
+    boxes: (pieces, 4) left, bottom, right, top, database units. figure: (pieces, 2)
+    number of the figure, and of the layer in it. own: (pieces,) exposure of the outer
+    edges by their own shape at unit dose. points: (n, 2) points on the outer edges, um.
+    piece: (n,) piece of each point. spots: points, areas and pieces of the samples that
+    represent the pieces on the nodes.
     """
 
     grid: NodeGrid
@@ -155,8 +160,12 @@ class ExposedMarks:
         return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
 
     def doses(self, field: Array) -> Array:
-        """(pieces,) doses that give the outer edges their exposure on a background (y,
-        x) of the nodes.
+        """(pieces,) doses that give the outer edges their exposure on a background.
+
+        dose = (THRESHOLD - mean background over the points of the piece) / own.
+
+        Args:
+            field: (y, x) background on the nodes.
         """
         if not len(self.own):
             return np.empty(0)
@@ -278,7 +287,10 @@ def straight_edge_error(point: PointExposure) -> float:
 
 
 def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
-    """The doses that everything on a plan needs, before they are rounded to classes.
+    """The doses that all shapes of a plan need, before they are rounded to classes.
+
+    Near Gaussians are in the table of each pillar kind; middle and far Gaussians form a
+    background that depends on all doses (:func:`_backgrounds`).
 
     Args:
         plan: every dose 1.

@@ -19,9 +19,9 @@ from layout.shapes.moments import (
 from metalens.core.arrays import Array
 
 _RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
-_EDGE_POINTS = 48  # points along the edges that neighbours are seen from
+_EDGE_POINTS = 48  # points along the edges where exposure by neighbours is evaluated
 _PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
-_PIXEL = 1 / 6  # of it, of the raster on which the level is found
+_PIXEL = 1 / 6  # of it, of the raster on which the level is sought
 _MOST_PIXELS = 1200  # along a side
 _HALVINGS = 34
 
@@ -39,7 +39,7 @@ class DrawnDiscs:
 
     @property
     def wider_um2(self) -> Array:
-        """R^2 / 2 of the disc and R^2 of the ring on which it is seen."""
+        """R^2 / 2 of the disc, and R^2 of its edge, where the exposure is evaluated."""
         return np.asarray(1.5 * self.diameter_um**2 / 4)
 
     def edge_exposure(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
@@ -235,7 +235,7 @@ def _level(
         middle = (low + high) / 2
         low, high = (middle, high) if area_above(middle) > area_um2 else (low, middle)
     level = (low + high) / 2
-    difference = 0.15 * level  # a few pixels, so that their places do not tell
+    difference = 0.15 * level  # a few pixels wide, so that their places do not matter
     return level, perimeter(contours) / max(
         (area_above(level - difference) - area_above(level + difference))
         / (2 * difference),

@@ -12,7 +12,7 @@ from metalens.core import threads
 from metalens.core.arrays import Array
 
 _OUTSIDE_UM = (
-    1e-4  # a point that far outside an edge tells whether another piece goes on there
+    1e-4  # another piece covers an edge where it holds a point that far outside
 )
 CORNER = 2.0  # widths of the core: an edge is round that near its ends
 

@@ -19,10 +19,10 @@ class ExposedLattices:
     """Doses on lattices, as the exact sum takes them.
 
     bodies: the samples are pillars of the first. drawn: their kinds, by entry. own:
-    (entries,) exposure of an edge by its own pillar, at unit dose.
-    ranges: Gaussians widened by the mean pillar. spots: x and y (n, 2), and area times
-    dose of what is no pillar.
-    dose_of: (body, first row, entries of a block) -> (rows, columns) relative doses.
+    (entries,) exposure of an edge by its own pillar, at unit dose. ranges: Gaussians
+    widened by the mean pillar. spots: (n, 2) x and y, and (n,) area times dose of marks
+    and labels. dose_of: (body, first row, entries of a block) -> (rows, columns)
+    relative doses.
     """
 
     bodies: Sequence[PillarArray]
@@ -35,15 +35,17 @@ class ExposedLattices:
 
 
 def exact_edges(scene: ExposedLattices, samples: int) -> tuple[Array, Array, Array]:
-    """Rows and columns of pillars, evenly drawn, and the exposure of their edges.
+    """Exposure of the edges of sample pillars, by direct sums.
 
-    Exact: whole shapes of all pillars within 5 sites, seen along the edges, and the
-    direct sum over every other pillar (and piece of a mark) of Gaussians whose second
-    moment is that of its shape.
+    Pillars within 5 sites count with their exact shapes. Every other pillar, and piece
+    of a mark, is a Gaussian sum whose second moment is that of its shape.
 
     Args:
         scene: lattices with doses.
-        samples: pillars of the first lattice.
+        samples: pillars of the first lattice, evenly over it.
+
+    Returns:
+        (samples,) rows, (samples,) columns and (samples,) exposures.
     """
     lens = scene.bodies[0]
     rows, columns = _some(lens, samples)

@@ -8,7 +8,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 _LEAST = (
-    4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
+    4e-4  # weight of all neighbours together: float32 sums have it to a few percent
 )
 
 

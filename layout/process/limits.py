@@ -17,8 +17,10 @@ _MOST_STEPS = 4000
 def printable_limits(
     path: Path, *, pitch_um: float, height_um: float
 ) -> tuple[float, float]:
-    """(thinnest pillar, least gap) in nm of designed pillars, so that what is drawn
-    keeps the rules.
+    """Thinnest pillar and least gap, nm, of designed pillars that a process can print.
+
+    All drawn sizes are tested for width, gap and gap at the foot. The limits are the
+    designed sizes of the thinnest and of the widest that keep the rules.
 
     Args:
         path: of PROCESS.toml.

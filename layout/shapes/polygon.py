@@ -185,8 +185,12 @@ def _trials(angle: Array, radius: float, half: int, *, diagonal: bool) -> Array:
 
 
 def _measures(eighths: Array, diameter: float, radius: float) -> tuple[Array, Array]:
-    """(t,) relative area error of (m, 2, t) eighths, and mean square distance of their
-    vertices from the circle on which an equal-area polygon has them.
+    """(t,) relative area error, and (t,) mean square distance of vertices to a circle.
+
+    Args:
+        eighths: (m, 2, t) vertices.
+        diameter: of the circle of equal area.
+        radius: of the vertices of a regular polygon of that area.
     """
     x, y = eighths[:, 0].astype(float), eighths[:, 1].astype(float)
     middle = (x[-1] + y[-1]) / 2
@@ -219,8 +223,9 @@ def _sound(eighths: Array, diagonal: bool) -> Array:
 
 
 def eightfold_images(eighth: Array) -> Array:
-    """All eight images of the vertices of one eighth: (n, 2), counter-clockwise;
-    doubles and flat corners go.
+    """(n, 2) vertices of a polygon from those of one eighth, counter-clockwise.
+
+    Repeated vertices and flat corners are removed.
     """
     quarter = np.concatenate([eighth, eighth[::-1, ::-1]])
     turns = [quarter]

@@ -12,11 +12,12 @@ _SLICE = 5000  # units
 
 
 def split_rectilinear(points: Array) -> Array:
-    """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by
-    slab.
+    """(n, 4) left, bottom, right, top of rectangles that fill a rectilinear polygon.
+
+    The polygon is cut at the y of every corner.
 
     Args:
-        points: (m, 2) corners.
+        points: (m, 2) corners of a simple polygon.
 
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
@@ -45,8 +46,9 @@ def split_rectilinear(points: Array) -> Array:
 
 
 def covering_rectangles(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of
-    slices 5 um high or more.
+    """(n, 4) rectangles of a rectilinear polygon, or boxes around slices of any other.
+
+    Slices are 5 um high or more.
 
     Args:
         shape: (n, 2) corners.

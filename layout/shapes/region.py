@@ -20,8 +20,11 @@ def union_contours(polygons: Iterable[Array]) -> list[Array]:
 
 
 def subtract_contours(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
-    """Contours of what is left of ``contours`` (outlines counter-clockwise, holes
-    clockwise) without ``taken``.
+    """Contours of the area of ``contours`` without ``taken``.
+
+    Args:
+        contours: outlines counter-clockwise, holes clockwise.
+        taken: polygons.
     """
     return _contours(_section(contours, filled=False) - _section(taken))
 
@@ -39,23 +42,26 @@ def overlap_area(contours: Iterable[Array], polygons: Iterable[Array]) -> float:
 
 
 def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
-    """The same area as polygons that any mask file holds: cut upright through the
-    middle of each hole, and again.
+    """The same area as polygons without holes, which any mask file holds.
 
-    A cut that slanted edges would end off whole units goes from corner to corner
-    instead, where there is one hole.
+    A part is cut upright through the middle of each hole, again and again. Where
+    slanted edges would end the cut off whole units, and there is one hole, the cut goes
+    from corner to corner.
 
     Args:
-        grid: step of the places of the cuts.
         contours: outlines counter-clockwise, holes clockwise.
+        grid: step of the places of the cuts.
     """
     return list(_cut(_section(contours, filled=False), grid))
 
 
 def triangulate(contours: Sequence[Array]) -> Array:
-    """(n, 3) corners, numbered on through all contours, of triangles that fill outlines
-    (counter-clockwise) but for
-    their holes (clockwise); they run counter-clockwise.
+    """(n, 3) corners of triangles that fill outlines but for their holes.
+
+    Corners are numbered through all contours; triangles run counter-clockwise.
+
+    Args:
+        contours: outlines counter-clockwise, holes clockwise.
     """
     from manifold3d import triangulate
 

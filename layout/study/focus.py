@@ -16,9 +16,9 @@ _ON_AXIS = (0.0, 0.0)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FocusWindow:
-    """Where the light is looked at.
+    """Where on the sensor the light is evaluated.
 
-    x_um, y_um: (x,), (y,) positions on the sensor; distance_um: lens to sensor.
+    x_um, y_um: (x,), (y,) positions on the sensor. distance_um: lens to sensor.
     depths_um: (depths,) distances of the source on the axis; inf for a collimated beam.
     """
 
@@ -39,8 +39,7 @@ class FocusSums:
     """Sums over the pillars of a lens, prepared for one window.
 
     case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um,
-    nodes_y_um: of the nodes.
-    onto_x, onto_y: (nodes, sites) polynomial basis, float32.
+    nodes_y_um: of the nodes. onto_x, onto_y: (nodes, sites) polynomial basis, float32.
     curvature: 1 / depth of the reference source whose phase is taken off.
     """
 

@@ -26,7 +26,7 @@ Answers = Mapping[
 
 
 def answers_of(lens: Lens) -> Answers:
-    """How the pillars answer to height, wall, index and their kin, from the solver.
+    """Sensitivities of the pillars to height, wall, index and the like, by the solver.
 
     Args:
         lens: as designed.

@@ -30,9 +30,8 @@ _SAMPLES = 160
 class SpreadModel:
     """Sums over the pillars of a lens for all draws of its process.
 
-    pillars: the kinds of them (sizes to 0.05 nm), and what their t answers to. count:
-    (kinds,) how many of each.
-    basis: (rank, kinds) B_k, orthonormal over pillars.
+    pillars: their kinds (sizes to 0.05 nm), with the sensitivities of t. count:
+    (kinds,) pillars of each. basis: (rank, kinds) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
 

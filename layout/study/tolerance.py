@@ -31,17 +31,14 @@ _BATCH = 25
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ToleranceOutcome:
-    """What is looked at, for draws of the process; the first axis counts them.
+    """Quantities of the study for draws of the process; the first axis counts them.
 
-    strehl: (draws,) peak at the design depth relative to the nominal lens.
-    efficiency: (draws,) focusing efficiency: power within a circle of three FWHM over
-        power on the aperture.
-    psf_change: (draws,) relative L2 change of the PSF at the design depth from the
-    nominal one.
-    information: (draws, depths) axial Fisher information of the normalised PSF (paper
-    Eq. 11), 1 / um^2.
-    psf: (draws, x) intensity along x through the middle at the design depth, 1 at the
-    nominal peak.
+    strehl: (draws,) peak at the design depth relative to the nominal lens. efficiency:
+    (draws,) focusing efficiency: power within a circle of three FWHM over power on the
+    aperture. psf_change: (draws,) relative L2 change of the PSF at the design depth
+    from the nominal PSF. information: (draws, depths) axial Fisher information of the
+    normalised PSF (paper Eq. 11), 1 / um^2. psf: (draws, x) intensity along x through
+    the middle at the design depth, 1 at the nominal peak.
     """
 
     strehl: Array
@@ -53,13 +50,11 @@ class ToleranceOutcome:
 
 @dataclass(frozen=True, slots=True)
 class CauseEffect:
-    """One cause at its standard deviation, both signs; the worse of the two for each
-    number.
+    """One cause at its standard deviation; for each number the worse of both signs.
 
     phase_rad: rms change of the pillars' phases about their mean. transmission: rms
-    change of |T|.
-    strehl, efficiency, information (summed over the depths): relative change; psf:
-    relative L2 change.
+    change of |T|. strehl, efficiency, information (summed over the depths): relative
+    change. psf: relative L2 change.
     """
 
     cause: str
@@ -77,11 +72,9 @@ class ToleranceReport:
     """Result of :func:`analyse_tolerance`.
 
     effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte
-    Carlo.
-    depths_um: of the information, by differences over step_um; window: where the light
-    was looked at.
-    rank: dimensions of the space of t(D). error: largest rms relative error of t over
-    the pillars in any draw.
+    Carlo. depths_um: of the information, by differences over step_um. window: of the
+    sensor where the PSFs are evaluated. rank: dimensions of the space of t(D). error:
+    largest rms relative error of t over the pillars in any draw.
     """
 
     effects: tuple[CauseEffect, ...]

@@ -45,7 +45,7 @@ class LensRows:
                 "pitch; check the doses"
             )
         length_um = sizes.length_um
-        if length_um is not None:  # all edges move alike
+        if length_um is not None:  # all edges move equally
             length_um = np.where(
                 size_um > 0, length_um + (size_um - sizes.diameter_um), 0
             ).astype(np.float32)

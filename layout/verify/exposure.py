@@ -31,8 +31,8 @@ class WrittenMask:
     """What a written mask exposes with the pillars.
 
     bodies: lattices of class numbers. kinds: what each class draws. dose, layer,
-    size_um: (classes + 1,) of each class, dose 0 where its layer has none.
-    others: all other shapes. undosed: layers with shapes and no dose.
+    size_um: (classes + 1,) of each class; dose 0 where its layer has none. others: all
+    other shapes. undosed: layers with shapes and no dose.
     """
 
     bodies: Sequence[PillarArray]
@@ -46,7 +46,7 @@ class WrittenMask:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExposedRows:
-    """What comes out in some rows of a lattice, (rows, columns) each.
+    """Predicted sizes in some rows of a lattice, (rows, columns) each.
 
     number: of the lattice. first: row. classes: 0 for no pillar. exposure: of the drawn
     edge, relative to dose to size. resist_nm, made_nm: sizes in the resist and after
@@ -224,13 +224,13 @@ def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Field:
-    """Background of all that is exposed: on nodes by wide Gaussians, on the sites by
-    those that reach neighbours only.
+    """Background exposure: on nodes by wide Gaussians, on the sites by middle ones.
 
-    own, slope: (classes + 1,) exposure of a pillar's edge by itself at unit dose, less
-    what the node field counts for it, and its fall per um.
-    close: (range, weight) of the Gaussians that nodes do not hold. spots: points and
-    masses that stand for other shapes.
+    far: (y, x) on the nodes. near: (rows, columns) of each lattice; empty without
+    middle range. own, slope: (classes + 1,) exposure of a pillar's edge by itself at
+    unit dose, less what the node field counts for it, and its fall per um. close:
+    (range, weight) of the Gaussians that nodes do not hold. spots: points and masses
+    that represent other shapes.
     """
 
     ranges: bodies.ScatterRanges

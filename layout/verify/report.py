@@ -27,9 +27,9 @@ _WIDEST_NM, _BIN_NM = (
 class EdgeErrors:
     """Edges of marks, labels and other shapes that are no pillars.
 
-    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,)
-    how far outside the drawn edge it
-    comes out in the resist. layer: (n,) layer numbers.
+    x_um, y_um: (n,) samples. exposure: (n,) relative to dose to size. shift_nm: (n,)
+    distance of the edge in the resist outside the drawn edge. layer: (n,) layer
+    numbers.
     """
 
     x_um: Array
@@ -41,10 +41,11 @@ class EdgeErrors:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationTally:
-    """Sums over judged pillars (the dose test is not) of a part of the mask.
+    """Sums over judged pillars (the dose test is not judged) of a part of the mask.
 
-    ends: largest |exposure - 1|, largest |resist - drawn| and least and largest made diameter, nm. total, count:
-    (y, x) of the map, of resist less drawn. bins: (n,) pillars by that difference.
+    ends: largest |exposure - 1|, largest |resist - drawn|, least and largest made
+    diameter, nm. total, count: (y, x) map: sum of resist less drawn, and number of
+    pillars. bins: (n,) pillars by that difference.
     """
 
     ends: Array
@@ -83,14 +84,11 @@ class VerificationTally:
 class ExposureReport:
     """The verdict over everything that is written.
 
-    pillars: the dose test too. tally: sums over those that are judged. box_um: left,
-    bottom, right, top of
-    the map. edges: of the other shapes. lean_nm: foot less half-height diameter.
-    tolerance: of the
-    exposure, relative.
-    undosed: layers with shapes and no dose.
-    sampled: largest |exposure - 1| by direct sums at sample pillars. error: largest
-    difference of the exposure of all pillars from these.
+    pillars: number, with the dose test. tally: sums over those that are judged. box_um:
+    left, bottom, right, top of the map. edges: of the other shapes. lean_nm: diameter
+    at the foot less that at half height. tolerance: of the exposure, relative. undosed:
+    layers with shapes and no dose. sampled: largest |exposure - 1| by direct sums at
+    sample pillars. error: largest difference of the exposure of all pillars from these.
     """
 
     pillars: int
