@@ -92,7 +92,8 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
     with work.stages("room between parts"):
         work.near = separation.check_separation(work.placed, work.process)
     spaces = [
-        f"{violation.text}: {violation.value / 1e3:.3f} um apart, need {violation.limit / 1e3:.4g}"
+        f"{violation.text}: {violation.value / 1e3:.3f} um apart, "
+        f"need {violation.limit / 1e3:.4g}"
         for violation in work.near
     ]
     unlisted = len(spaces) - _LISTED
@@ -197,13 +198,11 @@ def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
         work.judge_rules(name, check_plan(plan, process.rules))
     if work.corrected and process.exposure.csv is None:
         with work.stages(f"{name}: verify exposure"):
-            exposure_report = verify_exposure(
-                library_of(plan), plan, plan.doses, process
-            )
-        if not exposure_report.ok:
+            exposure = verify_exposure(library_of(plan), plan, plan.doses, process)
+        if not exposure.ok:
             work.failures.append(
-                f"{name}: exposure off by {100 * exposure_report.worst_exposure:.2g} % and "
-                f"{exposure_report.worst_nm:.2g} nm"
+                f"{name}: exposure off by {100 * exposure.worst_exposure:.2g} % and "
+                f"{exposure.worst_nm:.2g} nm"
             )
     return parts.of_plan(name, plan, process, corrected=work.corrected)
 
@@ -260,8 +259,8 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
         )
         work.failures.append(
             f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names}"
-            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the relative "
-            f"dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the "
+            f"relative dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
             "correction; correct the file and lay its doses.csv beside it, or set "
             "exposure.correct = false"
         )

@@ -184,12 +184,13 @@ def _text(path: Path, content: MaskLibrary, report: DrcReport) -> str:
     if content.skipped:
         lines.append(f"  draw nothing: {format_counts(content.skipped)}")
     lines += [
-        f"  {entry['count']:,} {entry['rule']} in {entry['cell']}, layer {entry['layer']}: worst "
-        f"{entry['worst']:.4g}, need {entry['limit']:.4g}"
+        f"  {entry['count']:,} {entry['rule']} in {entry['cell']}, "
+        f"layer {entry['layer']}: worst {entry['worst']:.4g}, need {entry['limit']:.4g}"
         for entry in report.worst[:20]
     ]
     lines += [
-        f"  {violation.rule} at ({violation.centre[0]:.0f}, {violation.centre[1]:.0f}): {violation.summary}"
+        f"  {violation.rule} at ({violation.centre[0]:.0f}, "
+        f"{violation.centre[1]:.0f}): {violation.summary}"
         for violation in report.violations[:10]
     ]
     return "\n".join(lines)

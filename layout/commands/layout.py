@@ -51,7 +51,8 @@ def _text(job: LayoutJob, target: Path) -> str:
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]
     lines += [
-        f"  {violation.rule} at ({violation.centre[0]:.0f}, {violation.centre[1]:.0f}) nm: {violation.summary}"
+        f"  {violation.rule} at ({violation.centre[0]:.0f}, "
+        f"{violation.centre[1]:.0f}) nm: {violation.summary}"
         for violation in job.drc.violations[:10]
     ]
     lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")

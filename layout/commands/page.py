@@ -446,8 +446,8 @@ def _checks(work: FloorplanWork) -> Section:
 def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     """Of layout.json of a lens."""
     exposed = [
-        f"{100 * verified['worst_relative']:.2f} %, {verified['worst_diameter_nm']:.2f} nm"
-        for verified in values["exposure"].values()
+        f"{100 * exposure['worst_relative']:.2f} %, {exposure['worst_diameter_nm']:.2f} nm"
+        for exposure in values["exposure"].values()
     ]
     return [
         name,

@@ -92,7 +92,7 @@ class PlacementSums:
             self.small = 0
 
     def columns(self) -> tuple[Array, Array, Array, Array]:
-        """child, x, y, turn of all placements; the parts are released column by column."""
+        """child, x, y, turn of all placements; parts are released column by column."""
         columns = [list(part) for part in zip(*self.parts, strict=True)]
         self.parts = []
         joined = []

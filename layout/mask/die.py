@@ -188,7 +188,7 @@ def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> A
 
 
 def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
-    """Outline of the die about the lens axis; without a set size, as large as needed."""
+    """Outline of the die about the lens axis; without a size, as large as needed."""
     die = process.die
     size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
     half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)

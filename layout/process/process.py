@@ -433,7 +433,7 @@ def load_process(path: str | Path) -> Process:
 
 
 def resolve_process(process: Process, folder: str | Path) -> Process:
-    """``process`` with its CSV files looked up in ``folder``, and the bias table read."""
+    """``process`` with its CSV files in ``folder``, and the bias table read."""
     folder = Path(folder)
     process = dataclasses.replace(process, bias=with_table(process.bias, folder))
     if process.exposure.csv is not None:

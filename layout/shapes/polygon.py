@@ -202,7 +202,7 @@ def _measures(eighths: Array, diameter: float, radius: float) -> tuple[Array, Ar
 
 
 def _sound(eighths: Array, diagonal: bool) -> Array:
-    """(t,) whether trials (m, 2, t) are eighths of convex polygons, vertices distinct."""
+    """(t,) whether trials (m, 2, t) are eighths of strictly convex polygons."""
     x, y = eighths[:, 0], eighths[:, 1]
     mirrored = (
         slice(-2, -1) if diagonal and len(x) > 1 else slice(-1, None)
