@@ -20,8 +20,10 @@ Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WaferDies:
-    """Dies on a wafer. index: (n, 2) column and row in the raster, row by row from the
-    lowest; place_um: (n, 2).
+    """Dies on a wafer.
+
+    index: (n, 2) column and row in the raster, row by row from the lowest. place_um:
+    (n, 2) centres.
     """
 
     index: Array
@@ -152,8 +154,7 @@ def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
 def step_and_repeat(
     child: str, found: WaferDies, *, units_per_um: float
 ) -> tuple[CellReference, ...]:
-    """The dies as arrays: neighbours of a row together, equal rows above each other
-    together.
+    """The dies as few arrays: runs of neighbours in a row, equal runs of rows together.
 
     Args:
         child: cell of the die.

@@ -40,13 +40,10 @@ def _text(job: LayoutJob, target: Path) -> str:
     lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
-        verdict = (
-            ""
-            if outcome is None
-            else (
-                ", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN"
-            )
-        )
+        verdict = ""
+        if outcome is not None:
+            as_planned = ", reads back as planned"
+            verdict = as_planned if outcome.ok else ", DIFFERS FROM THE PLAN"
         lines.append(f"  {target / name}: {size / 1e6:.3g} MB{verdict}")
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]

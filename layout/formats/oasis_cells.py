@@ -160,10 +160,9 @@ class CellReader:
         position = []
         for bit, old in zip(bits, previous, strict=True):
             new = c.coordinate() if info & bit else None
-            relative = self.modal.relative
-            position.append(
-                old if new is None else c.within(old + new) if relative else new
-            )
+            if new is not None and self.modal.relative:
+                new = c.within(old + new)
+            position.append(old if new is None else new)
         return position[0], position[1]
 
     def _repeated(

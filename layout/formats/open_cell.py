@@ -38,12 +38,12 @@ def has_area(points: Array) -> bool:
 
 @dataclass(eq=False, slots=True)
 class PlacementSums:
-    """Placements of a cell while it is read: kept up to a number (None: all), beyond it
-    only their sums.
+    """Placements of a cell while it is read: stored up to a number, summed beyond it.
 
-    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged:
-    how many of them are large;
-    small: placements in the others.
+    keep: that number; None: all are stored. parts: (child, x, y, turn) of the stored
+    placements; child as the reader numbers it. count: placements so far. digest: sums,
+    where there are more than ``keep``. merged: how many of the parts are large. small:
+    placements in the other parts.
     """
 
     keep: int | None = None

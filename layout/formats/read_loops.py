@@ -236,16 +236,12 @@ def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) ->
         else:
             direction = word >> 1 & 7
             size = word >> 4
-            dx = (
-                0
-                if direction == 1 or direction == 3
-                else (-size if direction in (2, 5, 6) else size)
-            )
-            dy = (
-                0
-                if direction == 0 or direction == 2
-                else (-size if direction in (3, 6, 7) else size)
-            )
+            dx = -size if direction in (2, 5, 6) else size
+            if direction == 1 or direction == 3:
+                dx = 0
+            dy = -size if direction in (3, 6, 7) else size
+            if direction == 0 or direction == 2:
+                dy = 0
         if abs(dx) > FARTHEST or abs(dy) > FARTHEST:
             return -1
         next_x, next_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid

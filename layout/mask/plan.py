@@ -232,8 +232,9 @@ class PillarArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FigureCell:
-    """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database
-    units.
+    """A cell of fixed polygons, such as marks or the label.
+
+    polygons: {(layer, datatype): polygons}, each (n, 2) in database units.
     """
 
     name: str

@@ -25,11 +25,10 @@ _FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pieces:
-    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these
-    sides the box has of its
-    shape, in part at least.
+    """Pieces of boxes, on the grid.
 
-    of: (n,) the box it was cut from.
+    box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) whether each side
+    is, at least in part, an edge of the shape. of: (n,) the box it was cut from.
     """
 
     box: Array

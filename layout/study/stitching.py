@@ -17,15 +17,13 @@ _BAND = 64
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StitchReport:
-    """Change of the point-spread function over random field offsets, uniform within +-
-    ``stitching_nm`` along x and y.
+    """Change of the PSF over random field offsets, uniform within +- ``stitching_nm``.
 
-    strehl: (draws,) peak intensity relative to perfect fields.
-    change: (draws,) relative L2 change of the PSF on the window.
-    moved_nm: (draws,) move of its centroid.
-    psf, worst_psf: (y, x) intensity of perfect fields and of the draw that changes
-    most; window: where.
-    fields: that hold pillars. seed: of the draws.
+    strehl: (draws,) peak intensity relative to perfect fields. change: (draws,)
+    relative L2 change of the PSF on the window. moved_nm: (draws,) move of its
+    centroid. psf, worst_psf: (y, x) intensity of perfect fields, and of the draw that
+    changes most. window: positions of both. fields: number that hold pillars. seed: of
+    the draws.
     """
 
     stitching_nm: float
@@ -42,10 +40,10 @@ class StitchReport:
 def simulate_stitching(
     lens: Lens, plan: FieldPlan, process: Process, *, draws: int = 500, seed: int = 0
 ) -> StitchReport:
-    """Draw field offsets and see the focus of the design source change.
+    """Change of the focus over random offsets of the write fields.
 
-    The mean offset of the fields, which only moves the image, is taken out of each
-    draw.
+    The light is a second-order series in the offset of each field. The mean offset of
+    the fields, which only moves the image, is taken out of each draw.
 
     Args:
         lens: as designed.

@@ -39,8 +39,9 @@ class EdgeSamples:
 
 
 def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
-    """Every few um along the outline of what each layer number draws, two ranges and
-    more away from corners.
+    """Samples about every um along the outline of what each layer number draws.
+
+    Samples keep two ranges from corners, which are round.
 
     Args:
         polygons: with their layers.
@@ -200,8 +201,14 @@ def _edge(p: Array, q: Array, range_um: float) -> Array:
 def equivalent_spots(
     polygons: ExposedPolygons, step_um: float
 ) -> tuple[Array, Array, Array]:
-    """(x, y, area times dose) of points that stand for the polygons in a Gaussian much
-    wider than ``step_um``.
+    """Points that represent polygons in a Gaussian much wider than ``step_um``.
+
+    Args:
+        polygons: corners and doses.
+        step_um: distance of the points.
+
+    Returns:
+        (n,) x, (n,) y, um, and (n,) area times dose.
     """
     parts: list[Array] = [np.empty((0, 3))]
     for corners, dose in zip(polygons.corners, polygons.dose.tolist(), strict=True):
@@ -231,8 +238,10 @@ def equivalent_spots(
 
 
 def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -> Array:
-    """(n, 2) points of a raster within a polygon (crossings to the right are odd), on
-    each side at least four.
+    """(n, 2) points of a raster within a polygon, four or more along each axis.
+
+    A point is inside where a ray to the right crosses the outline an odd number of
+    times.
     """
     counts = np.maximum(np.ceil((high - low) / step_um).astype(int), 4)
     x, y = (
