@@ -103,15 +103,15 @@ def cut_tile(
     reach = np.inf if side_um is None else side_um / 2 + 1e-9
     columns = np.flatnonzero(x <= reach)
     rows = np.flatnonzero(y <= reach)
-    part = np.zeros((0, 0))
+    sizes = np.zeros((0, 0))
     if len(rows) and len(columns):
-        part = grid.diameter_um[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    row, column = np.nonzero(part)
+        sizes = grid.diameter_um[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    row, column = np.nonzero(sizes)
     if not len(row):
         raise ProcessError(
             f"no pillar within {side_um} um around {centre_um}; move or enlarge the square"
         )
-    size_um = np.asarray(part[row, column], float)
+    size_um = np.asarray(sizes[row, column], float)
     row, column = rows[row], columns[column]
     if lens.cell.shape.hole:
         raise ProcessError(
@@ -135,10 +135,25 @@ def cut_tile(
 def _discs(
     lens: Lens, process: Process, size_um: Array, _: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
-    """Sections of round pillars at sites, and which of them each is."""
-    step, height = process.rules.diameter_step_nm, lens.cell.height_um
-    drawn = np.rint(process.written_diameter_nm(size_um / nm) / step).astype(np.int64)
-    sizes, kind = np.unique(drawn, return_inverse=True)
+    """Sections of round pillars, tapered by the sidewall angle.
+
+    Args:
+        lens: with its height and pitch.
+        process: bias and sidewalls.
+        size_um: (pillars,) designed diameters.
+
+    Returns:
+        A section of each drawn diameter, and (pillars,) which of them each pillar has.
+
+    Raises:
+        ProcessError: no top is left, or feet as wide as the pitch.
+    """
+    step = process.rules.diameter_step_nm
+    height = lens.cell.height_um
+    drawn_steps = np.rint(process.written_diameter_nm(size_um / nm) / step).astype(
+        np.int64
+    )
+    sizes, kind = np.unique(drawn_steps, return_inverse=True)
     made_nm = process.made_diameter_nm(sizes * step)
     top, foot = process.top_foot_nm(made_nm, height / nm)
     pitch_nm = lens.diameters.pitch_um / nm
@@ -151,13 +166,14 @@ def _discs(
             f"{pitch_nm:.0f} nm; need above 0 and below the pitch"
         )
     sections = tuple(
-        SolidSection(_label(middle), _circle(low * nm), _circle(high * nm))
-        for middle, low, high in zip((top + foot) / 2, foot, top, strict=True)
+        SolidSection(_label(middle_nm), _circle(foot_nm * nm), _circle(top_nm * nm))
+        for middle_nm, foot_nm, top_nm in zip((top + foot) / 2, foot, top, strict=True)
     )
     return sections, kind
 
 
 def _circle(diameter_um: float) -> Outline:
+    """Outline of a circle."""
     return Outline((EllipseArc(diameter_um / 2, diameter_um / 2),))
 
 
@@ -171,8 +187,20 @@ def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> st
 def _shapes(
     lens: Lens, process: Process, size_um: Array, sites: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
-    """Sections of pillars of any shape and rotation at sites, and which each is."""
-    grid, step = lens.diameters, process.rules.diameter_step_nm
+    """Sections of pillars of any shape and rotation.
+
+    Args:
+        lens: sizes, lengths and rotations.
+        process: bias, steps and sidewalls.
+        size_um: (pillars,) designed sizes.
+        sites: rows and columns of the pillars.
+
+    Returns:
+        A section of each distinct (size, length, rotation), and (pillars,) which of
+        them each pillar has.
+    """
+    grid = lens.diameters
+    step = process.rules.diameter_step_nm
 
     def drawn_steps(size_um: Array) -> Array:
         drawn = process.bias.drawn_nm(np.asarray(size_um, float) / nm)
@@ -186,33 +214,45 @@ def _shapes(
         angle = np.degrees(grid.angle_rad[sites]) / process.rules.angle_step_deg
         turns = round(360 / process.rules.angle_step_deg)
         keys[:, 2] = np.rint(angle).astype(int) % turns
-    used, kind = np.unique(keys, axis=0, return_inverse=True)
-    sections = tuple(_section(lens.cell, process, *key) for key in used.tolist())
+    distinct, kind = np.unique(keys, axis=0, return_inverse=True)
+    sections = tuple(_section(lens.cell, process, *key) for key in distinct.tolist())
     return sections, kind.reshape(-1)
 
 
 def _section(
     cell: Cell, process: Process, drawn_nm: int, length_nm: int, turn: int
 ) -> SolidSection:
-    """Section of a drawn size, length (0: set by the shape) and rotation (in steps)."""
-    bias, angle = process.bias, turn * process.rules.angle_step_deg
+    """Section of a pillar: outlines at foot and top, from that at half height.
+
+    Args:
+        cell: shape and height of the pillar.
+        process: bias and sidewall angle.
+        drawn_nm: drawn size.
+        length_nm: drawn length; 0: set by the shape.
+        turn: rotation in steps of the process.
+
+    Raises:
+        ProcessError: the walls leave no top, close a hole or make the feet touch.
+    """
+    bias = process.bias
+    angle = turn * process.rules.angle_step_deg
     width = float(bias.made_nm(np.array(float(drawn_nm))))
     length = float(bias.made_nm(np.array(float(length_nm)))) if length_nm else 0.0
     shape = cell_of_sizes(cell, width, length) if length else cell
     lean_um = cell.height_um * math.tan(math.radians(process.etch.sidewall_deg))
-    is_closed = True
+    is_impossible = True
     try:
         foot, middle, top = (
-            shape.outline(width * nm, grow_um=grow).turned(math.radians(angle))
-            for grow in (lean_um, 0, -lean_um)
+            shape.outline(width * nm, grow_um=grow_um).turned(math.radians(angle))
+            for grow_um in (lean_um, 0, -lean_um)
         )
-        is_closed = not len(foot.parts) == len(middle.parts) == len(top.parts)
+        is_impossible = not len(foot.parts) == len(middle.parts) == len(top.parts)
     except CellError:
         pass
-    if not is_closed:
+    if not is_impossible:
         largest = max(foot, top, key=lambda outline: outline.radius_um)
-        is_closed = largest.gap_um(cell.lattice.steps_um(cell.pitch_um)) <= 0
-    if is_closed:
+        is_impossible = largest.gap_um(cell.lattice.steps_um(cell.pitch_um)) <= 0
+    if is_impossible:
         raise ProcessError(
             f"walls of {process.etch.sidewall_deg} degrees over {cell.height_um} um "
             "leave nothing of the top, close a hole or make the feet touch, of a "
@@ -232,11 +272,12 @@ def check_count(pillars: SolidTile, form: str) -> None:
     Raises:
         ProcessError: with the side of a square that would do.
     """
-    limit, found = MAX_PILLARS[form], len(pillars.kind)
-    if found > limit:
+    limit = MAX_PILLARS[form]
+    count = len(pillars.kind)
+    if count > limit:
         side = (math.isqrt(limit) - 2) * math.sqrt(pillars.site_um2)
         raise ProcessError(
-            f"{found:,} pillars are too many for {form} (at most {limit:,}); take a "
+            f"{count:,} pillars are too many for {form} (at most {limit:,}); take a "
             f"square of the lens with side_um = {side:.1f} or less, or use the mask "
             "(OASIS) for the whole lens"
         )
@@ -257,18 +298,22 @@ def mesh_section(
         for low, high in zip(section.foot.parts, section.top.parts, strict=True)
     ]
     foot, top = (np.concatenate([pair[end] for pair in contours]) for end in (0, 1))
-    total, start, faces = len(foot), 0, []
+    corner_count = len(foot)
+    start = 0
+    faces = []
     for low, _ in contours:
-        here = start + np.arange(len(low))
-        after = start + (np.arange(len(low)) + 1) % len(low)
-        faces.append(np.stack([here, after, after + total], -1))
-        faces.append(np.stack([here, after + total, here + total], -1))
+        at_foot = start + np.arange(len(low))
+        next_at_foot = start + (np.arange(len(low)) + 1) % len(low)
+        faces.append(np.stack([at_foot, next_at_foot, next_at_foot + corner_count], -1))
+        faces.append(
+            np.stack([at_foot, next_at_foot + corner_count, at_foot + corner_count], -1)
+        )
         start += len(low)
     for end, order in ((0, -1), (1, 1)):
-        filled = region.triangulate([pair[end] / nm for pair in contours])
-        faces.append(filled[:, ::order] + end * total)
+        cap = region.triangulate([pair[end] / nm for pair in contours])
+        faces.append(cap[:, ::order] + end * corner_count)
     rings = [
-        np.column_stack([ring, np.full(total, z)])
+        np.column_stack([ring, np.full(corner_count, z)])
         for ring, z in ((foot, 0.0), (top, height_um))
     ]
     return TriangleMesh(np.concatenate(rings), np.concatenate(faces))
@@ -294,20 +339,21 @@ def write_stl(path: str | Path, pillars: SolidTile, *, sides: int = 8) -> int:
         for section in pillars.sections
     ]
     facets = np.stack([_facets(mesh) for mesh in meshes])
-    total = facets.shape[1] * len(pillars.kind)
-    head = b"tapered pillars, um, metalens-toolchain".ljust(80)
+    triangles = facets.shape[1] * len(pillars.kind)
+    header = b"tapered pillars, um, metalens-toolchain".ljust(80)
     places = np.column_stack([pillars.x_um, pillars.y_um]).astype(np.float32)
-    with store.replace_atomically(path) as part, open(part, "wb") as file:
-        file.write(head + struct.pack("<I", total))
+    with store.replace_atomically(path) as temporary, open(temporary, "wb") as file:
+        file.write(header + struct.pack("<I", triangles))
         for start in range(0, len(places), _PILLARS_PER_BLOCK):
             block = slice(start, start + _PILLARS_PER_BLOCK)
             placed = facets[pillars.kind[block]]
             placed["corners"][..., :2] += places[block, None, None]
             file.write(placed.data)
-    return int(total)
+    return int(triangles)
 
 
 def _facets(mesh: TriangleMesh) -> Array:
+    """(triangles,) binary STL records of a mesh: unit normals and corners, um."""
     corners = mesh.vertices_um[mesh.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facets = np.zeros(len(corners), _FACET)
@@ -344,14 +390,16 @@ def write_step(path: str | Path, pillars: SolidTile) -> None:
     colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
     root = shapes.NewShape()
     _set_name(root, "metalens tile")
-    x, y, margin = pillars.x_um, pillars.y_um, pillars.pitch_um
+    x = pillars.x_um
+    y = pillars.y_um
+    margin = pillars.pitch_um
     size = float(np.ptp(x)) + margin, float(np.ptp(y)) + margin, 1.0
     corner = float(x.min()) - margin / 2, float(y.min()) - margin / 2, -1.0
     slab = Solid.make_box(*size).wrapped
     parts = [("substrate", slab, _SUBSTRATE_COLOUR, [corner])]
     for kind, section in enumerate(pillars.sections):
-        here = pillars.kind == kind
-        places = [(*p, 0.0) for p in np.column_stack([x[here], y[here]]).tolist()]
+        members = pillars.kind == kind
+        places = [(*p, 0.0) for p in np.column_stack([x[members], y[members]]).tolist()]
         body = _body(section, pillars.height_um)
         parts.append((section.name, body, _PILLAR_COLOUR, places))
     for part in parts:
@@ -392,13 +440,13 @@ def _add_part(
 def _body(section: SolidSection, height_um: float) -> Any:
     """Solid of a pillar: each part of its section, the holes cut out of the first."""
     pairs = zip(section.foot.parts, section.top.parts, strict=True)
-    whole, *holes = (
+    solid, *holes = (
         _loft(foot, top, height_um, is_upright=section.is_upright)
         for foot, top in pairs
     )
     for hole in holes:
-        whole = (whole - hole).solid()
-    return whole.wrapped
+        solid = (solid - hole).solid()
+    return solid.wrapped
 
 
 def _loft(
@@ -408,6 +456,7 @@ def _loft(
     *,
     is_upright: bool,
 ) -> Any:
+    """Solid between two outlines: cylinder, cone, extrusion or ruled loft."""
     from build123d import Face, Solid
 
     if isinstance(foot, EllipseArc) and isinstance(top, EllipseArc):
@@ -422,6 +471,7 @@ def _loft(
 
 
 def _wire(part: EllipseArc | PolygonLoop, z_um: float) -> Any:
+    """Closed curve of a part of an outline at a height, um."""
     from build123d import Location, Wire
 
     if isinstance(part, EllipseArc):

@@ -18,7 +18,7 @@ from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
 MARGIN_UM = 10.0  # around the marks of a wafer
-_SAME = 5e-7  # doses that are written alike
+_SAME = 5e-7  # difference of doses that are written as the same number
 _MOST_DATATYPE = 32767
 
 
@@ -35,9 +35,12 @@ class PartPlacement:
 
 
 def _copies(child: str, at: Placement) -> CellReference:
+    """An array of a cell at a place of the die, in database units."""
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
     step = (
-        (0, 0) if at.step_um is None else tuple(round(s * PER_UM) for s in at.step_um)
+        (0, 0)
+        if at.step_um is None
+        else tuple(round(side * PER_UM) for side in at.step_um)
     )
     turn = Orientation(at.turn_deg % 360, at.mirrored)
     return CellReference(
@@ -49,8 +52,8 @@ def _copies(child: str, at: Placement) -> CellReference:
 class JobLayers:
     """(layer, datatype) of all parts together: one dose each.
 
-    doses: of those that are exposed. names: shown by viewers. kept: numbers that mean
-    something undosed.
+    doses: of those that are exposed. names: shown by viewers. kept: undosed layers,
+    whose numbers no dose may take.
     """
 
     kept: frozenset[LayerNumber]
@@ -70,10 +73,17 @@ class JobLayers:
         return new
 
     def _number(self, layer: LayerNumber, dose: float) -> LayerNumber:
+        """Number of a layer of a given dose, free or with an equal dose.
+
+        The own number first, then any with that dose, then the first free datatype.
+
+        Raises:
+            ProcessError: no datatype is free.
+        """
         if layer not in self.kept and abs(self.doses.get(layer, dose) - dose) < _SAME:
             return layer
-        for other, known in sorted(self.doses.items()):
-            if other[0] == layer[0] and abs(known - dose) < _SAME:
+        for other, other_dose in sorted(self.doses.items()):
+            if other[0] == layer[0] and abs(other_dose - dose) < _SAME:
                 return other
         for datatype in range(_MOST_DATATYPE + 1):
             if (layer[0], datatype) not in self.doses and (
@@ -99,10 +109,10 @@ def die_cell(
     """
     layers = JobLayers(kept)
     cells: dict[str, MaskCell] = {}
-    here: list[CellReference] = []
-    for one in placed:
-        here += _take(one, layers, cells)
-    return _joined(name, cells, here, layers)
+    references: list[CellReference] = []
+    for part_placement in placed:
+        references += _take(part_placement, layers, cells)
+    return _joined(name, cells, references, layers)
 
 
 def wafer_cell(
@@ -123,43 +133,60 @@ def wafer_cell(
         ProcessError: a part with a cell of that name.
     """
     layers = JobLayers(frozenset(), dict(one.doses), dict(one.layer_names))
-    cells, here = dict(one.cells), list(steps)
+    cells = dict(one.cells)
+    references = list(steps)
     if marks is not None:
-        here += _take(marks, layers, cells)
-    return _joined(name, cells, here, layers)
+        references += _take(marks, layers, cells)
+    return _joined(name, cells, references, layers)
 
 
 def _joined(
     name: str,
     cells: dict[str, MaskCell],
-    here: Sequence[CellReference],
+    references: Sequence[CellReference],
     layers: JobLayers,
 ) -> MaskLibrary:
+    """Mask of a top cell with references, and the cells of all parts.
+
+    Raises:
+        ProcessError: a part with a cell of the name of the top cell.
+    """
     if name in cells:
         raise ProcessError(
             f"a part holds a cell {name!r}, the name of the arrangement; give the "
             "arrangement another"
         )
-    top = MaskCell(name, references=tuple(here))
+    top = MaskCell(name, references=tuple(references))
     return MaskLibrary(name, {**cells, name: top}, UNIT_NM, layers.names, layers.doses)
 
 
 def _take(
     placed: PartPlacement, layers: JobLayers, cells: dict[str, MaskCell]
 ) -> tuple[CellReference, ...]:
-    """Add the cells of a part, with numbers and names of their own; its instances."""
+    """Copy the cells of a part into the mask, renamed where a name is in use.
+
+    Args:
+        placed: the part and its places.
+        layers: of the whole mask; receives those of the part.
+        cells: of the whole mask; receives those of the part.
+
+    Returns:
+        References to the top cell of the part.
+    """
     part = placed.part
     numbers = layers.take(part.library)
-    new: dict[str, str] = {}
+    new_names: dict[str, str] = {}
     for name in part.library.cells:
-        taken = {*cells, *new.values()}
-        free = (f"{name}_{n}" for n in itertools.count(2))
-        new[name] = (
-            name if name not in taken else next(f for f in free if f not in taken)
+        taken = {*cells, *new_names.values()}
+        candidates = (f"{name}_{n}" for n in itertools.count(2))
+        new_names[name] = (
+            name
+            if name not in taken
+            else next(candidate for candidate in candidates if candidate not in taken)
         )
     for cell in part.library.cells.values():
-        cells[new[cell.name]] = moved_cell(cell, new, numbers)
-    return placed.copies(new[part.top])
+        cells[new_names[cell.name]] = moved_cell(cell, new_names, numbers)
+    return placed.copies(new_names[part.top])
 
 
 # write fields
@@ -177,27 +204,29 @@ def place_fields(
         splits: fields of each lens about its axis, by the name of its part.
         placed: parts on the die.
     """
-    for one in placed:
-        if one.part.name not in splits:
+    for part_placement in placed:
+        if part_placement.part.name not in splits:
             continue
-        steps = handover.field_sequence(splits[one.part.name])
-        middle = np.array([(step.x_um, step.y_um) for step in steps])
-        for copies in one.copies(one.part.top):
+        steps = handover.field_sequence(splits[part_placement.part.name])
+        centres = np.array([(step.x_um, step.y_um) for step in steps])
+        for copies in part_placement.copies(part_placement.part.top):
             if not copies.turn.quarter:
                 continue
-            level = copies.turn.angle_deg % 180 == 0
-            x, y = copies.turn.apply(middle[:, 0], middle[:, 1])
-            for left, up in zip(*(v.tolist() for v in copies.places()), strict=True):
+            is_level = copies.turn.angle_deg % 180 == 0
+            x, y = copies.turn.apply(centres[:, 0], centres[:, 1])
+            for copy_x, copy_y in zip(
+                *(values.tolist() for values in copies.places()), strict=True
+            ):
                 for n, step in enumerate(steps):
                     sides = step.width_um, step.height_um
-                    wide, high = sides if level else sides[::-1]
+                    width, height = sides if is_level else sides[::-1]
                     yield handover.WriteStep(
-                        float(x[n]) + left / PER_UM,
-                        float(y[n]) + up / PER_UM,
-                        wide,
-                        high,
+                        float(x[n]) + copy_x / PER_UM,
+                        float(y[n]) + copy_y / PER_UM,
+                        width,
+                        height,
                         step.pillars,
-                        one.part.name,
+                        part_placement.part.name,
                     )
 
 

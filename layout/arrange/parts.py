@@ -62,23 +62,36 @@ def of_plan(
         corrected: whether the plan has corrected doses.
     """
     library = library_of(plan)
-    new = {c: name if c == plan.name else f"{name}_{c}" for c in library.cells}
-    cells = {new[c.name]: moved_cell(c, new, {}) for c in library.cells.values()}
+    new_names = {
+        cell: name if cell == plan.name else f"{name}_{cell}" for cell in library.cells
+    }
+    cells = {
+        new_names[cell.name]: moved_cell(cell, new_names, {})
+        for cell in library.cells.values()
+    }
     boxes = {
-        PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)],
+        PILLARS: [
+            box for lattice in plan.lattices for box in _lattice_boxes(plan, lattice)
+        ],
         APERTURE: [],
     }
-    every = list(boxes[PILLARS])
+    all_boxes = list(boxes[PILLARS])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
-            some = [box for s in shapes for box in rectilinear.covering_rectangles(s)]
-            every += some
+            boxes_of_shapes = [
+                box
+                for shape in shapes
+                for box in rectilinear.covering_rectangles(shape)
+            ]
+            all_boxes += boxes_of_shapes
             if figure.name not in UNDRAWN:
-                boxes[_exposure(layer, process)] += some
-    stacked = {kind: _stacked(some) for kind, some in boxes.items()}
+                boxes[_exposure(layer, process)] += boxes_of_shapes
+    boxes_of_exposure = {
+        exposure: _stacked(listed) for exposure, listed in boxes.items()
+    }
     library = dataclasses.replace(library, cells=cells)
-    extent = box_around(_stacked(every))
-    return DieComponent(name, name, library, stacked, extent, corrected)
+    extent = box_around(_stacked(all_boxes))
+    return DieComponent(name, name, library, boxes_of_exposure, extent, corrected)
 
 
 def of_file(
@@ -114,9 +127,9 @@ def of_file(
     library, empty = _without_empty(library)
     layers = process.layers
     table = path.with_name("doses.csv")
-    known = handover.read_dose_table(table) if table.is_file() else {}
+    table_doses = handover.read_dose_table(table) if table.is_file() else {}
     used = sorted(library.layers - {layers.outline, layers.fields})
-    doses = {layer: known.get(layer, relative_dose) for layer in used}
+    doses = {layer: table_doses.get(layer, relative_dose) for layer in used}
     boxes: dict[str, list[Array]] = {}
     counts: Counter[LayerNumber] = Counter()
     for stack in flatten_stacks(library, top):
@@ -127,18 +140,27 @@ def of_file(
         places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
         placed = (np.concatenate(pieces)[None] + places[:, None]).reshape(-1, 4)
         boxes.setdefault(_exposure(stack.layer, process, other=True), []).append(placed)
-    found = {key: np.concatenate(some) for key, some in boxes.items()}
-    every = np.concatenate([*found.values(), *([] if found else [np.zeros((1, 4))])])
+    boxes_of_exposure = {key: np.concatenate(stacks) for key, stacks in boxes.items()}
+    all_boxes = np.concatenate(
+        [
+            *boxes_of_exposure.values(),
+            *([] if boxes_of_exposure else [np.zeros((1, 4))]),
+        ]
+    )
     return DieComponent(
         name,
         top,
         dataclasses.replace(library, doses=doses),
-        {key: box for key, box in found.items() if key in (PILLARS, APERTURE)},
-        box_around(every),
+        {
+            key: stacked
+            for key, stacked in boxes_of_exposure.items()
+            if key in (PILLARS, APERTURE)
+        },
+        box_around(all_boxes),
         uncorrected={
             layer: counts[layer]
             for layer in used
-            if layer not in known and layer[0] != layers.aperture[0]
+            if layer not in table_doses and layer[0] != layers.aperture[0]
         },
         empty=empty,
     )
@@ -153,14 +175,14 @@ def _without_empty(library: MaskLibrary) -> tuple[MaskLibrary, int]:
     )
     cells = {}
     for name, cell in library.cells.items():
-        kept: dict[LayerNumber, list[Array]] = {}
+        polygons: dict[LayerNumber, list[Array]] = {}
         for layer, shapes in cell.polygons.items():
             for shape in shapes:
                 if polygon.twice_area(shape) or region.union_contours([shape]):
-                    kept.setdefault(layer, []).append(shape)
+                    polygons.setdefault(layer, []).append(shape)
                 else:
                     count += 1
-        cells[name] = dataclasses.replace(cell, polygons=kept)
+        cells[name] = dataclasses.replace(cell, polygons=polygons)
     return dataclasses.replace(library, cells=cells), count
 
 
@@ -184,6 +206,11 @@ def _exposure(layer: LayerNumber, process: Process, *, other: bool = False) -> s
 def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
     """The same mask in another database unit.
 
+    Args:
+        library: all its cells.
+        unit_nm: new database unit.
+        where: name of the file, for messages.
+
     Raises:
         MaskFileError: a coordinate that is no whole number of new units, or beyond 32
             bits.
@@ -193,11 +220,11 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
         return library
 
     def scaled(values: Array) -> Array:
-        new = np.asarray(values, float) * ratio
-        whole = np.rint(new)
-        off = np.abs(new - whole).max(initial=0)
-        far = np.abs(whole).max(initial=0)
-        if off > 1e-6 or far > 2**31 - 1:
+        in_new_unit = np.asarray(values, float) * ratio
+        whole = np.rint(in_new_unit)
+        rounding = np.abs(in_new_unit - whole).max(initial=0)
+        largest = np.abs(whole).max(initial=0)
+        if rounding > 1e-6 or largest > 2**31 - 1:
             raise MaskFileError(
                 f"{where}: its database unit is {library.unit_nm:g} nm, and its "
                 f"coordinates are no whole multiples of {unit_nm:g} nm within 32 bits; "
@@ -205,21 +232,24 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
             )
         return whole.astype(np.int64)
 
-    def cell(old: MaskCell) -> MaskCell:
+    def rescaled(old: MaskCell) -> MaskCell:
         placed = old.kept()
-        x, y = (scaled(v).astype(np.int32) for v in (placed.x, placed.y))
+        x, y = (scaled(places).astype(np.int32) for places in (placed.x, placed.y))
         circles = {
-            layer: [tuple(row) for row in scaled(np.array(some)).tolist()]
-            for layer, some in old.circles.items()
+            layer: [tuple(row) for row in scaled(np.array(shapes)).tolist()]
+            for layer, shapes in old.circles.items()
         }
         return dataclasses.replace(
             old,
-            polygons={k: [scaled(p) for p in some] for k, some in old.polygons.items()},
+            polygons={
+                k: [scaled(points) for points in shapes]
+                for k, shapes in old.polygons.items()
+            },
             circles=circles,
             placed=dataclasses.replace(placed, x=x, y=y),
         )
 
-    cells = {name: cell(c) for name, c in library.cells.items()}
+    cells = {name: rescaled(cell) for name, cell in library.cells.items()}
     return dataclasses.replace(library, unit_nm=unit_nm, cells=cells)
 
 
@@ -239,7 +269,8 @@ def moved_cell(
         polygons.setdefault(layers.get(layer, layer), []).extend(shapes)
     for layer, some in cell.circles.items():
         circles.setdefault(layers.get(layer, layer), []).extend(some)
-    placed, pillars = cell.kept(), cell.pillars
+    placed = cell.kept()
+    pillars = cell.pillars
     if pillars is not None:
         children = tuple(names.get(child, "") for child in pillars.children)
         pillars = dataclasses.replace(pillars, children=children)
@@ -259,29 +290,36 @@ def moved_cell(
 
 
 def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
-    """Boxes around the pillars of squares of sites, at most 64 each way: single pillars
-    where there are few.
+    """Boxes around the pillars of tiles of a lattice, at most 64 by 64 tiles.
+
+    Args:
+        plan: outlines of the classes.
+        lattice: of the plan.
+
+    Returns:
+        (4,) left, bottom, right, top of each tile that holds pillars, database units.
     """
-    reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
-    high = -(-lattice.rows // _TILES)
-    wide = -(-lattice.columns // _TILES)
-    found = []
-    for first, block in lattice.blocks(high):
-        for left in range(0, lattice.columns, wide):
-            held = block[:, left : left + wide] != 0
-            if held.any():
-                rows = np.flatnonzero(held.any(1))[[-1, 0]] + first
-                columns = np.flatnonzero(held.any(0))[[0, -1]] + left
+    reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
+    rows_per_tile = -(-lattice.rows // _TILES)
+    columns_per_tile = -(-lattice.columns // _TILES)
+    boxes = []
+    for first, block in lattice.blocks(rows_per_tile):
+        for left in range(0, lattice.columns, columns_per_tile):
+            occupied = block[:, left : left + columns_per_tile] != 0
+            if occupied.any():
+                rows = np.flatnonzero(occupied.any(1))[[-1, 0]] + first
+                columns = np.flatnonzero(occupied.any(0))[[0, -1]] + left
                 x = lattice.x0 + columns * lattice.pitch
                 y = lattice.y0 - rows * lattice.down
                 low, high_corner = (x[0], y[0]), (x[1], y[1])
-                found.append(
+                boxes.append(
                     np.add([*low, *high_corner], np.array([-1, -1, 1, 1]) * reach)
                 )
-    return found
+    return boxes
 
 
 def _stacked(boxes: Sequence[Array]) -> Array:
+    """(n, 4) boxes."""
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 

@@ -153,6 +153,7 @@ class WaferSettings:
     marks: tuple[WaferMark, ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse values out of range, and settings that contradict each other."""
         _above("pitch_um", *self.pitch_um)
         if any(abs(1e3 * pitch - round(1e3 * pitch)) > 1e-6 for pitch in self.pitch_um):
             raise ProcessError(
@@ -191,6 +192,7 @@ class Floorplan:
     wafer: WaferSettings | None = None
 
     def __post_init__(self) -> None:
+        """Refuse an empty floorplan, and names used twice."""
         _named(self.name)
         if not self.lens and not self.cell:
             raise ProcessError("nothing to arrange: need a [[lens]] or a [[cell]]")
@@ -198,10 +200,10 @@ class Floorplan:
             raise ProcessError(
                 "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
             )
-        taken = [self.name, *(part.name for part in self.parts)]
+        used_names = [self.name, *(part.name for part in self.parts)]
         if self.die is not None:
-            taken.append("DIE")
-        names.check_distinct_names(taken)
+            used_names.append("DIE")
+        names.check_distinct_names(used_names)
 
     @property
     def parts(self) -> list[LensPart | CellPart]:
@@ -214,6 +216,7 @@ class Floorplan:
 
 
 def _named(name: str) -> None:
+    """Refuse an illegal name, or more than 12 characters."""
     names.check_cell_name(name)
     if len(name) > 12:
         raise ProcessError(
@@ -222,6 +225,7 @@ def _named(name: str) -> None:
 
 
 def _above(name: str, *values: float) -> None:
+    """Refuse lengths that are not finite and above 0."""
     if not all(0 < value < math.inf for value in values):
         raise ProcessError(
             f"{name} = {', '.join(map(str, values))}: need finite lengths above 0"

@@ -61,28 +61,28 @@ def reach_um(process: Process) -> float:
     if not process.exposure.corrected:
         return 0.0
     point = psf.point_exposure(process.exposure)
-    most = psf.THRESHOLD * process.exposure.tolerance
+    allowed = psf.THRESHOLD * process.exposure.tolerance
 
-    def added(away_um: float) -> float:
+    def exposure_at(away_um: float) -> float:
         pairs = zip(point.weights.tolist(), point.widths_um.tolist(), strict=True)
-        return float(sum(w / 2 * math.erfc(away_um / a) for w, a in pairs))
+        return float(
+            sum(weight / 2 * math.erfc(away_um / width) for weight, width in pairs)
+        )
 
     low, high = 0.0, 8 * float(point.widths_um.max())
     while high - low > 1e-3:
         middle = (low + high) / 2
-        low, high = (middle, high) if added(middle) > most else (low, middle)
+        low, high = (middle, high) if exposure_at(middle) > allowed else (low, middle)
     return high
 
 
 def check_separation(
     placed: Sequence[PartPlacement], process: Process
 ) -> list[Violation]:
-    """Pairs of parts that are nearer than the least gap, or than one's backscatter lets
-    the other's doses hold.
+    """Pairs of parts closer than the gap rule, or in reach of scattered electrons.
 
-    Rectilinear shapes are taken as they are, lattices as boxes of some of their pillars
-    (squares of a 64th of the
-    lattice), any other shape as boxes around slices of it (5 um high, or a 64th).
+    Rectilinear shapes are taken as they are. A lattice is taken as boxes of tiles (a
+    64th of it each way), any other shape as boxes of slices (5 um high, or a 64th).
 
     Args:
         placed: parts on the die.
@@ -97,32 +97,32 @@ def check_separation(
             f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer"
         )
     gap = process.rules.minimum_gap_nm * PER_UM / 1e3
-    far = reach_um(process) * PER_UM
-    around = np.array([one.box() for one in standing])
-    found: list[Violation] = []
-    for n, one in enumerate(standing):
-        for m in np.flatnonzero(
-            box_distance(around[n + 1 :], around[n]) < max(gap, far)
+    reach = reach_um(process) * PER_UM
+    boxes = np.array([first.box() for first in standing])
+    violations: list[Violation] = []
+    for i, first in enumerate(standing):
+        for j in np.flatnonzero(
+            box_distance(boxes[i + 1 :], boxes[i]) < max(gap, reach)
         ).tolist():
-            two = standing[n + 1 + m]
-            scattered = far if one.part.corrected or two.part.corrected else 0.0
-            found += _between(one, two, gap, scattered, process)
-    return found
+            second = standing[i + 1 + j]
+            scattered = reach if first.part.corrected or second.part.corrected else 0.0
+            violations += _between(first, second, gap, scattered, process)
+    return violations
 
 
 def extent_of_copies(
     placed: Sequence[PartPlacement], *, exposed: bool = False
 ) -> Array:
-    """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``:
-    of what is exposed alone.
+    """(4,) left, bottom, right, top around all copies, database units.
 
     Args:
         placed: parts on the die.
+        exposed: whether only exposed shapes count; else outlines count too.
     """
-    made = []
-    for one in standing_parts(placed):
-        made.append(one.box() if exposed else one.moved(one.part.extent[None])[0])
-    return box_around(np.array(made))
+    boxes = []
+    for copy in standing_parts(placed):
+        boxes.append(copy.box() if exposed else copy.moved(copy.part.extent[None])[0])
+    return box_around(np.array(boxes))
 
 
 def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
@@ -140,47 +140,65 @@ def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
 
 
 def _each(part: DieComponent, copies: CellReference) -> Iterator[StandingPart]:
+    """Each copy of an array as a part of its own."""
     if copies.count > MOST_PLACED:
         raise ProcessError(
             f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked"
         )
-    for x, y in zip(*(v.tolist() for v in copies.places()), strict=True):
+    for x, y in zip(*(values.tolist() for values in copies.places()), strict=True):
         yield StandingPart(part, copies.turn, x, y)
 
 
 def _between(
-    one: StandingPart, two: StandingPart, gap: float, scattered: float, process: Process
+    part_1: StandingPart,
+    part_2: StandingPart,
+    gap: float,
+    scattered: float,
+    process: Process,
 ) -> Iterator[Violation]:
-    """At most one finding for each exposure that both have shapes of."""
-    for kind in sorted(one.part.boxes.keys() & two.part.boxes.keys()):
-        first = one.moved(one.part.boxes[kind])
-        second = two.moved(two.part.boxes[kind])
-        need = gap if kind == APERTURE else max(gap, scattered)
-        first = (
-            first[box_distance(first, box_around(second)) < need]
-            if len(first) and len(second)
-            else first[:0]
+    """Violations between two parts: the closest boxes of each common exposure.
+
+    Args:
+        part_1, part_2: copies on the die.
+        gap: least distance by the rules, database units.
+        scattered: distance at which scattered electrons matter, database units.
+        process: rules, for the limit that is reported.
+
+    Yields:
+        At most one violation for each exposure.
+    """
+    for exposure in sorted(part_1.part.boxes.keys() & part_2.part.boxes.keys()):
+        boxes_1 = part_1.moved(part_1.part.boxes[exposure])
+        boxes_2 = part_2.moved(part_2.part.boxes[exposure])
+        limit_units = gap if exposure == APERTURE else max(gap, scattered)
+        boxes_1 = (
+            boxes_1[box_distance(boxes_1, box_around(boxes_2)) < limit_units]
+            if len(boxes_1) and len(boxes_2)
+            else boxes_1[:0]
         )
-        second = (
-            second[box_distance(second, box_around(first)) < need]
-            if len(first)
-            else second[:0]
+        boxes_2 = (
+            boxes_2[box_distance(boxes_2, box_around(boxes_1)) < limit_units]
+            if len(boxes_1)
+            else boxes_2[:0]
         )
-        least, box = math.inf, np.zeros(4)
-        for each in second if len(first) else ():
-            distance = box_distance(first, each)
+        smallest = math.inf
+        box = np.zeros(4)
+        for other in boxes_2 if len(boxes_1) else ():
+            distance = box_distance(boxes_1, other)
             n = int(distance.argmin())
-            if distance[n] < least:
-                least = float(distance[n])
-                box = box_around(np.stack([first[n], each]))
-        if least >= need:
+            if distance[n] < smallest:
+                smallest = float(distance[n])
+                box = box_around(np.stack([boxes_1[n], other]))
+        if smallest >= limit_units:
             continue
-        left, bottom, right, top = (int(v) for v in box)
-        nm = least * 1e3 / PER_UM
-        if least < gap:
-            limit = process.rules.minimum_gap_nm
-            text = f"{one.text} to {two.text}, {kind}"
+        left, bottom, right, top = (int(side) for side in box)
+        distance_nm = smallest * 1e3 / PER_UM
+        if smallest < gap:
+            limit_nm = process.rules.minimum_gap_nm
+            text = f"{part_1.text} to {part_2.text}, {exposure}"
         else:
-            limit = need * 1e3 / PER_UM
-            text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"
-        yield Violation("clearance", (left, bottom, right, top), nm, limit, text)
+            limit_nm = limit_units * 1e3 / PER_UM
+            text = f"{part_1.text} to {part_2.text}: backscatter of one that the doses of the other do not know of"
+        yield Violation(
+            "clearance", (left, bottom, right, top), distance_nm, limit_nm, text
+        )

@@ -20,8 +20,10 @@ Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WaferDies:
-    """Dies on a wafer. index: (n, 2) column and row in the raster, row by row from the
-    lowest; place_um: (n, 2).
+    """Dies on a wafer.
+
+    index: (n, 2) column and row in the raster, row by row from the lowest. place_um:
+    (n, 2) centres.
     """
 
     index: Array
@@ -37,8 +39,9 @@ def usable_dies(
     wafer: its circle, the chord of the flat, the notch (:func:`notch_distance_um`).
 
     Args:
+        wafer: diameter, raster, marks and exclusion.
         die_um: left, bottom, right, top of all that a die draws, about its middle.
-        around_marks_um: kept free around the marks.
+        around_marks_um: distance from the marks that stays free.
 
     Raises:
         ProcessError: dies that overlap, or none that fits.
@@ -67,19 +70,19 @@ def usable_dies(
     index = np.column_stack([columns, rows])
     place = index * wafer.pitch_um + wafer.offset_um
     boxes = place[:, [0, 1, 0, 1]] + die_um
-    kept = _usable(wafer, boxes)
+    usable = _usable(wafer, boxes)
     for mark in wafer.marks:
         half = wafer.mark_um / 2 + around_marks_um
         x, y = 1e3 * mark.x_mm, 1e3 * mark.y_mm
-        kept &= (
+        usable &= (
             box_distance(boxes, np.array([x - half, y - half, x + half, y + half])) > 0
         )
-    if not kept.any():
+    if not usable.any():
         raise ProcessError(
             f"no die of {right - left:.0f} x {top - bottom:.0f} um fits on the wafer; change wafer.offset_um, "
             "wafer.edge_exclusion_mm or wafer.diameter_mm"
         )
-    return WaferDies(index[kept], place[kept])
+    return WaferDies(index[usable], place[usable])
 
 
 def refuse_marks_off(wafer: WaferSettings) -> None:
@@ -97,16 +100,26 @@ def chord_um(wafer: WaferSettings) -> float:
     """Distance of the flat from the middle of the wafer; the radius where there is
     none.
     """
-    radius, half = 500 * wafer.diameter_mm, 500 * wafer.flat_mm
+    radius = 500 * wafer.diameter_mm
+    half = 500 * wafer.flat_mm
     return math.sqrt(radius**2 - half**2)
 
 
 def _usable(wafer: WaferSettings, boxes: Array) -> Array:
-    """(n,) whether boxes (n, 4) lie whole on the usable part."""
+    """(n,) whether a box lies whole on the usable part of the wafer.
+
+    Usable is what is ``edge_exclusion_mm`` from the circle, the flat and the notch.
+
+    Args:
+        wafer: diameter, flat, notch and exclusion.
+        boxes: (n, 4) left, bottom, right, top, um.
+    """
     radius = 500 * wafer.diameter_mm
     exclusion = 1e3 * wafer.edge_exclusion_mm
-    far = np.hypot(np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1))
-    inside = (far <= radius - exclusion + 1e-6) & (
+    farthest = np.hypot(
+        np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1)
+    )
+    inside = (farthest <= radius - exclusion + 1e-6) & (
         boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6
     )
     if wafer.notch_mm:
@@ -115,31 +128,33 @@ def _usable(wafer: WaferSettings, boxes: Array) -> Array:
 
 
 def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
-    """(n,) distances of boxes (n, 4) from the notch; 0 or less where they overlap.
+    """(n,) distance of boxes from the notch, um; 0 or less where they overlap.
 
-    SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` deep. That
-    is a sharp V with its corner at the middle of the bottom's circle, widened by the
-    radius; a box is nearest to it at a corner or an edge of either.
+    SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` in depth.
+    That is a sharp V, with its corner at the centre of the bottom's circle, widened by
+    the radius. A box is nearest to it at a corner or an edge of either.
 
     Args:
         wafer: with its notch.
+        boxes: (n, 4) left, bottom, right, top, um.
     """
     radius = 1e3 * NOTCH_RADIUS_MM
     corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius
     left, bottom, right, _ = boxes.T
     x = np.maximum(np.maximum(left, -right), 0.0)  # of the point nearest to the axis
-    up = bottom - corner
-    side = (x + up) / math.sqrt(2)  # from the line of a wall, above 0 outside
-    along = (x - up) / math.sqrt(2)  # down the wall from the corner
-    away = np.where(along >= 0, np.maximum(side, 0.0), np.hypot(x, np.maximum(up, 0)))
-    return np.asarray(away - radius)
+    height = bottom - corner
+    from_wall = (x + height) / math.sqrt(2)  # from the line of a wall, above 0 outside
+    down_wall = (x - height) / math.sqrt(2)  # down the wall from the corner
+    distance = np.where(
+        down_wall >= 0, np.maximum(from_wall, 0.0), np.hypot(x, np.maximum(height, 0))
+    )
+    return np.asarray(distance - radius)
 
 
 def step_and_repeat(
     child: str, found: WaferDies, *, units_per_um: float
 ) -> tuple[CellReference, ...]:
-    """The dies as arrays: neighbours of a row together, equal rows above each other
-    together.
+    """The dies as few arrays: runs of neighbours in a row, equal runs of rows together.
 
     Args:
         child: cell of the die.
@@ -152,27 +167,35 @@ def step_and_repeat(
     for row, members in itertools.groupby(
         zip(rows, columns, strict=True), key=lambda pair: pair[0]
     ):
-        line = [column for _, column in members]
+        row_columns = [column for _, column in members]
         breaks = [
             0,
-            *(n for n in range(1, len(line)) if line[n] != line[n - 1] + 1),
-            len(line),
+            *(
+                n
+                for n in range(1, len(row_columns))
+                if row_columns[n] != row_columns[n - 1] + 1
+            ),
+            len(row_columns),
         ]
-        spans[row] = [(line[a], line[b - 1] + 1) for a, b in itertools.pairwise(breaks)]
-    at = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
+        spans[row] = [
+            (row_columns[start], row_columns[stop - 1] + 1)
+            for start, stop in itertools.pairwise(breaks)
+        ]
+    die_number = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
     open_runs: dict[tuple[int, int], int] = {}
-    made: list[tuple[tuple[int, int], int, int]] = []
+    blocks: list[tuple[tuple[int, int], int, int]] = []
     for row in range(min(spans), max(spans) + 2):
-        here = set(spans.get(row, ()))
-        made += [
-            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - here)
+        runs = set(spans.get(row, ()))
+        blocks += [
+            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - runs)
         ]
-        open_runs.update(dict.fromkeys(here - open_runs.keys(), row))
+        open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
     step = _steps(found, units_per_um)
     copies = []
-    for (first, end), low, high in made:
+    for (first, end), low, high in blocks:
         x, y = (
-            round(v * units_per_um) for v in found.place_um[at[first, low]].tolist()
+            round(v * units_per_um)
+            for v in found.place_um[die_number[first, low]].tolist()
         )
         copies.append(
             CellReference(
@@ -192,7 +215,8 @@ def _steps(found: WaferDies, units_per_um: float) -> tuple[int, int]:
     """From die to die in units, along x and y; 0 where there is one column or row."""
     steps = []
     for axis in (0, 1):
-        index, place = found.index[:, axis], found.place_um[:, axis]
+        index = found.index[:, axis]
+        place = found.place_um[:, axis]
         low, high = int(index.argmin()), int(index.argmax())
         count = int(index[high] - index[low])
         steps.append(

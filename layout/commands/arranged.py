@@ -70,7 +70,8 @@ def _refuse_negative(work: FloorplanWork) -> None:
     """Raises: ProcessError: gaps are drawn, and something stands on the die that the
     frame of a lens does not include.
     """
-    record, size = work.record, work.record.wafer
+    record = work.record
+    size = work.record.wafer
     alone = all(record.furnished(part) for part in record.lens) and not record.cell
     alone &= record.die is None and not (size and size.marks)
     if work.process.tone == "negative" and not alone:
@@ -82,7 +83,8 @@ def _refuse_negative(work: FloorplanWork) -> None:
 
 def _whole(work: FloorplanWork) -> MaskLibrary:
     """The die of the record, or its wafer."""
-    record, layers = work.record, work.process.layers
+    record = work.record
+    layers = work.process.layers
     _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
@@ -90,25 +92,29 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
     with work.stages("room between parts"):
         work.near = separation.check_separation(work.placed, work.process)
     spaces = [
-        f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
-        for v in work.near
+        f"{violation.text}: {violation.value / 1e3:.3f} um apart, "
+        f"need {violation.limit / 1e3:.4g}"
+        for violation in work.near
     ]
-    more = len(spaces) - _LISTED
-    work.failures += spaces[:_LISTED] + ([f"{more} more"] if more > 0 else [])
+    unlisted = len(spaces) - _LISTED
+    work.failures += spaces[:_LISTED] + ([f"{unlisted} more"] if unlisted > 0 else [])
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    one = joined.die_cell(name, work.placed, kept=kept)
-    return one if record.wafer is None else _stepped(work, record.wafer, one, marks)
+    die = joined.die_cell(name, work.placed, kept=kept)
+    return die if record.wafer is None else _stepped(work, record.wafer, die, marks)
 
 
 def _parts(
     work: FloorplanWork,
 ) -> tuple[list[joined.PartPlacement], parts.DieComponent | None]:
-    """What stands on the die, and the alignment mark of the wafer.
+    """Everything that stands on the die, and the alignment mark of the wafer.
 
-    All that is corrected here is drawn first, so that it shares one series of doses.
+    All lenses and frames are drawn first, and corrected together, so that they share
+    one series of doses.
     """
-    record, process, size = work.record, work.process, work.record.wafer
+    record = work.record
+    process = work.process
+    size = work.record.wafer
     files = [joined.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
     drawings = []
     for part in record.lens:
@@ -152,15 +158,17 @@ def _parts(
             ).plan
         )
     with work.stages("dose"):
-        solved = make.correct_doses(plans, process, corrected=work.corrected)
-    mark = _frame_part(work, solved.pop()[0]) if has_marks else None
+        solved_plans = make.correct_doses(plans, process, corrected=work.corrected)
+    mark = _frame_part(work, solved_plans.pop()[0]) if has_marks else None
     placed = [
-        joined.PartPlacement(_lens_part(work, drawing, one), part.at)
-        for part, drawing, one in zip(record.lens, drawings, solved, strict=False)
+        joined.PartPlacement(_lens_part(work, drawing, solved_plan), part.at)
+        for part, drawing, solved_plan in zip(
+            record.lens, drawings, solved_plans, strict=False
+        )
     ]
     placed += files
     if record.die is not None:
-        around = _frame_part(work, solved[-1][0])
+        around = _frame_part(work, solved_plans[-1][0])
         placed.append(joined.PartPlacement(around, (Placement(),)))
     return placed, mark
 
@@ -183,23 +191,32 @@ def _lens_part(
 
 
 def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
-    """What stands around the lenses: checked and verified; read back with the die."""
-    name, process = plan.name, work.process
+    """What stands around the lenses as a part of the die, checked and verified."""
+    name = plan.name
+    process = work.process
     with work.stages(f"{name}: check"):
         work.judge_rules(name, check_plan(plan, process.rules))
     if work.corrected and process.exposure.csv is None:
         with work.stages(f"{name}: verify exposure"):
-            found = verify_exposure(library_of(plan), plan, plan.doses, process)
-        if not found.ok:
+            exposure = verify_exposure(library_of(plan), plan, plan.doses, process)
+        if not exposure.ok:
             work.failures.append(
-                f"{name}: exposure off by {100 * found.worst_exposure:.2g} % and "
-                f"{found.worst_nm:.2g} nm"
+                f"{name}: exposure off by {100 * exposure.worst_exposure:.2g} % and "
+                f"{exposure.worst_nm:.2g} nm"
             )
     return parts.of_plan(name, plan, process, corrected=work.corrected)
 
 
 def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
-    """A cell of a file made elsewhere; its rules are those of where it will be."""
+    """A cell of a mask file as a part of the die, checked and with its doses.
+
+    Args:
+        work: of the command; receives notes and failures.
+        part: file, cell and relative dose.
+
+    Raises:
+        MaskFileError: the file is missing, too large or cannot be read.
+    """
     path = work.options.lens.parent / part.file
     if not path.is_file():
         raise MaskFileError(
@@ -208,7 +225,7 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
     limit = placement_limit(path)
     content = read_mask(path, limit)
     content.refuse_beyond(limit)
-    made = parts.of_file(
+    component = parts.of_file(
         part.name,
         path,
         content,
@@ -216,47 +233,59 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
         cell=part.cell,
         relative_dose=part.relative_dose,
     )
-    texts = made.library.skipped["text"]
-    for number, what in ((texts, "texts"), (made.empty, "shapes without area")):
+    text_count = component.library.skipped["text"]
+    for number, kind in (
+        (text_count, "texts"),
+        (component.empty, "shapes without area"),
+    ):
         if number:
             work.notes.append(
-                f"{number} {what} of {path.name} are left out: they draw nothing"
+                f"{number} {kind} of {path.name} are left out: they draw nothing"
             )
     if part.checked:
         layers = work.process.layers
         skip = {layers.outline[0], layers.fields[0]}
-        drawn = {number for number, _ in made.library.layers}
+        drawn = {number for number, _ in component.library.layers}
         with work.stages(f"{part.name}: check"):
             chosen = [(number, None) for number in sorted(drawn - skip)]
-            report = check_library(made.library, work.process.rules, layers=chosen)
+            report = check_library(component.library, work.process.rules, layers=chosen)
         work.judge_rules(part.name, report)
     else:
         work.unchecked.append(part.name)
-    if work.corrected and made.uncorrected:
-        names = ", ".join(f"{a}/{b}" for a, b in list(made.uncorrected)[:8])
-        doses = sorted({made.library.doses[layer] for layer in made.uncorrected})
+    if work.corrected and component.uncorrected:
+        names = ", ".join(f"{a}/{b}" for a, b in list(component.uncorrected)[:8])
+        doses = sorted(
+            {component.library.doses[layer] for layer in component.uncorrected}
+        )
         work.failures.append(
-            f"{part.name}: {sum(made.uncorrected.values()):,} shapes on {names}"
-            f"{', ...' * (len(made.uncorrected) > 8)} of {part.file} get the relative "
-            f"dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+            f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names}"
+            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the "
+            f"relative dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
             "correction; correct the file and lay its doses.csv beside it, or set "
             "exposure.correct = false"
         )
-    return made
+    return component
 
 
 def _stepped(
     work: FloorplanWork,
     size: WaferSettings,
-    one: MaskLibrary,
+    die: MaskLibrary,
     mark: parts.DieComponent | None,
 ) -> MaskLibrary:
-    """The wafer: as many whole dies as it holds, and its marks."""
-    scattered = separation.reach_um(work.process)
-    inner = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
-    need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
+    """The wafer: as many whole dies as it holds, and its marks.
+
+    Args:
+        work: of the command; receives the dies and failures.
+        size: of the wafer, raster and marks.
+        die: cells of a die.
+        mark: alignment mark; None: no marks.
+    """
+    scatter_um = separation.reach_um(work.process)
+    exposed_box = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
+    need = max(scatter_um, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
-        between = pitch - float(inner[2 + axis] - inner[axis])
+        between = pitch - float(exposed_box[2 + axis] - exposed_box[axis])
         if between < need:
             work.failures.append(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
@@ -264,17 +293,17 @@ def _stepped(
             )
     box = separation.extent_of_copies(work.placed) / joined.PER_UM
     left, bottom, right, top = box.tolist()
-    margin = max(scattered, joined.MARGIN_UM)
+    margin = max(scatter_um, joined.MARGIN_UM)
     box_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
-    steps = wafer.step_and_repeat(one.name, work.dies, units_per_um=joined.PER_UM)
+    steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=joined.PER_UM)
     at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
     marks = None if mark is None else joined.PartPlacement(mark, at)
-    return joined.wafer_cell(work.record.name, one, steps, marks)
+    return joined.wafer_cell(work.record.name, die, steps, marks)
 
 
 def _write(work: FloorplanWork, made: MaskLibrary) -> None:
-    """The files that were asked for, each read back."""
+    """Write the mask files of the options, and read each back."""
     writers: dict[str, Callable[[MaskLibrary, Path], None]] = {}
     if work.options.writes_oasis:
         writers["mask.oas"] = oasis_write.write_oasis
@@ -286,11 +315,11 @@ def _write(work: FloorplanWork, made: MaskLibrary) -> None:
             write(made, path)
         with work.stages(f"read back {name}"):
             content = read_mask(path, make.MOST_READ, keep=make.KEPT)
-            found = compare.mask_differences(made, content)
+            differences = compare.mask_differences(made, content)
         work.failures += [
-            f"{name} does not read back as planned: {text}" for text in found
+            f"{name} does not read back as planned: {text}" for text in differences
         ]
-        work.different |= {name} if found else set()
+        work.different |= {name} if differences else set()
         work.written[name] = path.stat().st_size
 
 
@@ -305,12 +334,12 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
     ]
     write_lyp(made, work.folder / "mask.lyp")
     handover.write_dose_table(made, work.process, work.folder / "doses.csv")
-    most = work.process.exposure.maximum_classes
+    limit = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
-    held = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
-    if held > most:
+    dose_count = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
+    if dose_count > limit:
         work.failures.append(
-            f"{held} doses on the mask, exposure.maximum_classes = {most}"
+            f"{dose_count} doses on the mask, exposure.maximum_classes = {limit}"
         )
     texts = {
         "process.toml": config.dumps(work.process),
@@ -332,6 +361,7 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
 
 
 def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
+    """Values of layout.json of an arrangement."""
     return {
         "ok": not work.failures,
         "failures": work.failures,
@@ -348,10 +378,12 @@ def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
 
 
 def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
-    """The job sheet: what stands where, and its doses; what is said of each lens lies
-    in its folder.
+    """Lines of the job sheet: parts, files, fields and doses.
+
+    The job sheet of each lens is in its own folder.
     """
-    process, size = work.process, work.record.wafer
+    process = work.process
+    size = work.record.wafer
     lines = [
         f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
         work.verdict,
@@ -400,6 +432,7 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
 
 
 def _text(work: FloorplanWork, made: MaskLibrary) -> str:
+    """Summary for a person: verdict, notes, files and time."""
     target = work.options.output
     lines = [] if work.failures and not work.unchecked else [work.verdict]
     lines += work.notes

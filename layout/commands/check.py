@@ -117,10 +117,11 @@ def _negative_layers(content: MaskLibrary, process: processes.Process) -> set[in
 
 
 def _values(content: MaskLibrary, report: DrcReport) -> dict[str, Any]:
-    sizes = {n: v for n, v in report.sizes.items() if "foot" not in n}
+    """Values of the report, for JSON."""
+    sizes = {name: size for name, size in report.sizes.items() if "foot" not in name}
     layers = {
-        f"{layer}/{datatype}": {"checked": one.checked, "shapes": one.shapes}
-        for (layer, datatype), one in (report.layers or {}).items()
+        f"{layer}/{datatype}": {"checked": coverage.checked, "shapes": coverage.shapes}
+        for (layer, datatype), coverage in (report.layers or {}).items()
     }
     return {
         "ok": report.ok,
@@ -151,7 +152,10 @@ def _failures(
     missing = [
         text
         for text, (number, datatype) in zip(options.layers, layers, strict=True)
-        if not any(n == number and datatype in (None, d) for n, d in drawn)
+        if not any(
+            drawn_number == number and datatype in (None, drawn_datatype)
+            for drawn_number, drawn_datatype in drawn
+        )
     ]
     failures = [f"nothing is drawn on layer {text}" for text in missing]
     if report.is_empty:
@@ -162,6 +166,7 @@ def _failures(
 
 
 def _text(path: Path, content: MaskLibrary, report: DrcReport) -> str:
+    """The report for a person: verdict, layers, and the first violations."""
     verdict = "keeps" if report.ok else "does not keep"
     space = (
         f"minimum space {format_size(report.minimum_space_nm)}"
@@ -173,18 +178,19 @@ def _text(path: Path, content: MaskLibrary, report: DrcReport) -> str:
         f"{path}: {verdict} the design rules; top cells {', '.join(content.tops[:8])}",
         f"  {report.shapes:,} shapes checked; {space}, minimum width {width}",
     ]
-    for (layer, datatype), one in (report.layers or {}).items():
-        state = "checked" if one.checked else "NOT CHECKED"
-        lines.append(f"  layer {layer}/{datatype}: {one.shapes:,} shapes, {state}")
+    for (layer, datatype), coverage in (report.layers or {}).items():
+        state = "checked" if coverage.checked else "NOT CHECKED"
+        lines.append(f"  layer {layer}/{datatype}: {coverage.shapes:,} shapes, {state}")
     if content.skipped:
         lines.append(f"  draw nothing: {format_counts(content.skipped)}")
     lines += [
-        f"  {e['count']:,} {e['rule']} in {e['cell']}, layer {e['layer']}: worst "
-        f"{e['worst']:.4g}, need {e['limit']:.4g}"
-        for e in report.worst[:20]
+        f"  {entry['count']:,} {entry['rule']} in {entry['cell']}, "
+        f"layer {entry['layer']}: worst {entry['worst']:.4g}, need {entry['limit']:.4g}"
+        for entry in report.worst[:20]
     ]
     lines += [
-        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.summary}"
-        for v in report.violations[:10]
+        f"  {violation.rule} at ({violation.centre[0]:.0f}, "
+        f"{violation.centre[1]:.0f}): {violation.summary}"
+        for violation in report.violations[:10]
     ]
     return "\n".join(lines)

@@ -126,24 +126,24 @@ class LayoutJob:
         """What is wrong with the mask, in words, worst first; empty where it may go to
         the writer.
         """
-        found = [
+        failures = [
             f"{name}: no dose for layer {', '.join(f'{a}/{b}' for a, b in layers[:8])}"
             for name, layers in self.undosed.items()
             if layers
         ]
-        found += [
+        failures += [
             f"{name} does not read back as planned"
             for name, outcome in self.compared.items()
             if not outcome.ok
         ]
         exposure = self.process.exposure  # a fitted table has an error of its own
         if exposure.corrected and exposure.csv is None and self.options.dose:
-            found += [
-                f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm{self._too_few}"
-                for name, c in self.verified.items()
-                if not c.ok
+            failures += [
+                f"{name}: exposure off by {100 * report.worst_exposure:.2g} % and {report.worst_nm:.2g} nm{self._too_few}"
+                for name, report in self.verified.items()
+                if not report.ok
             ]
-        return found + (
+        return failures + (
             [f"design rules violated: {self.drc.violated}"] if self.drc.violated else []
         )
 

@@ -36,22 +36,21 @@ def run(options: Options) -> int:
 
 
 def _text(job: LayoutJob, target: Path) -> str:
+    """Summary for a person: verdict, files, differences and first violations."""
     lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
-        verdict = (
-            ""
-            if outcome is None
-            else (
-                ", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN"
-            )
-        )
+        verdict = ""
+        if outcome is not None:
+            as_planned = ", reads back as planned"
+            verdict = as_planned if outcome.ok else ", DIFFERS FROM THE PLAN"
         lines.append(f"  {target / name}: {size / 1e6:.3g} MB{verdict}")
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]
     lines += [
-        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}) nm: {v.summary}"
-        for v in job.drc.violations[:10]
+        f"  {violation.rule} at ({violation.centre[0]:.0f}, "
+        f"{violation.centre[1]:.0f}) nm: {violation.summary}"
+        for violation in job.drc.violations[:10]
     ]
     lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")
     return "\n".join(lines)

@@ -48,7 +48,7 @@ MOST_MADE = (
 )  # sites of a lens whose predicted diameters are handed on as made.h5
 KEPT = (
     1 << 16
-)  # placements of a cell that are kept when a file is read back; of more only sums are
+)  # placements of a cell that are stored when a file is read back; of more only sums
 MOST_READ = 2**40
 SolvedPlan = tuple[MaskPlan, DoseLadder | None]  # dose None: every dose is 1
 
@@ -92,8 +92,8 @@ def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnL
         )
         transaction.check_room(options.output, _room(options, source))
     with stages("classes"):
-        made = build.draw_mask(source, process, name=options.name, furniture=furniture)
-    return DrawnLens(options, source, process, made, stages)
+        mask = build.draw_mask(source, process, name=options.name, furniture=furniture)
+    return DrawnLens(options, source, process, mask, stages)
 
 
 def correct_doses(
@@ -144,16 +144,18 @@ def make_mask(
 def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
     source = drawing.source
-    rules = drawing.process
+    process = drawing.process
     stages = drawing.stages
-    made = drawing.made
+    mask = drawing.made
     with stages("write fields"):
-        split = fields.split_write_fields(source.diameters, rules, drawn=made.cells)
-        plan = stages.rows.watched(with_fields(plan, split, rules))
+        write_fields = fields.split_write_fields(
+            source.diameters, process, drawn=mask.cells
+        )
+        plan = stages.rows.watched(with_fields(plan, write_fields, process))
     with stages("check"):
-        found = check_plan(plan, rules.rules, foot_nm=_feet(plan, source, rules))
+        drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
     return LayoutJob(
-        drawing.options, source, rules, made, dose, split, plan, found, stages
+        drawing.options, source, process, mask, dose, write_fields, plan, drc, stages
     )
 
 
@@ -170,17 +172,25 @@ def _room(options: Options, source: Lens) -> int:
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
-    """(classes,) diameters at the foot of what the etch makes of each class; isolated
-    pillars count where wider.
+    """(classes,) larger diameter of foot and top of each class after the etch, nm.
+
+    Isolated pillars count where the bias makes them wider.
+
+    Args:
+        plan: drawn diameters.
+        source: with the height of the pillars.
+        rules: process.
     """
-    drawn = np.array([made.diameter_nm for made in plan.classes])
-    made = rules.made_diameter_nm(drawn) + max(0.0, rules.bias.isolated_nm)
+    drawn_nm = np.array([made.diameter_nm for made in plan.classes])
+    made = rules.made_diameter_nm(drawn_nm) + max(0.0, rules.bias.isolated_nm)
     top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
     return np.maximum(top, foot)
 
 
 def _write_masks(job: LayoutJob, target: Path) -> None:
-    options, plan = job.options, job.plan
+    """Write the mask files of the options, and read each back."""
+    options = job.options
+    plan = job.plan
     if options.writes_oasis:
         path = target / "mask.oas"
         with job.stages("write OASIS"):
@@ -208,7 +218,8 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
     """STL and STEP of the pillars in the window."""
     from layout import solids
 
-    options, window = job.options, job.options.window
+    options = job.options
+    window = job.options.window
     tile = solids.cut_tile(
         job.source,
         job.process,
@@ -227,6 +238,7 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
 
 
 def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> None:
+    """Read a mask file back: compare it with the plan, verify its exposure."""
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
@@ -248,15 +260,13 @@ def _is_verifiable(job: LayoutJob) -> bool:
 def _verified(
     job: LayoutJob, content: MaskLibrary, table: Mapping[LayerNumber, float]
 ) -> ExposureReport:
-    """What a file makes that holds the plan's places; two files of the same polygons
-    make the same.
-    """
+    """Exposure report of a file; files of the same polygons share one report."""
     if job.verified:
         return next(iter(job.verified.values()))
     lattice = job.plan.lattices[0]
-    small = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
-    job.made_rows = LensRows(job.plan) if small else job.made_rows
-    keep = job.made_rows.take if small and job.made_rows else None
+    keeps_rows = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
+    job.made_rows = LensRows(job.plan) if keeps_rows else job.made_rows
+    keep = job.made_rows.take if keeps_rows and job.made_rows else None
     return verify_exposure(
         content,
         job.plan,
@@ -285,27 +295,27 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
     Args:
         job: that has been written.
     """
-    found = job.drc
+    drc = job.drc
     return {
         "ok": job.ok,
         "failures": job.failures,
-        "pillars": found.shapes,
+        "pillars": drc.shapes,
         "classes": len(job.plan.classes),
         "diameters": len(job.made.cells.diameters_nm),
-        **found.sizes,
-        "maximum_density": found.maximum_density,
-        "violations": found.counts,
-        "worst": found.worst,
+        **drc.sizes,
+        "maximum_density": drc.maximum_density,
+        "violations": drc.counts,
+        "worst": drc.worst,
         "files": job.written,
         "exposure": {
             name: {
-                "worst_relative": c.worst_exposure,
-                "field_error": c.error,
-                "worst_diameter_nm": c.worst_nm,
-                "pillars": c.pillars,
-                "edges": len(c.edges.x_um),
+                "worst_relative": verified.worst_exposure,
+                "field_error": verified.error,
+                "worst_diameter_nm": verified.worst_nm,
+                "pillars": verified.pillars,
+                "edges": len(verified.edges.x_um),
             }
-            for name, c in job.verified.items()
+            for name, verified in job.verified.items()
         },
         "differences": {
             name: list(outcome.differences) for name, outcome in job.compared.items()

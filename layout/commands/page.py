@@ -99,35 +99,41 @@ def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> No
 
 
 def _lead(job: LayoutJob) -> str:
-    source, classes = job.source, job.plan.classes
-    own = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
+    """First paragraph of the report: verdict, lens, and number of pillars."""
+    source = job.source
+    classes = job.plan.classes
+    pillars = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
     die = ""
-    if job.drc.shapes != own:
+    if job.drc.shapes != pillars:
         die = f" ({job.drc.shapes:,} on the die, with its test arrays)"
     return (
         f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
-        f"{2 * job.made.radius_um / 1e3:.4g} mm across, as {own:,} pillars{die} in "
+        f"{2 * job.made.radius_um / 1e3:.4g} mm across, as {pillars:,} pillars{die} in "
         f"{len(classes)} cells; process “{job.process.name}”."
     )
 
 
 def _key_figures(job: LayoutJob) -> list[KeyFigure]:
-    found = job.drc
-    counts = found.counts
-    same = all(outcome.ok for outcome in job.compared.values())
-    broken = sum(counts.values())
-    close = counts["space"] + counts["overlap"]
-    gap, width = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
+    """Key figures of a mask: pillars, smallest sizes, violations, files."""
+    drc = job.drc
+    counts = drc.counts
+    as_planned = all(outcome.ok for outcome in job.compared.values())
+    violations = sum(counts.values())
+    too_close = counts["space"] + counts["overlap"]
+    gap, width = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
     return [
-        KeyFigure("pillars", f"{found.shapes:,}"),
-        KeyFigure("smallest gap", gap, close == 0),
+        KeyFigure("pillars", f"{drc.shapes:,}"),
+        KeyFigure("smallest gap", gap, too_close == 0),
         KeyFigure("thinnest pillar", width, counts["width"] == 0),
-        KeyFigure("violations", f"{broken:,}", broken == 0),
-        KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
+        KeyFigure("violations", f"{violations:,}", violations == 0),
+        KeyFigure(
+            "files read back", "as planned" if as_planned else "DIFFERENT", as_planned
+        ),
     ]
 
 
 def _rules(found: DrcReport) -> Section:
+    """Section on the design rules: limits, counts, and the first violations."""
     items: list[Figure | Table] = [
         Table(
             ("rule", "limit", "violations"),
@@ -151,7 +157,14 @@ def _rules(found: DrcReport) -> Section:
 
 
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    rules, classes = job.process.rules, job.plan.classes
+    """Section on the drawn pillars: sizes and steps, and for discs a table of polygons.
+
+    Args:
+        job: of the command.
+        shots: pictures, from :func:`draw_pictures`.
+    """
+    rules = job.process.rules
+    classes = job.plan.classes
     if not classes[0].round:
         shape = job.source.cell.shape
         area = [made.twice_area / 2 for made in classes]
@@ -166,7 +179,8 @@ def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
             f"for. {len(area)} classes of {min(area):,.0f} to {max(area):,.0f} nm².",
         )
     shapes = {made.diameter_units: made for made in classes}
-    grid, unit = job.plan.grid, job.plan.grid * job.plan.unit_nm
+    grid = job.plan.grid
+    unit = job.plan.grid * job.plan.unit_nm
     made = [
         polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)
     ]
@@ -197,7 +211,7 @@ def _exposure(job: LayoutJob) -> list[Section]:
     """Doses, and what the written files and their dose table make."""
     sections = []
     if job.dose is not None:
-        used = [made.dose for made in job.plan.classes]
+        used = [pillar.dose for pillar in job.plan.classes]
         text = (
             "Proximity effect correction of lens, dose test, witness cells, marks and "
             f"label together: relative dose {min(used):.3f} to {max(used):.3f} in "
@@ -210,15 +224,15 @@ def _exposure(job: LayoutJob) -> list[Section]:
     rows = [
         [
             name,
-            f"{c.pillars:,}",
-            f"{len(c.edges.x_um):,}",
-            f"{100 * c.worst_exposure:.2f}",
-            f"{100 * c.error:.2g}",
-            f"{c.worst_nm:.2f}",
-            f"{c.thinnest_top_nm:.0f} to {c.widest_foot_nm:.0f}",
-            "yes" if c.ok else "NO",
+            f"{verified.pillars:,}",
+            f"{len(verified.edges.x_um):,}",
+            f"{100 * verified.worst_exposure:.2f}",
+            f"{100 * verified.error:.2g}",
+            f"{verified.worst_nm:.2f}",
+            f"{verified.thinnest_top_nm:.0f} to {verified.widest_foot_nm:.0f}",
+            "yes" if verified.ok else "NO",
         ]
-        for name, c in job.verified.items()
+        for name, verified in job.verified.items()
     ]
     head = (
         "file",
@@ -240,8 +254,10 @@ def _exposure(job: LayoutJob) -> list[Section]:
         "not judged. made.h5 (up to 16 million sites) is the lens of the predicted "
         "diameters: give it to metalens psf, or to this command with --study."
     )
-    shown = Figure(picture, "Predicted less drawn diameter.", wide=True)
-    sections.append(Section("Exposure as written", text, [Table(head, rows), shown]))
+    map_figure = Figure(picture, "Predicted less drawn diameter.", wide=True)
+    sections.append(
+        Section("Exposure as written", text, [Table(head, rows), map_figure])
+    )
     return sections
 
 
@@ -257,6 +273,7 @@ def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
 
 
 def _job_sheet(job: LayoutJob) -> Section:
+    """Section on write fields and charge."""
     split = job.fields
     text = (
         f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
@@ -271,7 +288,11 @@ def _job_sheet(job: LayoutJob) -> Section:
 
 
 def _charge(charges: dict[str, float]) -> Table:
-    rows = [[step, f"{q:.4g}", f"{q / 3.6:.3g}"] for step, q in charges.items()]
+    """Table of the charge of each step, and its time at 1 nA."""
+    rows = [
+        [step, f"{charge_uC:.4g}", f"{charge_uC / 3.6:.3g}"]
+        for step, charge_uC in charges.items()
+    ]
     head = ("step", "charge / µC", "hours at 1 nA")
     return Table(head, rows, "Without stage and settling times.")
 
@@ -279,6 +300,7 @@ def _charge(charges: dict[str, float]) -> Table:
 def _files(
     written: dict[str, int], read_back: dict[str, str], seconds: dict[str, float]
 ) -> Section:
+    """Section on the files: sizes, outcome of reading back, and times."""
     rows = [
         [name, f"{size / 1e6:.3f}", read_back.get(name, "not read back")]
         for name, size in written.items()
@@ -337,10 +359,11 @@ def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
         _files(work.written, read_back, work.stages.seconds),
     ]
     pillars = sum(
-        values["pillars"] * sum(copies.count for copies in one.copies(one.part.top))
-        for one in work.placed
+        values["pillars"]
+        * sum(copies.count for copies in placement.copies(placement.part.top))
+        for placement in work.placed
         for name, values in work.lenses.items()
-        if name == one.part.name
+        if name == placement.part.name
     )
     lead = (
         f"{work.verdict} {len(work.lenses)} lenses with {pillars:,} pillars on a die; "
@@ -361,6 +384,7 @@ def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
 
 
 def _dose_table(made: MaskLibrary, process: Process) -> Table:
+    """Table of the dose of each layer and datatype."""
     base = process.exposure.base_uC_cm2
     rows = [
         [*layer, f"{dose:.6f}", dose * base, made.layer_names.get(layer, "")]
@@ -370,18 +394,19 @@ def _dose_table(made: MaskLibrary, process: Process) -> Table:
 
 
 def _places(work: FloorplanWork) -> Table:
-    files = {p.name: str(p.file) for p in work.record.parts}
+    """Table of the parts and their places."""
+    files = {part.name: str(part.file) for part in work.record.parts}
     rows = [
         [
-            one.part.name,
-            files.get(one.part.name, "own"),
+            placement.part.name,
+            files.get(placement.part.name, "own"),
             at.x_um,
             at.y_um,
             f"{at.turn_deg:g}{' mirrored' * at.mirrored}",
             at.columns * at.rows,
         ]
-        for one in work.placed
-        for at in one.at
+        for placement in work.placed
+        for at in placement.at
     ]
     head = ("part", "file", "x / µm", "y / µm", "turn / degrees", "copies")
     text = f"The first {min(_LISTED, len(rows))} of {len(rows)} places."
@@ -391,25 +416,28 @@ def _places(work: FloorplanWork) -> Table:
 def _checks(work: FloorplanWork) -> Section:
     """Rules, exposure and read-back of each part, and what stands too near what."""
     rows = [_lens_row(name, values) for name, values in work.lenses.items()]
-    for name, found in work.rules.items():
-        sizes = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
-        broken = sum(found.counts.values())
+    for name, drc in work.rules.items():
+        sizes = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
+        broken = sum(drc.counts.values())
         verdict = "FAILS" if broken else "passes"
-        rows.append([name, f"{found.shapes:,}", *sizes, broken, "", "", verdict])
+        rows.append([name, f"{drc.shapes:,}", *sizes, broken, "", "", verdict])
     rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
     columns = "part, shapes, least gap, least feature, broken rules, exposure, "
     columns += "read back, verdict"
     caption = "Each lens has a report of its own, in the folder of its name."
     items = [Table(columns.split(", "), rows, caption)]
     if work.near:
-        near = [[v.text, v.value / 1e3, v.limit / 1e3] for v in work.near[:_LISTED]]
+        near = [
+            [violation.text, violation.value / 1e3, violation.limit / 1e3]
+            for violation in work.near[:_LISTED]
+        ]
         head = ("what", "apart / µm", "needed / µm")
         items.append(Table(head, near, "Parts that stand too near each other."))
     text = [*work.failures, *work.warnings]
     if not work.failures:
-        who = "Every part that was checked" if work.unchecked else "Every part"
+        checked = "Every part that was checked" if work.unchecked else "Every part"
         text.append(
-            f"{who} is within the design rules, and all stand far enough from each "
+            f"{checked} is within the design rules, and all stand far enough from each "
             "other."
         )
     return Section("Checks", "\n\n".join(text), items)
@@ -418,8 +446,8 @@ def _checks(work: FloorplanWork) -> Section:
 def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     """Of layout.json of a lens."""
     exposed = [
-        f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm"
-        for e in values["exposure"].values()
+        f"{100 * exposure['worst_relative']:.2f} %, {exposure['worst_diameter_nm']:.2f} nm"
+        for exposure in values["exposure"].values()
     ]
     return [
         name,

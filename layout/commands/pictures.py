@@ -34,7 +34,7 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
     scale = plan.unit_nm * 1e-3
     images = [_coverage(plan, lattice) for lattice in plan.lattices]
     shares = np.concatenate([image[np.isfinite(image)] for image in images])
-    shown, reach = None, 0.0
+    picture, reach = None, 0.0
     for lattice, image in zip(plan.lattices, images, strict=True):
         left = lattice.x0 - lattice.pitch / 2
         top = lattice.y0 + lattice.down / 2
@@ -42,7 +42,7 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
         bottom = top - lattice.rows * lattice.down
         extent = np.array([left, right, bottom, top]) * scale
         reach = max(reach, float(np.abs(extent).max()))
-        shown = axes.imshow(
+        picture = axes.imshow(
             image,
             extent=extent.tolist(),
             vmin=shares.min(initial=50),
@@ -59,8 +59,10 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
         axes.legend(**place, ncols=6, frameon=False, fontsize=8)
     span = (-1.03 * reach, 1.03 * reach)
     axes.set(xlim=span, ylim=span, aspect="equal", xlabel="x / µm", ylabel="y / µm")
-    if shown is not None:
-        figure.colorbar(shown, ax=axes, label="area that pillars cover / %", shrink=0.8)
+    if picture is not None:
+        figure.colorbar(
+            picture, ax=axes, label="area that pillars cover / %", shrink=0.8
+        )
     return report.figure_png(figure)
 
 
@@ -76,14 +78,15 @@ def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
     size = (4.0 * len(windows), 4.0)
     figure, axes = report.make_figure(1, len(windows), size=size, squeeze=False)
     scale = plan.unit_nm * 1e-3
-    sizes_nm = [made.diameter_nm for made in plan.classes]
+    sizes_nm = [pillar.diameter_nm for pillar in plan.classes]
     for ax, window in zip(axes[0], windows, strict=True):
-        shapes, sizes = [], []
+        shapes = []
+        sizes = []
         for lattice in plan.lattices:
-            for k, x, y in sites_in(plan, lattice, window):
-                for corners in plan.classes[k - 1].polygons:
+            for number, x, y in sites_in(plan, lattice, window):
+                for corners in plan.classes[number - 1].polygons:
                     shapes.append((corners + np.array([x, y])) * scale)
-                    sizes.append(sizes_nm[k - 1])
+                    sizes.append(sizes_nm[number - 1])
         style: dict[str, Any] = {
             "cmap": "viridis",
             "edgecolors": "#222",
@@ -93,7 +96,9 @@ def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
         drawn.set_clim(min(sizes_nm), max(sizes_nm))
         ax.grid(False)
         ax.add_collection(drawn)
-        u, v, half = window.x_um, window.y_um, window.size_um / 2
+        u = window.x_um
+        v = window.y_um
+        half = window.size_um / 2
         ax.set(xlim=(u - half, u + half), ylim=(v - half, v + half), aspect="equal")
         ax.set(xlabel="x / µm", ylabel="y / µm")
         ax.set_title(f"{window.size_um:g} µm at ({u:.6g}, {v:.6g})")
@@ -107,15 +112,15 @@ def plot_diameters(plan: MaskPlan) -> bytes:
         plan: with the lens as its first lattice.
     """
     counts = plan.lattices[0].counts(len(plan.classes))[1:]
-    sizes = np.array([made.diameter_nm for made in plan.classes])
-    merged, where = np.unique(sizes[counts > 0], return_inverse=True)
-    total = np.bincount(where, counts[counts > 0])
+    sizes = np.array([pillar.diameter_nm for pillar in plan.classes])
+    diameters, diameter_number = np.unique(sizes[counts > 0], return_inverse=True)
+    total = np.bincount(diameter_number, counts[counts > 0])
     figure, axes = report.make_figure(size=(7.6, 2.9))
-    step = float(np.diff(merged).min(initial=np.inf)) if len(merged) > 1 else 1.0
-    axes.bar(merged, total / 1e3, width=0.9 * step)
+    step = float(np.diff(diameters).min(initial=np.inf)) if len(diameters) > 1 else 1.0
+    axes.bar(diameters, total / 1e3, width=0.9 * step)
     axes.set(xlabel="drawn diameter / nm", ylabel="pillars / 1000")
     axes.set_title(
-        f"{int(total.sum()):,} pillars of the lens in {len(merged)} diameters"
+        f"{int(total.sum()):,} pillars of the lens in {len(diameters)} diameters"
     )
     return report.figure_png(figure)
 
@@ -129,10 +134,12 @@ def plot_verification(found: ExposureReport) -> bytes:
     figure, (at_left, at_right) = report.make_figure(1, 2, size=(8.2, 3.6))
     left, bottom, right, top = found.box_um
     extent = (left, right, bottom, top)
-    shown = at_left.imshow(found.map_nm, origin="lower", extent=extent, cmap="coolwarm")
+    picture = at_left.imshow(
+        found.map_nm, origin="lower", extent=extent, cmap="coolwarm"
+    )
     at_left.grid(False)
     at_left.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
-    figure.colorbar(shown, ax=at_left, label="resist - drawn / nm", shrink=0.8)
+    figure.colorbar(picture, ax=at_left, label="resist - drawn / nm", shrink=0.8)
     edges, pillars = found.histogram
     at_right.stairs(pillars, edges, fill=True)
     at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
@@ -158,13 +165,13 @@ def _coverage(plan: MaskPlan, lattice: PillarArray) -> Array:
     squares of sites; NaN where there is none. Every n-th pillar would show moiré rings.
     """
     step = max(1, -(-max(lattice.rows, lattice.columns) // _POINTS))
-    areas = np.array([0.0, *(made.twice_area / 2 for made in plan.classes)])
-    table = 100 * areas / (lattice.pitch * lattice.down)
+    areas = np.array([0.0, *(pillar.twice_area / 2 for pillar in plan.classes)])
+    percent_of_class = 100 * areas / (lattice.pitch * lattice.down)
     edges = np.arange(0, lattice.columns, step)
     rows = []
     for _, block in lattice.blocks(step):
         sites = len(block) * np.diff(np.r_[edges, lattice.columns])
-        rows.append(np.add.reduceat(table[block].sum(0), edges) / sites)
+        rows.append(np.add.reduceat(percent_of_class[block].sum(0), edges) / sites)
     covered = np.array(rows)
     return np.where(covered > 0, covered, np.nan)
 
@@ -177,7 +184,9 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
     names: dict[int, str] = {}
     for figure in plan.figures:
         for layer, polygons in sorted(figure.polygons.items()):
-            drawn.setdefault(layer[0], []).extend(p * scale for p in polygons)
+            drawn.setdefault(layer[0], []).extend(
+                polygon * scale for polygon in polygons
+            )
             names.setdefault(layer[0], plan.layer_names.get(layer, "layer"))
     for n, (number, shapes) in enumerate(sorted(drawn.items())):
         name = names[number].split("_dose_")[0]
@@ -190,8 +199,10 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
         }
         axes.add_collection(PolyCollection(shapes, **style))
         axes.plot([], [], color=colour, label=f"{name} {number}")
-    every = [float(np.abs(p).max()) for shapes in drawn.values() for p in shapes]
-    return max(every, default=0.0)
+    reaches = [
+        float(np.abs(polygon).max()) for shapes in drawn.values() for polygon in shapes
+    ]
+    return max(reaches, default=0.0)
 
 
 # arrangements
@@ -219,16 +230,16 @@ def plot_floorplan(
 
     figure, axes = report.make_figure(size=(7.2, 6.6))
     axes.grid(False)
-    for one in separation.standing_parts(placed):
-        for colour, boxes in zip(_COLOURS, one.part.boxes.values(), strict=False):
-            shapes = [rectilinear.box_corners(b) for b in one.moved(boxes)]
+    for part in separation.standing_parts(placed):
+        for colour, boxes in zip(_COLOURS, part.part.boxes.values(), strict=False):
+            shapes = [rectilinear.box_corners(box) for box in part.moved(boxes)]
             corners = [shape / joined.PER_UM for shape in shapes]
             style: dict[str, Any] = {"facecolors": f"{colour}55", "edgecolors": "none"}
             axes.add_collection(PolyCollection(corners, **style))
-        x, y = one.x / joined.PER_UM, one.y / joined.PER_UM
-        axes.annotate(one.part.name, (x, y), fontsize=7, ha="center", va="center")
+        x, y = part.x / joined.PER_UM, part.y / joined.PER_UM
+        axes.annotate(part.part.name, (x, y), fontsize=7, ha="center", va="center")
     if near:
-        x, y = np.array([v.centre for v in near]).T / joined.PER_UM
+        x, y = np.array([violation.centre for violation in near]).T / joined.PER_UM
         axes.plot(x, y, "x", color="red", ms=6, mew=1.5)
     left, bottom, right, top = floorplan_box_um(placed).tolist()
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
@@ -255,7 +266,8 @@ def plot_wafer(size: WaferSettings, dies: WaferDies, box_um: Array) -> bytes:
         "linewidths": 0.4,
     }
     ax.add_collection(PolyCollection(shapes, **style))
-    turn, radius = np.linspace(0, 2 * np.pi, 400), size.diameter_mm / 2
+    turn = np.linspace(0, 2 * np.pi, 400)
+    radius = size.diameter_mm / 2
     for r, line in ((radius, "-"), (radius - size.edge_exclusion_mm, ":")):
         ax.plot(r * np.cos(turn), r * np.sin(turn), line, color="#444", lw=1)
     for mark in size.marks:

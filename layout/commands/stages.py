@@ -36,7 +36,7 @@ class RowProgress:
         return plan.replace(lattices=(lattice, *plan.lattices[1:]))
 
     def unwatched(self, plan: MaskPlan) -> MaskPlan:
-        """A watched plan as it was, for what is made beside the stages."""
+        """A watched plan as it was, for work outside the stages."""
         return (
             plan
             if self._lens is None
@@ -66,12 +66,14 @@ class StageTimes:
     ) -> None:
         self.seconds: dict[str, float] = {}
         self.rows = RowProgress()
-        self._say, self._waits = say, (first_s, next_s)
+        self._say = say
+        self._waits = (first_s, next_s)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         """Time what happens inside as ``stage``."""
-        start, over = time.perf_counter(), threading.Event()
+        start = time.perf_counter()
+        over = threading.Event()
         self.rows.end = 0
         ticker = threading.Thread(
             target=self._tick, args=(stage, start, over), daemon=True
@@ -85,7 +87,8 @@ class StageTimes:
             self.seconds[stage] = time.perf_counter() - start
 
     def _tick(self, stage: str, start: float, over: threading.Event) -> None:
-        wait, then = self._waits
+        """Report a stage that lasts: after the first wait, then at every next wait."""
+        wait, next_wait = self._waits
         while not over.wait(wait):
             self._say(f"{stage}: {time.perf_counter() - start:.0f} s{self.rows.text}")
-            wait = then
+            wait = next_wait

@@ -37,32 +37,33 @@ class FormatFinding:
 def validate_mask(
     path: str | Path, content: MaskLibrary | None = None
 ) -> list[FormatFinding]:
-    """All findings about a GDSII or OASIS file, whose format its first bytes show; an
-    empty list is a clean file.
+    """All findings about a GDSII or OASIS file; an empty list is a clean file.
 
-    content: what was read of it, where it was read already.
+    The first bytes of the file tell its format.
 
     Args:
         path: of the file.
+        content: what was read of it; None: it is read here.
 
     Raises:
         MaskFileError: an empty file.
         OSError: it cannot be opened.
     """
     data = map_bytes(path)
-    oasis = data[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
+    is_oasis = data[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
     try:
         if content is None:
             content = (
-                oasis_read.read_oasis(path) if oasis else gdsii_read.read_gdsii(path)
+                oasis_read.read_oasis(path) if is_oasis else gdsii_read.read_gdsii(path)
             )
     except MaskFileError as error:
         return [FormatFinding(_offset(error), str(error))]
-    own = _oasis(path, data) if oasis else _gdsii(content, data)
-    return [*_any(content), *own]
+    of_format = _oasis(path, data) if is_oasis else _gdsii(content, data)
+    return [*_any(content), *of_format]
 
 
 def _offset(error: MaskFileError) -> int:
+    """Byte that a message of a reader names; -1 for none."""
     words = str(error).split("byte ", 1)[-1].split(":", 1)[0].split(" ", 1)[0]
     return int(words) if words.isdigit() else -1
 
@@ -93,6 +94,7 @@ def _any(content: MaskLibrary) -> Iterator[FormatFinding]:
 
 
 def _shapes(cell: MaskCell) -> Iterator[FormatFinding]:
+    """Polygons with a repeated vertex, and circles of radius 0, of a cell."""
     for layer, polygons in cell.polygons.items():
         for points in polygons:
             if len({(int(x), int(y)) for x, y in points}) != len(points):
@@ -108,6 +110,7 @@ def _shapes(cell: MaskCell) -> Iterator[FormatFinding]:
 
 
 def _gdsii(content: MaskLibrary, data: Array) -> Iterator[FormatFinding]:
+    """What GDSII forbids: odd length, large layer numbers, long boundaries."""
     if len(data) % 2:
         yield FormatFinding(len(data), f"{len(data)} bytes, need an even number")
     for cell in content.cells.values():
@@ -127,25 +130,29 @@ def _gdsii(content: MaskLibrary, data: Array) -> Iterator[FormatFinding]:
 
 def _oasis(path: str | Path, data: Array) -> Iterator[FormatFinding]:
     """The END record: tables where it says, and a checksum."""
-    at = len(data) - oasis_bytes.END_SIZE
+    end_at = len(data) - oasis_bytes.END_SIZE
     start = ByteCursor(str(path), data, at=len(oasis_bytes.MAGIC) + 1)
     start.string()
     start.real()
-    end = start if start.unsigned() == 0 else ByteCursor(str(path), data, at=at + 1)
+    end = start if start.unsigned() == 0 else ByteCursor(str(path), data, at=end_at + 1)
     for table, kinds in _TABLES:
-        strict, offset = end.unsigned(), end.unsigned()
+        strict = end.unsigned()
+        offset = end.unsigned()
         if (
             strict
             and offset
-            and (offset >= at or int(data[offset]) not in (*kinds, oasis_bytes.CBLOCK))
+            and (
+                offset >= end_at
+                or int(data[offset]) not in (*kinds, oasis_bytes.CBLOCK)
+            )
         ):
             yield FormatFinding(
-                at,
+                end_at,
                 f"the table of {table} is said to start at byte {offset}, where it does not",
             )
         if not strict:
             yield FormatFinding(
-                at, f"{table} may stand anywhere; strict tables are wanted"
+                end_at, f"{table} may stand anywhere; strict tables are wanted"
             )
     if int(data[-5]) != 1:
         yield FormatFinding(len(data) - 5, "no CRC-32 of the file")

@@ -33,25 +33,25 @@ def mask_panels(path: Path) -> list[Panel]:
     Raises:
         MaskFileError: no mask file, one that cannot be read, or that draws nothing.
     """
-    found = mask_of(path) if path.is_dir() else path
-    if found is None:
+    mask = mask_of(path) if path.is_dir() else path
+    if mask is None:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
-    most = placement_limit(found)
-    content = read_mask(found, most)
-    content.refuse_beyond(most)
-    table = found.with_name("doses.csv")
+    limit = placement_limit(mask)
+    content = read_mask(mask, limit)
+    content.refuse_beyond(limit)
+    table = mask.with_name("doses.csv")
     dose = handover.read_dose_table(table) if table.is_file() else {}
     groups = equal_shapes(content, lambda shape: (shape.cell, shape.layer))
     outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:
-        raise MaskFileError(f"{found} holds no shape to be shown")
-    marks = _marks(found.with_suffix(".lyrdb"))
+        raise MaskFileError(f"{mask} holds no shape to be shown")
+    marks = _marks(mask.with_suffix(".lyrdb"))
     caption = (
         f"{sum(len(o.places) for o in outlines):,} shapes, each as it is in the file. Drag to move, wheel or + and - "
         "to zoom: far away a pixel shows how much of it is covered, near by the outlines are drawn. "
         + (f"Boxes: {len(marks)} places where a rule is broken." if marks else "")
     )
-    drawn = DrawingPanel(found.name, outlines, 1e-3 * content.unit_nm, caption, marks)
+    drawn = DrawingPanel(mask.name, outlines, 1e-3 * content.unit_nm, caption, marks)
     return [drawn, _layers(content, outlines, dose)]
 
 
@@ -71,7 +71,7 @@ def _outline(
     if shape.layer in dose:
         notes["relative dose"] = dose[shape.layer]
     places = np.concatenate(
-        [np.column_stack([some.x, some.y]) for some in group]
+        [np.column_stack([stack.x, stack.y]) for stack in group]
     ).astype(np.int32)
     return OutlinePanel(_name(content, shape.layer), shape.outlines[0], places, notes)
 
@@ -91,9 +91,12 @@ def _layers(
         {layer for cell in content.cells.values() for layer in cell.layers}
     ):
         number = "/".join(map(str, layer))
-        some = [o for o in outlines if o.notes["layer"] == number]
+        in_layer = [outline for outline in outlines if outline.notes["layer"] == number]
         area = (
-            sum(len(o.places) * abs(polygon.twice_area(o.corners)) / 2 for o in some)
+            sum(
+                len(outline.places) * abs(polygon.twice_area(outline.corners)) / 2
+                for outline in in_layer
+            )
             * (1e-3 * content.unit_nm) ** 2
         )
         name = content.layer_names.get(layer, "")
@@ -101,7 +104,7 @@ def _layers(
             (
                 number,
                 name,
-                sum(len(o.places) for o in some),
+                sum(len(outline.places) for outline in in_layer),
                 area,
                 dose.get(layer, "none stated"),
             )
@@ -123,13 +126,13 @@ def _marks(path: Path) -> list[tuple[float, float, str]]:
         items = list(ElementTree.parse(path).getroot().iter("item"))
     except ElementTree.ParseError as error:
         raise MaskFileError(f"{path}: no marker database ({error})") from None
-    found = []
+    marks = []
     for item in items:
         box = next(
             (
-                v.text or ""
-                for v in item.iter("value")
-                if (v.text or "").startswith("box:")
+                value.text or ""
+                for value in item.iter("value")
+                if (value.text or "").startswith("box:")
             ),
             "",
         )
@@ -142,5 +145,5 @@ def _marks(path: Path) -> list[tuple[float, float, str]]:
             y = (corners[1] + corners[3]) / 2
         except (ValueError, IndexError):
             continue
-        found.append((x, y, f"{item.findtext('category', '').strip(chr(39))}"))
-    return found
+        marks.append((x, y, f"{item.findtext('category', '').strip(chr(39))}"))
+    return marks

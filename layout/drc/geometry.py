@@ -114,29 +114,35 @@ def measure_polygon(
         Pairs below the limits, and the caliper width of each convex contour whatever it
         is.
     """
-    found = find_sharp_corners(contours)
-    convex_contour = []
+    measurements = find_sharp_corners(contours)
+    number_of_edge = []
     for number, points in enumerate(contours):
-        outer, hole = is_convex(points), is_convex(points[::-1])
-        convex_contour.append(np.full(len(points), number if outer or hole else -1))
-        if outer:
-            found.append(
+        is_outer = is_convex(points)
+        is_hole = is_convex(points[::-1])
+        number_of_edge.append(
+            np.full(len(points), number if is_outer or is_hole else -1)
+        )
+        if is_outer:
+            measurements.append(
                 ShapeMeasurement(
                     "width", convex.least_width(points), contour_box([points])
                 )
             )
-        elif hole:
-            found.append(
+        elif is_hole:
+            measurements.append(
                 ShapeMeasurement(
                     "notch", convex.least_width(points[::-1]), contour_box([points])
                 )
             )
-    if len(contours) == 1 and convex_contour[0][0] == 0:
-        return found
+    if len(contours) == 1 and number_of_edge[0][0] == 0:
+        return measurements
     edges = contour_edges(contours)
     pairs = find_close_boxes(edge_boxes(edges), max(width_limit, space_limit))
-    of = np.concatenate(convex_contour)
-    pairs = pairs[(of[pairs[:, 0]] != of[pairs[:, 1]]) | (of[pairs[:, 0]] < 0)]
+    contour_of_edge = np.concatenate(number_of_edge)
+    pairs = pairs[
+        (contour_of_edge[pairs[:, 0]] != contour_of_edge[pairs[:, 1]])
+        | (contour_of_edge[pairs[:, 0]] < 0)
+    ]
     for rule, side, limit in (
         ("width", 1.0, width_limit),
         ("notch", -1.0, space_limit),
@@ -148,8 +154,10 @@ def measure_polygon(
             strict=True,
         ):
             corners = edges[[i, j]].reshape(4, 2).astype(np.int64)
-            found.append(ShapeMeasurement(rule, float(value), contour_box([corners])))
-    return found
+            measurements.append(
+                ShapeMeasurement(rule, float(value), contour_box([corners]))
+            )
+    return measurements
 
 
 def find_sharp_corners(contours: Sequence[Array]) -> list[ShapeMeasurement]:
@@ -161,20 +169,20 @@ def find_sharp_corners(contours: Sequence[Array]) -> list[ShapeMeasurement]:
     Accuracy:
         A corner counts where rounding its ends to whole units cannot explain it.
     """
-    found = []
+    measurements = []
     for points in contours:
-        before = np.roll(points, 1, axis=0) - points
-        after = np.roll(points, -1, axis=0) - points
-        lengths = np.hypot(*before.T), np.hypot(*after.T)
-        scalar = (before * after).sum(1)
+        to_previous = np.roll(points, 1, axis=0) - points
+        to_next = np.roll(points, -1, axis=0) - points
+        lengths = np.hypot(*to_previous.T), np.hypot(*to_next.T)
+        dot = (to_previous * to_next).sum(1)
         product = lengths[0] * lengths[1]
         rounding = 2**0.5 * (lengths[0] + lengths[1])
-        for n in np.flatnonzero(scalar > product / 2 + rounding).tolist():
-            angle = np.degrees(np.arccos(min(scalar[n] / product[n], 1.0)))
-            x, y = points[n].tolist()
+        for corner in np.flatnonzero(dot > product / 2 + rounding).tolist():
+            angle = np.degrees(np.arccos(min(dot[corner] / product[corner], 1.0)))
+            x, y = points[corner].tolist()
             box = (x - 1, y - 1, x + 1, y + 1)
-            found.append(ShapeMeasurement("corner", float(angle), box))
-    return found
+            measurements.append(ShapeMeasurement("corner", float(angle), box))
+    return measurements
 
 
 def edge_boxes(edges: Array) -> Array:
@@ -211,15 +219,15 @@ def find_close_boxes(
     shift = np.zeros((len(which), 2), np.int32) if shift is None else shift
     boxes = np.asarray(boxes, float)
     heights = boxes[:, 3] - boxes[:, 1]
-    typical = np.median(heights[which[:: max(1, len(which) // 10_000)]])
+    typical_height = np.median(heights[which[:: max(1, len(which) // 10_000)]])
     shift = np.ascontiguousarray(shift)
     order = stable_order(boxes[which, 0] + shift[:, 0])
-    low, height, start, member = _fill_bands(
-        boxes, which, shift, order, float(typical + distance), distance
+    bottom, height, offsets, member = _fill_bands(
+        boxes, which, shift, order, float(typical_height + distance), distance
     )
-    bands = np.array([low, height, distance])
+    bands = np.array([bottom, height, distance])
     pairs = np.empty((len(which), 2), np.int64)
-    count = _sweep_bands(boxes, which, shift, bands, start, member, pairs)
+    count = _sweep_bands(boxes, which, shift, bands, offsets, member, pairs)
     if count > MAX_PAIRS:
         raise MaskFileError(
             f"{count:,} pairs of shapes closer than {distance:g} units, at most "
@@ -227,7 +235,7 @@ def find_close_boxes(
         )
     if count > len(pairs):
         pairs = np.empty((count, 2), np.int64)
-        _sweep_bands(boxes, which, shift, bands, start, member, pairs)
+        _sweep_bands(boxes, which, shift, bands, offsets, member, pairs)
     return pairs[:count].copy()
 
 
@@ -240,30 +248,43 @@ def _fill_bands(
     height: float,
     distance: float,
 ) -> tuple[float, float, Array, Array]:
-    """Bottom and height of the bands, offsets of their copies, and the copies of each
-    band in order; no more bands than copies.
+    """Sort copies of boxes into horizontal bands, each copy into every band it meets.
+
+    A band is raised so that there are no more bands than copies.
+
+    Args:
+        boxes: (k, 4) left, bottom, right, top.
+        which: (copies,) box of each copy.
+        shift: (copies, 2) displacement of each copy.
+        order: (copies,) copies by their left edges.
+        height: smallest height of a band.
+        distance: added to the top of each box.
+
+    Returns:
+        Bottom of the lowest band, height of the bands, (bands + 1,) offsets into the
+        last array, and the copies of all bands, each band in the order of ``order``.
     """
-    low, high = np.inf, -np.inf
-    for n in range(len(which)):
-        low = min(low, boxes[which[n], 1] + shift[n, 1])
-        high = max(high, boxes[which[n], 3] + shift[n, 1] + distance)
-    height = max(height, (high - low) / len(which))
-    start = np.zeros(int((high - low) // height) + 2, np.int64)
-    for n in range(len(which)):
-        bottom = boxes[which[n], 1] + shift[n, 1] - low
-        top = boxes[which[n], 3] + shift[n, 1] + distance - low
-        for band in range(int(bottom // height), int(top // height) + 1):
-            start[band + 1] += 1
-    start = np.cumsum(start)
-    member = np.empty(start[-1], np.int32)
-    place = start.copy()
-    for n in order:
-        bottom = boxes[which[n], 1] + shift[n, 1] - low
-        top = boxes[which[n], 3] + shift[n, 1] + distance - low
-        for band in range(int(bottom // height), int(top // height) + 1):
-            member[place[band]] = n
-            place[band] += 1
-    return low, height, start, member
+    low, top_end = np.inf, -np.inf
+    for copy in range(len(which)):
+        low = min(low, boxes[which[copy], 1] + shift[copy, 1])
+        top_end = max(top_end, boxes[which[copy], 3] + shift[copy, 1] + distance)
+    height = max(height, (top_end - low) / len(which))
+    offsets = np.zeros(int((top_end - low) // height) + 2, np.int64)
+    for copy in range(len(which)):
+        lower = boxes[which[copy], 1] + shift[copy, 1] - low
+        upper = boxes[which[copy], 3] + shift[copy, 1] + distance - low
+        for band in range(int(lower // height), int(upper // height) + 1):
+            offsets[band + 1] += 1
+    offsets = np.cumsum(offsets)
+    member = np.empty(offsets[-1], np.int32)
+    next_free = offsets.copy()
+    for copy in order:
+        lower = boxes[which[copy], 1] + shift[copy, 1] - low
+        upper = boxes[which[copy], 3] + shift[copy, 1] + distance - low
+        for band in range(int(lower // height), int(upper // height) + 1):
+            member[next_free[band]] = copy
+            next_free[band] += 1
+    return low, height, offsets, member
 
 
 @compile_loop
@@ -272,36 +293,46 @@ def _sweep_bands(
     which: Array,
     shift: Array,
     bands: Array,
-    start: Array,
+    offsets: Array,
     member: Array,
     pairs: Array,
 ) -> int:
-    """Count the close pairs, and store as many as ``pairs`` holds; a pair belongs to
-    its lowest common band. ``bands``: bottom and height of them, and the distance.
+    """Number of pairs of copies closer than a distance; as many as fit go to ``pairs``.
+
+    A pair in several bands counts in the lowest band that holds both copies.
+
+    Args:
+        boxes: (k, 4) left, bottom, right, top.
+        which: (copies,) box of each copy.
+        shift: (copies, 2) displacement of each copy.
+        bands: bottom of the lowest band, height of the bands, distance.
+        offsets: (bands + 1,) first entry of each band in ``member``.
+        member: copies of each band by their left edges.
+        pairs: (n, 2) output, copies.
     """
     count = 0
     low, height, distance = bands
-    for band in range(len(start) - 1):
-        for k in range(start[band], start[band + 1]):
-            i = member[k]
-            one = boxes[which[i]]
-            right = one[2] + shift[i, 0] + distance
-            for other in range(k + 1, start[band + 1]):
-                j = member[other]
-                two = boxes[which[j]]
-                if two[0] + shift[j, 0] >= right:
+    for band in range(len(offsets) - 1):
+        for position in range(offsets[band], offsets[band + 1]):
+            first = member[position]
+            first_box = boxes[which[first]]
+            right = first_box[2] + shift[first, 0] + distance
+            for later in range(position + 1, offsets[band + 1]):
+                second = member[later]
+                second_box = boxes[which[second]]
+                if second_box[0] + shift[second, 0] >= right:
                     break
-                bottom = one[1] + shift[i, 1]
-                next_bottom = two[1] + shift[j, 1]
-                if int((max(bottom, next_bottom) - low) // height) != band:
+                first_bottom = first_box[1] + shift[first, 1]
+                second_bottom = second_box[1] + shift[second, 1]
+                if int((max(first_bottom, second_bottom) - low) // height) != band:
                     continue
                 if (
-                    next_bottom - one[3] - shift[i, 1] >= distance
-                    or bottom - two[3] - shift[j, 1] >= distance
+                    second_bottom - first_box[3] - shift[first, 1] >= distance
+                    or first_bottom - second_box[3] - shift[second, 1] >= distance
                 ):
                     continue
                 if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = i, j
+                    pairs[count, 0], pairs[count, 1] = first, second
                 count += 1
     return count
 
@@ -326,11 +357,11 @@ def measure_separation(
         Intersections are exact for extents below 2^26 database units; distances are
         rounded as float64.
     """
-    start = np.cumsum([0, *(len(edges) for edges in polygons)])
+    first_edge = np.cumsum([0, *(len(edges) for edges in polygons)])
     edges = np.concatenate([np.empty((0, 4)), *polygons]).astype(float)
     euclidean, projected = np.empty(len(first)), np.empty(len(first))
     _measure_separation(
-        edges, start, first, second, offset.astype(float), euclidean, projected
+        edges, first_edge, first, second, offset.astype(float), euclidean, projected
     )
     return euclidean, projected
 
@@ -338,32 +369,50 @@ def measure_separation(
 @compile_loop
 def _measure_separation(
     edges: Array,
-    start: Array,
+    first_edge: Array,
     first: Array,
     second: Array,
     offset: Array,
     euclidean: Array,
     projected: Array,
 ) -> None:
-    for n in range(len(first)):
-        one = edges[start[first[n]] : start[first[n] + 1]]
-        two = edges[start[second[n]] : start[second[n] + 1]].copy()
-        two[:, 0::2] += offset[n, 0]
-        two[:, 1::2] += offset[n, 1]
-        nearest, facing = np.inf, np.inf
-        for i in range(len(one)):
-            for j in range(len(two)):
-                square = edge_distance_squared(one[i], two[j])
-                nearest = min(nearest, square)
-                if square < facing * facing:
-                    facing = min(facing, projected_distance(one[i], two[j], -1.0))
-        if nearest > 0 and (
-            encloses_point(one, two[0, 0], two[0, 1])
-            or encloses_point(two, one[0, 0], one[0, 1])
+    """Fill ``euclidean`` and ``projected`` (n,) with distances of pairs of polygons.
+
+    The distance is the least over all pairs of edges. Where one polygon encloses a
+    corner of the other, the Euclidean distance is 0.
+
+    Args:
+        edges: (m, 4) x1, y1, x2, y2 of all polygons.
+        first_edge: (polygons + 1,) first edge of each polygon.
+        first: (n,) polygon of each pair.
+        second: (n,) the other polygon of each pair.
+        offset: (n, 2) displacement of the second polygon.
+        euclidean: (n,) output.
+        projected: (n,) output, in the projection metric; inf where no edges face.
+    """
+    for pair in range(len(first)):
+        edges_1 = edges[first_edge[first[pair]] : first_edge[first[pair] + 1]]
+        edges_2 = edges[first_edge[second[pair]] : first_edge[second[pair] + 1]].copy()
+        edges_2[:, 0::2] += offset[pair, 0]
+        edges_2[:, 1::2] += offset[pair, 1]
+        least_square = np.inf
+        least_projected = np.inf
+        for i in range(len(edges_1)):
+            for j in range(len(edges_2)):
+                square = edge_distance_squared(edges_1[i], edges_2[j])
+                least_square = min(least_square, square)
+                if square < least_projected * least_projected:
+                    least_projected = min(
+                        least_projected,
+                        projected_distance(edges_1[i], edges_2[j], -1.0),
+                    )
+        if least_square > 0 and (
+            encloses_point(edges_1, edges_2[0, 0], edges_2[0, 1])
+            or encloses_point(edges_2, edges_1[0, 0], edges_1[0, 1])
         ):
-            nearest = 0.0
-        euclidean[n] = nearest**0.5
-        projected[n] = facing
+            least_square = 0.0
+        euclidean[pair] = least_square**0.5
+        projected[pair] = least_projected
 
 
 @compile_loop
@@ -420,6 +469,7 @@ def encloses_point(edges: Array, x: float, y: float) -> bool:
     """Whether the winding number of a polygon about a point off its edges is not 0.
 
     Args:
+        edges: (m, 4) x1, y1, x2, y2.
         x: of the point.
         y: of the point.
     """
@@ -435,9 +485,11 @@ def encloses_point(edges: Array, x: float, y: float) -> bool:
 
 @compile_loop
 def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
-    """(n,) :func:`projected_distance` of pairs (n, 2) of edges.
+    """(n,) :func:`projected_distance` of pairs of edges.
 
     Args:
+        edges: (m, 4) x1, y1, x2, y2.
+        pairs: (n, 2) edge numbers.
         side: 1 through the interior, -1 through the exterior.
     """
     out = np.empty(len(pairs))
@@ -450,8 +502,8 @@ def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
 def projected_distance(e: Array, f: Array, side: float) -> float:
     """Distance of two edges in the projection metric, as KLayout measures it.
 
-    Edges face each other where their directions are opposed by more than 90 degrees,
-    each lies on the wanted side of the other, and the perpendicular projection of each
+    Edges face each other where their directions differ by more than 90 degrees, each
+    lies on the side ``side`` of the other, and the perpendicular projection of each
     onto the other has a length.
 
     Args:
@@ -472,32 +524,45 @@ def projected_distance(e: Array, f: Array, side: float) -> float:
 
 @compile_loop
 def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
-    """Least distance from the line of e of that part of f which projects onto e and
-    lies on one side of it.
+    """Least distance of edge f from the line of edge e, on one side of it.
+
+    Only that part of f counts whose projection falls on e; inf where it has no length.
+
+    Args:
+        e: x1, y1, x2, y2 with the interior on the left.
+        f: the other edge.
+        side: 1 through the interior, -1 through the exterior.
     """
     length = ((e[2] - e[0]) ** 2 + (e[3] - e[1]) ** 2) ** 0.5
     ux, uy = (e[2] - e[0]) / length, (e[3] - e[1]) / length
     along_start = (f[0] - e[0]) * ux + (f[1] - e[1]) * uy
     along_end = (f[2] - e[0]) * ux + (f[3] - e[1]) * uy
-    away_start = side * (ux * (f[1] - e[1]) - uy * (f[0] - e[0]))
-    away_end = side * (ux * (f[3] - e[1]) - uy * (f[2] - e[0]))
-    if max(away_start, away_end) <= 0:
+    distance_start = side * (ux * (f[1] - e[1]) - uy * (f[0] - e[0]))
+    distance_end = side * (ux * (f[3] - e[1]) - uy * (f[2] - e[0]))
+    if max(distance_start, distance_end) <= 0:
         return np.inf
     low, high = _clip_to_range(along_start, along_end, 0.0, length)
-    low_side, high_side = _clip_to_range(away_start, away_end, 0.0, np.inf)
-    low, high = max(low, low_side), min(high, high_side)
+    low_on_side, high_on_side = _clip_to_range(
+        distance_start, distance_end, 0.0, np.inf
+    )
+    low, high = max(low, low_on_side), min(high, high_on_side)
     if (high - low) * abs(along_end - along_start) <= 1e-9:
         return np.inf
-    slope = away_end - away_start
-    return float(max(min(away_start + low * slope, away_start + high * slope), 0.0))
+    slope = distance_end - distance_start
+    return float(
+        max(min(distance_start + low * slope, distance_start + high * slope), 0.0)
+    )
 
 
 @compile_loop
 def _clip_to_range(
     start: float, end: float, low: float, high: float
 ) -> tuple[float, float]:
-    """Part (0 to 1) of the way from start to end that lies between two values; empty
-    where the second is smaller.
+    """Part of the segment from start to end that lies between two values.
+
+    Returns:
+        First and last fraction (0 to 1) of the way; nothing lies between the two values
+        where the last is smaller than the first.
     """
     if start == end:
         return (0.0, 1.0) if low <= start <= high else (1.0, 0.0)

@@ -86,6 +86,14 @@ def write_lyrdb(report: DrcReport, top_cell: str, path: str | Path) -> None:
 def _add_marker(
     items: ElementTree.Element, violation: Violation, top_cell: str, unit_nm: float
 ) -> None:
+    """Append the marker of a violation: its category, box in um and text.
+
+    Args:
+        items: element that receives the marker.
+        violation: rule, box and values.
+        top_cell: name of the cell that the box refers to.
+        unit_nm: database unit.
+    """
     item = ElementTree.SubElement(items, "item")
     _add_texts(
         item,
@@ -115,6 +123,7 @@ def _add_texts(parent: ElementTree.Element, texts: dict[str, str]) -> None:
 
 
 def _write_xml(root: ElementTree.Element, path: str | Path) -> None:
+    """Write an indented XML document."""
     ElementTree.indent(root, " ")
     body = ElementTree.tostring(root, encoding="unicode")
     store.write_text(path, f'<?xml version="1.0" encoding="utf-8"?>\n{body}\n')

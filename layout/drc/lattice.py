@@ -95,83 +95,107 @@ class _LatticeCheck:
     report: DrcReport
 
     def run(self, foot_nm: Array | None) -> None:
-        """Report the violations of the lattice and its smallest sizes."""
+        """Enter the violations of the lattice and its smallest sizes into the report.
+
+        Pairs of pillars are counted by (lattice vector, outline, outline), and the
+        space of each such triple is measured once. Feet of discs follow from their
+        diameters; feet of other shapes from the drawn space less half the growth of
+        both.
+
+        Args:
+            foot_nm: (classes,) diameter of each class at its foot; None: feet are not
+                checked.
+        """
         used = np.flatnonzero(self.counts[1:]) + 1
         if not len(used):
             return
-        outlines, kind = _distinct_outlines(self.plan.classes, used)
-        self._check_widths(outlines, kind, used)
-        foot, growth = np.zeros((2, len(outlines) + 1))
+        outlines, outline_of_class = _distinct_outlines(self.plan.classes, used)
+        self._check_widths(outlines, outline_of_class, used)
+        foot_diameter_nm, growth_nm = np.zeros((2, len(outlines) + 1))
         limit = self.rules.minimum_gap_nm / self.plan.unit_nm
-        measured = limit
+        measured_below = limit
         if foot_nm is not None:
-            drawn = np.array([self.plan.classes[k - 1].diameter_nm for k in used])
-            np.maximum.at(foot, kind[used], foot_nm[used - 1])
-            np.maximum.at(growth, kind[used], foot_nm[used - 1] - drawn)
+            drawn_nm = np.array([self.plan.classes[k - 1].diameter_nm for k in used])
+            np.maximum.at(foot_diameter_nm, outline_of_class[used], foot_nm[used - 1])
+            np.maximum.at(
+                growth_nm, outline_of_class[used], foot_nm[used - 1] - drawn_nm
+            )
             if not all(self.plan.classes[k - 1].round for k in used):
-                widest = self.rules.minimum_foot_gap_nm + growth.max()
-                measured = max(limit, widest / self.plan.unit_nm)
+                widest = self.rules.minimum_foot_gap_nm + growth_nm.max()
+                measured_below = max(limit, widest / self.plan.unit_nm)
         radius = np.array(
             [0.0, *(np.hypot(*outline[0].T).max() for outline in outlines)]
         )
-        foot_reach = (foot.max() + self.rules.minimum_foot_gap_nm) / self.plan.unit_nm
+        foot_reach = (
+            foot_diameter_nm.max() + self.rules.minimum_foot_gap_nm
+        ) / self.plan.unit_nm
         vectors = lattice_vectors(
-            self.lattice, max(2 * radius.max() + measured, foot_reach)
+            self.lattice, max(2 * radius.max() + measured_below, foot_reach)
         )
         table = np.zeros((len(vectors), len(radius), len(radius)), np.int64)
-        for block, new, _ in self._blocks(vectors):
-            count_pairs(block, new, kind, vectors, table)
+        for block, first_new_row, _ in self._blocks(vectors):
+            count_pairs(block, first_new_row, outline_of_class, vectors, table)
         steps = vectors * (self.lattice.pitch, self.lattice.down)
-        spaces = self._measure_pairs(table, steps, outlines, radius, measured)
+        spaces = self._measure_pairs(table, steps, outlines, radius, measured_below)
         nearest = min(spaces.values(), default=math.inf)
         self.report.measured("space", nearest * self.plan.unit_nm)
-        close = {key: space for key, space in spaces.items() if space < limit - 1e-9}
-        if close:
-            self._report_pairs(kind, vectors, table, close)
+        too_close = {
+            key: space for key, space in spaces.items() if space < limit - 1e-9
+        }
+        if too_close:
+            self._report_pairs(outline_of_class, vectors, table, too_close)
         if foot_nm is not None:
             if all(self.plan.classes[k - 1].round for k in used):
-                self._check_feet(*self._foot_spaces(table, steps, foot))
+                self._check_feet(*self._foot_spaces(table, steps, foot_diameter_nm))
             else:
                 pairs = np.array(list(spaces), np.int64).reshape(-1, 3)
                 _, first, second = pairs.T
-                drawn_nm = np.array(list(spaces.values())) * self.plan.unit_nm
+                spaces_nm = np.array(list(spaces.values())) * self.plan.unit_nm
                 self._check_feet(
-                    drawn_nm - (growth[first] + growth[second]) / 2,
+                    spaces_nm - (growth_nm[first] + growth_nm[second]) / 2,
                     table[tuple(pairs.T)],
                 )
 
     def _check_widths(
-        self, outlines: list[tuple[Array, ...]], kind: Array, used: Array
+        self, outlines: list[tuple[Array, ...]], outline_of_class: Array, used: Array
     ) -> None:
-        """Width and notches of each class."""
+        """Report width and notches of each distinct outline, for all its classes.
+
+        Args:
+            outlines: contours of each distinct outline, database units.
+            outline_of_class: (classes + 1,) outline number of each class, from 1 on.
+            used: class numbers that occur on the lattice.
+        """
         for number, contours in enumerate(outlines, 1):
             reach = 4 * float(np.abs(contours[0]).max())
             worst: dict[str, float] = {}
-            for found in measure_polygon(contours, reach, reach):
-                value = found.value * self.report.scale(found.rule)
-                worst[found.rule] = min(worst.get(found.rule, math.inf), value)
-            classes = used[kind[used] == number]
+            for measurement in measure_polygon(contours, reach, reach):
+                value = measurement.value * self.report.scale(measurement.rule)
+                worst[measurement.rule] = min(
+                    worst.get(measurement.rule, math.inf), value
+                )
+            classes = used[outline_of_class[used] == number]
             for rule, value in worst.items():
                 self.report.measured(rule, value)
                 limit = self.report.limits[rule]
                 if value >= limit - 1e-9:
                     continue
                 for k in classes.tolist():
-                    shape = self.plan.classes[k - 1]
+                    pillar = self.plan.classes[k - 1]
                     boxes = (
-                        _moved_box(shape.outline, x, y) for x, y in self._sites_of(k)
+                        _moved_box(pillar.outline, x, y) for x, y in self._sites_of(k)
                     )
-                    shown = (
-                        Violation(rule, box, value, limit, shape.name) for box in boxes
+                    violations = (
+                        Violation(rule, box, value, limit, pillar.name) for box in boxes
                     )
                     count = int(self.counts[k])
                     self.report.add(
                         rule,
                         count,
-                        layer=shape.layer[0],
-                        cell=shape.name,
+                        layer=pillar.layer[0],
+                        cell=pillar.name,
                         worst=value,
-                        examples=shown,
+                        examples=violations,
                     )
 
     def _measure_pairs(
@@ -182,143 +206,188 @@ class _LatticeCheck:
         radius: Array,
         limit: float,
     ) -> dict[tuple[int, int, int], float]:
-        """{(vector, outline, outline): space}, database units, of all pairs below the
-        limit and of the nearest.
+        """Euclidean space of each kind of pair, database units, nearest pairs first.
 
-        Pairs are measured in the order of the least space their radii allow, until none
-        can be nearer.
+        The space of a pair is at least |step| - radius - radius. Pairs are measured in
+        the order of this bound, until it reaches both the limit and the smallest space
+        so far.
+
+        Args:
+            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
+            steps: (vectors, 2) displacement of the second pillar, database units.
+            outlines: contours of each distinct outline; only the outer one is measured.
+            radius: (outlines + 1,) largest distance of a corner from the site.
+            limit: spaces below it are all measured.
+
+        Returns:
+            {(vector, outline, outline): space} of all pairs below the limit and of the
+            nearest.
         """
         vector, first, second = np.nonzero(table)
-        filled = (first > 0) & (second > 0)
-        vector = vector[filled]
-        first = first[filled]
-        second = second[filled]
-        bound = np.hypot(*steps[vector].T) - radius[first] - radius[second]
-        order = np.argsort(bound, kind="stable")
+        both_pillars = (first > 0) & (second > 0)
+        vector = vector[both_pillars]
+        first = first[both_pillars]
+        second = second[both_pillars]
+        least_space = np.hypot(*steps[vector].T) - radius[first] - radius[second]
+        order = np.argsort(least_space, kind="stable")
         edges = [contour_edges(outline[:1]) for outline in outlines]
         spaces: dict[tuple[int, int, int], float] = {}
         nearest = math.inf
         for batch in np.array_split(order, max(1, len(order) // 256)):
-            if not len(batch) or bound[batch[0]] >= max(limit, nearest):
+            if not len(batch) or least_space[batch[0]] >= max(limit, nearest):
                 break
-            found, _ = measure_separation(
+            distances, _ = measure_separation(
                 edges, first[batch] - 1, second[batch] - 1, steps[vector[batch]]
             )
-            nearest = min(nearest, float(found.min()))
+            nearest = min(nearest, float(distances.min()))
             keys = zip(
                 vector[batch].tolist(),
                 first[batch].tolist(),
                 second[batch].tolist(),
                 strict=True,
             )
-            spaces |= dict(zip(keys, found.tolist(), strict=True))
+            spaces |= dict(zip(keys, distances.tolist(), strict=True))
         return spaces
 
     def _report_pairs(
         self,
-        kind: Array,
+        outline_of_class: Array,
         vectors: Array,
         table: Array,
-        close: dict[tuple[int, int, int], float],
+        spaces: dict[tuple[int, int, int], float],
     ) -> None:
-        """Count the pairs below the limit, and list the first."""
+        """Report overlaps and spaces below the limit: their number, and some of them.
+
+        Args:
+            outline_of_class: (classes + 1,) outline number of each class.
+            vectors: (vectors, 2) columns to the right and rows up.
+            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
+            spaces: {(vector, outline, outline): space} below the limit, database units.
+        """
         layer = self.plan.classes[0].layer[0]
         unit = self.plan.unit_nm
         for rule in ("overlap", "space"):
-            keys = {
+            values_nm = {
                 key: space * unit
-                for key, space in close.items()
+                for key, space in spaces.items()
                 if (space <= 0) == (rule == "overlap")
             }
-            if not keys:
+            if not values_nm:
                 continue
             marked = np.zeros(table.shape, bool)
-            marked[tuple(np.array(list(keys)).T)] = True
-            shown = self._close_pairs(rule, kind, vectors, marked, keys)
-            count, worst = int(table[marked].sum()), min(keys.values())
+            marked[tuple(np.array(list(values_nm)).T)] = True
+            violations = self._close_pairs(
+                rule, outline_of_class, vectors, marked, values_nm
+            )
+            count = int(table[marked].sum())
+            worst = min(values_nm.values())
             self.report.add(
                 rule,
                 count,
                 layer=layer,
                 cell=self.lattice.name,
                 worst=worst,
-                examples=shown,
+                examples=violations,
             )
 
     def _close_pairs(
         self,
         rule: str,
-        kind: Array,
+        outline_of_class: Array,
         vectors: Array,
         marked: Array,
         values: dict[tuple[int, int, int], float],
     ) -> Iterator[Violation]:
-        """Violations of marked pairs (vector, outline, outline), with a box around both
-        pillars.
+        """Violations of the marked kinds of pairs, with a box around both pillars.
+
+        Args:
+            rule: name of the rule.
+            outline_of_class: (classes + 1,) outline number of each class.
+            vectors: (vectors, 2) columns to the right and rows up.
+            marked: (vectors, outlines + 1, outlines + 1) whether a kind of pair is
+                listed.
+            values: {(vector, outline, outline): space in nm}.
         """
         limit = self.rules.minimum_gap_nm
-        for block, new, top in self._blocks(vectors):
-            found = np.empty((MAX_LISTED, 3), np.int64)
-            count = locate_pairs(block, new, kind, vectors, marked, found)
-            for row, column, vector in found[:count].tolist():
+        for block, first_new_row, top in self._blocks(vectors):
+            located = np.empty((MAX_LISTED, 3), np.int64)
+            count = locate_pairs(
+                block, first_new_row, outline_of_class, vectors, marked, located
+            )
+            for row, column, vector in located[:count].tolist():
                 right, up = vectors[vector].tolist()
-                one = int(block[row, column])
-                two = int(block[row - up, column + right])
-                shapes = self.plan.classes[one - 1], self.plan.classes[two - 1]
-                places = (
+                first = int(block[row, column])
+                second = int(block[row - up, column + right])
+                shapes = self.plan.classes[first - 1], self.plan.classes[second - 1]
+                sites = (
                     self._place(top + row, column),
                     self._place(top + row - up, column + right),
                 )
-                both = [
-                    shape.outline + place
-                    for shape, place in zip(shapes, places, strict=True)
+                moved = [
+                    shape.outline + site
+                    for shape, site in zip(shapes, sites, strict=True)
                 ]
                 text = f"{shapes[0].name} to {shapes[1].name} in {self.lattice.name}"
-                value = values[vector, int(kind[one]), int(kind[two])]
-                yield Violation(rule, contour_box(both), value, limit, text)
+                value = values[
+                    vector, int(outline_of_class[first]), int(outline_of_class[second])
+                ]
+                yield Violation(rule, contour_box(moved), value, limit, text)
 
     def _foot_spaces(
-        self, table: Array, steps: Array, foot: Array
+        self, table: Array, steps: Array, foot_nm: Array
     ) -> tuple[Array, Array]:
-        """Spaces between the feet of discs for each kind of pair, nm, and the number of
-        such pairs.
-        """
-        vector, first, second = np.nonzero(table)
-        filled = (first > 0) & (second > 0)
-        vector = vector[filled]
-        first = first[filled]
-        second = second[filled]
-        away = np.hypot(*steps[vector].T) * self.plan.unit_nm
-        return away - (foot[first] + foot[second]) / 2, table[vector, first, second]
+        """Spaces between feet of discs for each kind of pair, nm, and number of pairs.
 
-    def _check_feet(self, spaces_nm: Array, pairs: Array) -> None:
-        """Enter the pairs of feet that are nearer than the rule.
+        space = distance of the sites - (foot_1 + foot_2) / 2.
 
         Args:
-            spaces_nm: (n,) between feet, of all pairs that can be too near, and of the
-                nearest: of discs by their diameters, of other shapes between the drawn
-                polygons less what both walls lean out.
-            pairs: (n,) how many there are of each.
+            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
+            steps: (vectors, 2) displacement of the second pillar, database units.
+            foot_nm: (outlines + 1,) diameter at the foot.
         """
-        lattice, limit = self.lattice, self.rules.minimum_foot_gap_nm
-        least = float(spaces_nm.min(initial=math.inf))
+        vector, first, second = np.nonzero(table)
+        both_pillars = (first > 0) & (second > 0)
+        vector = vector[both_pillars]
+        first = first[both_pillars]
+        second = second[both_pillars]
+        distance_nm = np.hypot(*steps[vector].T) * self.plan.unit_nm
+        return distance_nm - (foot_nm[first] + foot_nm[second]) / 2, table[
+            vector, first, second
+        ]
+
+    def _check_feet(self, spaces_nm: Array, pairs: Array) -> None:
+        """Report the pairs of feet whose space is below the rule.
+
+        Args:
+            spaces_nm: (n,) space between the feet for each kind of pair; complete below
+                the rule, and with the smallest one.
+            pairs: (n,) number of pairs of each kind.
+        """
+        lattice = self.lattice
+        limit = self.rules.minimum_foot_gap_nm
+        smallest = float(spaces_nm.min(initial=math.inf))
         count = int(pairs[spaces_nm < limit - 1e-9].sum())
         layer = self.plan.classes[int(np.flatnonzero(self.counts[1:])[0])].layer[0]
         self.report.minimum_foot_space_nm = min(
-            self.report.minimum_foot_space_nm, least
+            self.report.minimum_foot_space_nm, smallest
         )
         corners = np.array(
             [self._place(0, 0), self._place(lattice.rows, lattice.columns)]
         )
-        shown = Violation(
+        violation = Violation(
             "foot",
             contour_box([corners]),
-            least,
+            smallest,
             limit,
             f"feet of etched pillars in {lattice.name}",
         )
         self.report.add(
-            "foot", count, layer=layer, cell=lattice.name, worst=least, examples=[shown]
+            "foot",
+            count,
+            layer=layer,
+            cell=lattice.name,
+            worst=smallest,
+            examples=[violation],
         )
 
     def _sites_of(self, class_number: int) -> Iterator[tuple[int, int]]:
@@ -328,34 +397,53 @@ class _LatticeCheck:
                 yield self._place(top + row, column)
 
     def _place(self, row: int, column: int) -> tuple[int, int]:
+        """(x, y) of a site, database units."""
         return (
             self.lattice.x0 + column * self.lattice.pitch,
             self.lattice.y0 - row * self.lattice.down,
         )
 
     def _blocks(self, vectors: Array) -> Iterator[tuple[Array, int, int]]:
-        """(class numbers, rows repeated from the block before, number of the first
-        row).
+        """Blocks of rows, each preceded by the last rows of the block before.
+
+        The repeated rows hold the upper partners of pairs that cross the border.
+
+        Args:
+            vectors: (m, 2) columns to the right and rows up of the second site of a
+                pair.
+
+        Yields:
+            (class numbers, number of repeated rows, lattice row of the first row).
         """
-        above = int(vectors[:, 1].max())
+        halo = int(vectors[:, 1].max())
         repeated = None
-        rows = max(above, BLOCK_SITES // self.lattice.columns, 1)
+        rows = max(halo, BLOCK_SITES // self.lattice.columns, 1)
         for top, block in self.lattice.blocks(rows):
-            whole = block if repeated is None else np.concatenate([repeated, block])
-            new = len(whole) - len(block)
-            yield whole, new, top - new
-            repeated = whole[-above:].copy()
+            extended = block if repeated is None else np.concatenate([repeated, block])
+            first_new_row = len(extended) - len(block)
+            yield extended, first_new_row, top - first_new_row
+            repeated = extended[-halo:].copy()
 
 
 def _distinct_outlines(
     classes: tuple[PillarClass, ...], used: Array
 ) -> tuple[list[tuple[Array, ...]], Array]:
-    """Distinct contours, and (classes + 1,) number of each class among them from 1 on,
-    0 for unused ones.
+    """Distinct contours of the classes, and which of them each class draws.
+
+    Args:
+        classes: of the plan.
+        used: class numbers, from 1 on, that occur.
+
+    Returns:
+        Cleaned contours of each distinct outline, and (classes + 1,) its number, from 1
+        on, for each class; 0: not used.
+
+    Raises:
+        ProcessError: more than 1500 distinct outlines.
     """
     numbers: dict[bytes, int] = {}
     outlines = []
-    kind = np.zeros(len(classes) + 1, np.int64)
+    outline_of_class = np.zeros(len(classes) + 1, np.int64)
     for k in used.tolist():
         contours = [
             np.ascontiguousarray(contour, np.int64)
@@ -365,22 +453,25 @@ def _distinct_outlines(
         if key not in numbers:
             outlines.append(tuple(clean_contour(contour) for contour in contours))
             numbers[key] = len(outlines)
-        kind[k] = numbers[key]
+        outline_of_class[k] = numbers[key]
     if len(outlines) > MAX_OUTLINES:
         raise ProcessError(
             f"{len(outlines)} distinct outlines, at most {MAX_OUTLINES}; raise diameter_step_nm"
         )
-    return outlines, kind
+    return outlines, outline_of_class
 
 
 def lattice_vectors(lattice: PillarArray, reach: float) -> Array:
-    """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one
-    of each opposite pair.
+    """Lattice vectors shorter than ``reach``, one of each opposite pair.
 
-    The nearest sites on all sides are always among them.
+    The nearest sites on all sides are always included.
 
     Args:
         lattice: of the pillars.
+        reach: database units.
+
+    Returns:
+        (m, 2) columns to the right and rows up.
     """
     nearest = 2 if lattice.centred else 1
     across = max(nearest, int(reach // lattice.pitch))
@@ -424,14 +515,15 @@ def count_pairs(
 def locate_pairs(
     block: Array, new: int, kind: Array, vectors: Array, marked: Array, found: Array
 ) -> int:
-    """Fill ``found`` (n, 3) with row, column, vector of marked pairs; arguments as in
-    :func:`count_pairs`.
+    """Number of marked pairs; row, column and vector of each go to ``found``.
 
     Args:
         block: (rows, columns) class numbers.
         new: first row that counts.
         kind: (classes + 1,) outline number of each class.
-        vectors: (m, 2) columns to the right and rows up.
+        vectors: (m, 2) columns to the right and rows up of the second site.
+        marked: (m, outlines + 1, outlines + 1) kinds of pairs that are listed.
+        found: (n, 3) output; the search ends where it is full.
     """
     rows, columns = block.shape
     count = 0
@@ -455,31 +547,43 @@ def locate_pairs(
 def _check_density(
     plan: MaskPlan, lattice: PillarArray, rules: DesignRules, report: DrcReport
 ) -> Array:
-    """Sites of each class number; windows denser than the rule are entered into the
-    report.
+    """Check the area density in windows of 2 x 2 tiles, which step by one tile.
+
+    Args:
+        plan: areas of the classes.
+        lattice: whose sites are summed.
+        rules: edge of a window and largest density.
+        report: receives the windows denser than the rule, and the largest density.
+
+    Returns:
+        (classes + 1,) number of sites of each class.
     """
-    half = rules.density_window_um * 1e3 / plan.unit_nm / 2
-    across, down = (
-        max(1, round(half / step)) for step in (lattice.pitch, lattice.down)
+    half_window = rules.density_window_um * 1e3 / plan.unit_nm / 2
+    tile_columns, tile_rows = (
+        max(1, round(half_window / step)) for step in (lattice.pitch, lattice.down)
     )
-    tiles = math.ceil(lattice.rows / down) + 1, math.ceil(lattice.columns / across) + 1
+    tiles = (
+        math.ceil(lattice.rows / tile_rows) + 1,
+        math.ceil(lattice.columns / tile_columns) + 1,
+    )
     area = np.array([0.0, *(shape.twice_area / 2 for shape in plan.classes)])
-    counts, covered = np.zeros(len(area), np.int64), np.zeros(tiles)
+    counts = np.zeros(len(area), np.int64)
+    covered = np.zeros(tiles)
     for top, block in lattice.blocks():
-        add_coverage(block, top, area, (down, across), counts, covered)
+        add_coverage(block, top, area, (tile_rows, tile_columns), counts, covered)
     report.shapes += int(counts[1:].sum())
     windows = covered[:-1, :-1] + covered[1:, :-1] + covered[:-1, 1:] + covered[1:, 1:]
-    width, height = 2 * across * lattice.pitch, 2 * down * lattice.down
+    width, height = 2 * tile_columns * lattice.pitch, 2 * tile_rows * lattice.down
     density = windows / (float(width) * height)
     worst = float(density.max(initial=0.0))
     report.maximum_density = max(report.maximum_density, worst)
     dense = np.argwhere(density > rules.maximum_density)
-    shown = []
+    violations = []
     for row, column in dense[:MAX_LISTED].tolist():
-        x = lattice.x0 + column * across * lattice.pitch
-        y = lattice.y0 - row * down * lattice.down
+        x = lattice.x0 + column * tile_columns * lattice.pitch
+        y = lattice.y0 - row * tile_rows * lattice.down
         box = (x, y - height, x + width, y)
-        shown.append(
+        violations.append(
             Violation(
                 "density",
                 box,
@@ -495,7 +599,7 @@ def _check_density(
         layer=layer,
         cell=lattice.name,
         worst=worst,
-        examples=shown,
+        examples=violations,
     )
     return counts
 
@@ -540,15 +644,19 @@ def _check_figures(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> Non
                 polygons.setdefault(layer[0], []).extend(
                     np.asarray(points, np.int64) for points in drawn
                 )
-    for number, merged in polygons.items():
-        _check_merged(merged, rules, {}, number, f"figures of layer {number}", report)
+    for number, drawn_on_layer in polygons.items():
+        _check_merged(
+            drawn_on_layer, rules, {}, number, f"figures of layer {number}", report
+        )
 
 
 def _check_negative_frame(
     plan: MaskPlan, rules: DesignRules, report: DrcReport
 ) -> None:
-    """Frame written around the lattices of a negative tone: its width is a space, its
-    notches are widths.
+    """Check the frame written around the lattices of a negative tone.
+
+    Clear areas remain as structures: a width of the frame counts as a space, a notch of
+    it as a width.
     """
     drawn = [tone.lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     aperture = {
@@ -561,11 +669,11 @@ def _check_negative_frame(
         if figure.name not in (*UNDRAWN, "CLEAR"):
             for layer, polygons in figure.polygons.items():
                 drawn += polygons if layer not in aperture else ()
-    names = {"width": "space", "notch": "width"}
+    rule_names = {"width": "space", "notch": "width"}
     _check_merged(
         drawn,
         rules,
-        names,
+        rule_names,
         plan.classes[0].layer[0],
         "frame of the negative tone",
         report,
@@ -577,40 +685,53 @@ def _check_merged(
     rules: DesignRules,
     names: dict[str, str],
     layer: int,
-    text: str,
+    cell: str,
     report: DrcReport,
 ) -> None:
-    """Widths and notches of the union of polygons; ``names`` renames the rules."""
+    """Report widths and notches below the rules of the union of polygons.
+
+    Args:
+        polygons: (n, 2) corners each, database units.
+        rules: design rules; the limits of the report apply.
+        names: rule that a measured "width" or "notch" is reported as, if another.
+        layer: number of the layer, for the report.
+        cell: what the polygons are, for the report.
+        report: receives the violations.
+    """
     cleaned = (clean_contour(contour) for contour in region.union_contours(polygons))
     contours = [contour for contour in cleaned if len(contour) > 2]
     if not contours:
         return
-    limit = {rule: report.limits[names.get(rule, rule)] for rule in ("width", "notch")}
+    limits_nm = {
+        rule: report.limits[names.get(rule, rule)] for rule in ("width", "notch")
+    }
     unit = report.unit_nm
-    for found in measure_polygon(
-        contours, limit["width"] / unit, limit["notch"] / unit
+    for measurement in measure_polygon(
+        contours, limits_nm["width"] / unit, limits_nm["notch"] / unit
     ):
-        value = found.value * unit
-        if value >= limit[found.rule] - 1e-9:
+        value = measurement.value * unit
+        if value >= limits_nm[measurement.rule] - 1e-9:
             continue
-        rule = names.get(found.rule, found.rule)
-        shown = Violation(rule, found.box, value, limit[found.rule], text)
+        rule = names.get(measurement.rule, measurement.rule)
+        violation = Violation(
+            rule, measurement.box, value, limits_nm[measurement.rule], cell
+        )
         report.measured(rule, value)
-        report.add(rule, 1, layer=layer, cell=text, worst=value, examples=[shown])
+        report.add(rule, 1, layer=layer, cell=cell, worst=value, examples=[violation])
 
 
 def _check_grid(plan: MaskPlan, report: DrcReport) -> None:
     """Classes, lattices and figures with coordinates off the grid."""
     grid = plan.grid
     layer = plan.classes[0].layer[0] if plan.classes else -1
-    for shape in plan.classes:
-        off = _off_grid(shape.polygons, grid)
-        _report_off_grid(off, grid, shape.layer[0], shape.name, report)
+    for pillar in plan.classes:
+        off = _off_grid(pillar.polygons, grid)
+        _report_off_grid(off, grid, pillar.layer[0], pillar.name, report)
     for lattice in plan.lattices:
-        first = np.array([[lattice.x0, lattice.y0]])
+        origin = np.array([[lattice.x0, lattice.y0]])
         steps = np.array([[lattice.pitch, lattice.down]])
-        is_off = bool(_off_grid([first, steps], grid))
-        _report_off_grid([first] if is_off else [], grid, layer, lattice.name, report)
+        is_off = bool(_off_grid([origin, steps], grid))
+        _report_off_grid([origin] if is_off else [], grid, layer, lattice.name, report)
     for figure in plan.figures:
         for number, polygons in figure.polygons.items():
             off = _off_grid(polygons, grid)
@@ -625,51 +746,74 @@ def _off_grid(polygons: Iterable[Array], grid: int) -> list[Array]:
 def _report_off_grid(
     polygons: list[Array], grid: int, layer: int, cell: str, report: DrcReport
 ) -> None:
+    """Report polygons off the grid, each with its box."""
     boxes = (contour_box([points]) for points in polygons)
-    shown = (Violation("off-grid", box, 0.0, float(grid), cell) for box in boxes)
+    violations = (Violation("off-grid", box, 0.0, float(grid), cell) for box in boxes)
     report.add(
-        "off-grid", len(polygons), layer=layer, cell=cell, worst=0.0, examples=shown
+        "off-grid",
+        len(polygons),
+        layer=layer,
+        cell=cell,
+        worst=0.0,
+        examples=violations,
     )
 
 
 def _check_zone(
     plan: MaskPlan, lattice: PillarArray, zone: KeepOutZone, report: DrcReport
 ) -> None:
-    """Pillars that share area with an exclusion zone."""
+    """Report pillars that share area with an exclusion zone.
+
+    Pillars whose box lies inside the zone count at once. Where the box only meets the
+    zone, the area of the intersection decides.
+    """
     scale = 1e3 / plan.unit_nm
     left, bottom = zone.x_um * scale, zone.y_um * scale
     right = left + zone.width_um * scale
     top = bottom + zone.height_um * scale
     box = left, bottom, right, top
-    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
-    for number, places in _sites_near(plan, lattice, box):
-        shape = plan.classes[number - 1]
-        low = shape.outline.min(0) + places
-        high = shape.outline.max(0) + places
+    zone_corners = np.array(
+        [[left, bottom], [right, bottom], [right, top], [left, top]]
+    )
+    for number, sites in _sites_near(plan, lattice, box):
+        pillar = plan.classes[number - 1]
+        low = pillar.outline.min(0) + sites
+        high = pillar.outline.max(0) + sites
         meets = ((low < box[2:]) & (high > box[:2])).all(1)
         inside = ((low >= box[:2]) & (high <= box[2:])).all(1)
         for n in np.flatnonzero(meets & ~inside).tolist():
-            moved = [contour + places[n] for contour in shape.contours]
-            meets[n] = region.overlap_area(moved, [corners]) > 1e-9
-        hit = places[meets]
-        text = f"{shape.name} in {zone.name}"
-        boxes = (_moved_box(shape.outline, x, y) for x, y in hit.tolist())
-        shown = (Violation("exclusion", found, 0.0, 0.0, text) for found in boxes)
+            moved = [contour + sites[n] for contour in pillar.contours]
+            meets[n] = region.overlap_area(moved, [zone_corners]) > 1e-9
+        violating = sites[meets]
+        text = f"{pillar.name} in {zone.name}"
+        boxes = (_moved_box(pillar.outline, x, y) for x, y in violating.tolist())
+        violations = (
+            Violation("exclusion", pillar_box, 0.0, 0.0, text) for pillar_box in boxes
+        )
         report.add(
             "exclusion",
-            len(hit),
-            layer=shape.layer[0],
-            cell=shape.name,
+            len(violating),
+            layer=pillar.layer[0],
+            cell=pillar.name,
             worst=0.0,
-            examples=shown,
+            examples=violations,
         )
 
 
 def _sites_near(
     plan: MaskPlan, lattice: PillarArray, box: tuple[float, float, float, float]
 ) -> Iterator[tuple[int, Array]]:
-    """(class number, (n, 2) places) of the pillars that can reach into a box."""
-    reach = max(int(np.abs(shape.outline).max()) for shape in plan.classes)
+    """Pillars whose outline can reach into a box, class by class.
+
+    Args:
+        plan: outlines of the classes.
+        lattice: whose sites are searched.
+        box: left, bottom, right, top, database units.
+
+    Yields:
+        (class number, (n, 2) x and y of its sites).
+    """
+    reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
     left = max(0, math.floor((box[0] - reach - lattice.x0) / lattice.pitch))
     right = min(
         lattice.columns, math.ceil((box[2] + reach - lattice.x0) / lattice.pitch) + 1
@@ -689,21 +833,24 @@ def _sites_near(
 
 
 def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
-    """Lattices, marks, labels and verniers keep the minimum space from each other, box
-    to box.
+    """Report lattices and figures whose boxes are closer than the minimum space.
+
+    The distance is Euclidean, box to box. Shapes of one figure are not compared with
+    each other.
     """
-    outlines = (int(np.abs(shape.outline).max()) for shape in plan.classes)
-    reach = max(outlines, default=0)
-    names, boxes = [], []
+    reaches = (int(np.abs(pillar.outline).max()) for pillar in plan.classes)
+    reach = max(reaches, default=0)
+    names = []
+    boxes = []
     for lattice in plan.lattices:
-        right = (lattice.columns - 1) * lattice.pitch
-        down = (lattice.rows - 1) * lattice.down
+        width = (lattice.columns - 1) * lattice.pitch
+        height = (lattice.rows - 1) * lattice.down
         names.append(lattice.name)
         boxes.append(
             (
                 lattice.x0 - reach,
-                lattice.y0 - down - reach,
-                lattice.x0 + right + reach,
+                lattice.y0 - height - reach,
+                lattice.x0 + width + reach,
                 lattice.y0 + reach,
             )
         )
@@ -715,25 +862,33 @@ def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> N
     box = np.array(boxes).reshape(-1, 4)
     layer = plan.classes[0].layer[0] if plan.classes else -1
     limit = rules.minimum_gap_nm
-    for one, two in find_close_boxes(box, limit / plan.unit_nm).tolist():
-        across = np.maximum(
-            np.maximum(box[one, :2] - box[two, 2:], box[two, :2] - box[one, 2:]), 0
+    for first, second in find_close_boxes(box, limit / plan.unit_nm).tolist():
+        gaps = np.maximum(
+            np.maximum(
+                box[first, :2] - box[second, 2:], box[second, :2] - box[first, 2:]
+            ),
+            0,
         )
-        value = float(np.hypot(*across)) * plan.unit_nm
-        if names[one] != names[two] and value < limit:
-            around = contour_box([box[[one, two]].reshape(-1, 2)])
-            shown = Violation(
-                "clearance", around, value, limit, f"{names[one]} to {names[two]}"
+        distance_nm = float(np.hypot(*gaps)) * plan.unit_nm
+        if names[first] != names[second] and distance_nm < limit:
+            both = contour_box([box[[first, second]].reshape(-1, 2)])
+            violation = Violation(
+                "clearance",
+                both,
+                distance_nm,
+                limit,
+                f"{names[first]} to {names[second]}",
             )
             report.add(
                 "clearance",
                 1,
                 layer=layer,
-                cell=names[one],
-                worst=value,
-                examples=[shown],
+                cell=names[first],
+                worst=distance_nm,
+                examples=[violation],
             )
 
 
 def _moved_box(outline: Array, x: int, y: int) -> tuple[int, int, int, int]:
+    """Left, bottom, right, top of an outline about the site (x, y)."""
     return contour_box([outline + np.array([x, y])])

@@ -163,10 +163,12 @@ class _Placements:
     xy: Array
 
     def select(self, members: Array) -> "_Placements":
+        """The placements of some indices, or of a mask."""
         return _Placements(self.element[members], self.xy[members])
 
 
 def _concatenate(parts: Sequence[_Placements]) -> _Placements:
+    """Placements of all parts, in their order."""
     element = [np.empty(0, np.int32), *(part.element for part in parts)]
     xy = [np.empty((0, 2), np.int32), *(part.xy for part in parts)]
     return _Placements(np.concatenate(element), np.concatenate(xy))
@@ -190,8 +192,11 @@ class _LayerCheck:
         max_elements: int,
         rule_names: dict[str, str] | None = None,
     ) -> None:
-        self.content, self.layers, self.rules = content, layers, rules
-        self.metric, self.max_elements = metric, max_elements
+        self.content = content
+        self.layers = layers
+        self.rules = rules
+        self.metric = metric
+        self.max_elements = max_elements
         self.rule_names = rule_names or {}
         self.layer = min(layers)[0]
         self.width = rules.minimum_feature_nm / content.unit_nm
@@ -211,37 +216,55 @@ class _LayerCheck:
             for name in self.content.tops
             if self.bounding_box(name) is not None
         ]
-        place = _Placements(
+        placed = _Placements(
             np.array(tops, np.int32), np.zeros((len(tops), 2), np.int32)
         )
-        found = self._check_placements(self.content.tops[0], place)
-        report.shapes += found.shapes
+        top_report = self._check_placements(self.content.tops[0], placed)
+        report.shapes += top_report.shapes
         for rule in ("width", "space"):
             report.measured(
-                self.rule_names.get(rule, rule), getattr(found, f"minimum_{rule}_nm")
+                self.rule_names.get(rule, rule),
+                getattr(top_report, f"minimum_{rule}_nm"),
             )
         self._copy_findings(
-            found, report, UPRIGHT, np.zeros((1, 2), np.int64), names=self.rule_names
+            top_report,
+            report,
+            UPRIGHT,
+            np.zeros((1, 2), np.int64),
+            names=self.rule_names,
         )
         self._check_grid(report)
 
     # hierarchy
 
     def _polygons(self, cell: str) -> list[tuple[Array, Array]]:
-        """Distinct polygons of a cell from their lowest corners, and (n, 2) places of
-        each.
+        """Distinct polygons of a cell on the checked layers, and where each stands.
+
+        Returns:
+            [((corners, 2) polygon with its lowest corner at 0, (n, 2) its places)].
         """
-        every = self.content.cells[cell].drawn().items()
-        drawn = [p for layer, some in every if layer in self.layers for p in some]
-        found = []
-        for _, same in group_equal(np.array([len(points) for points in drawn], int)):
-            points = np.stack([drawn[n] for n in same.tolist()]).astype(np.int64)
+        layers = self.content.cells[cell].drawn().items()
+        polygons = [
+            polygon
+            for layer, drawn in layers
+            if layer in self.layers
+            for polygon in drawn
+        ]
+        distinct_polygons = []
+        for _, indices in group_equal(
+            np.array([len(points) for points in polygons], int)
+        ):
+            points = np.stack([polygons[n] for n in indices.tolist()]).astype(np.int64)
             places = points.min(1)
             outlines = (points - places[:, None]).reshape(len(points), -1)
-            distinct, which = np.unique(outlines, axis=0, return_inverse=True)
-            for number, members in group_equal(which.ravel()):
-                found.append((distinct[number].reshape(-1, 2), places[members]))
-        return found
+            distinct, number_of_polygon = np.unique(
+                outlines, axis=0, return_inverse=True
+            )
+            for number, members in group_equal(number_of_polygon.ravel()):
+                distinct_polygons.append(
+                    (distinct[number].reshape(-1, 2), places[members])
+                )
+        return distinct_polygons
 
     def _references(self, cell: str) -> list[tuple[str, Orientation, Array]]:
         """(referenced cell, orientation, (n, 2) places) of all references that draw on
@@ -267,20 +290,20 @@ class _LayerCheck:
 
     def _contents(self, cell: str, turn: Orientation) -> _Placements:
         """Polygons and references directly in a cell of some orientation."""
-        parts = []
+        numbered = []
         for outline, places in self.polygons(cell):
             number = self._polygon(cell, outline, turn)
             if number >= 0:
-                parts.append((number, places))
-        parts += [
+                numbered.append((number, places))
+        numbered += [
             (self._reference(child, turn.after(own)), places)
             for child, own, places in self.references(cell)
         ]
         placed = []
-        for number, places in parts:
+        for number, places in numbered:
             xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
-            every = np.full(len(xy), number, np.int32)
-            placed.append(_Placements(every, _narrowed(xy)))
+            numbers = np.full(len(xy), number, np.int32)
+            placed.append(_Placements(numbers, _narrowed(xy)))
         return _concatenate(placed)
 
     def _polygon(self, cell: str, outline: Array, turn: Orientation) -> int:
@@ -313,7 +336,14 @@ class _LayerCheck:
         return len(self.elements) - 1
 
     def _expand(self, placed: _Placements) -> _Placements:
-        """References replaced by what their cells hold."""
+        """Replace references by the elements of their cells, one level down.
+
+        Args:
+            placed: references only.
+
+        Raises:
+            MaskFileError: more elements than ``max_elements``.
+        """
         parts = []
         total = 0
         for number, members in group_equal(placed.element):
@@ -338,42 +368,56 @@ class _LayerCheck:
         return self._check_placements(cell, self._contents(cell, UPRIGHT))
 
     def _check_placements(self, cell: str, placed: _Placements) -> DrcReport:
-        """Findings of elements; references that stay isolated count as their cells."""
+        """Report of placed elements of a cell.
+
+        References that are close to anything are expanded, level by level, until only
+        polygons are close. A reference that stays isolated counts as its cell, checked
+        once.
+
+        Args:
+            cell: name of the cell, for the report.
+            placed: polygons and references.
+        """
         report = DrcReport.empty(self.content.unit_nm, self.rules)
         isolated = []
         while True:
             pairs, distance, _ = self._close_pairs(placed)
-            close = np.zeros(len(placed.element), bool)
-            close[pairs[distance < max(self.space, 1.0)]] = True
+            is_close = np.zeros(len(placed.element), bool)
+            is_close[pairs[distance < max(self.space, 1.0)]] = True
             turns = [element.turn for element in self.elements]
-            reference = np.array([turn is not None for turn in turns], bool)[
+            is_reference = np.array([turn is not None for turn in turns], bool)[
                 placed.element
             ]
-            scaled = np.array(
+            is_scaled = np.array(
                 [turn is not None and turn.scale != 1 for turn in turns], bool
             )[placed.element]
-            expanded = reference & (close | scaled)
-            isolated.append(placed.select(~close & ~expanded))
-            if not expanded.any():
+            is_expanded = is_reference & (is_close | is_scaled)
+            isolated.append(placed.select(~is_close & ~is_expanded))
+            if not is_expanded.any():
                 break
             placed = _concatenate(
                 [
-                    placed.select(close & ~reference),
-                    self._expand(placed.select(expanded)),
+                    placed.select(is_close & ~is_reference),
+                    self._expand(placed.select(is_expanded)),
                 ]
             )
         self._check_isolated(_concatenate(isolated), report)
-        self._check_close(cell, placed.select(close), report)
+        self._check_close(cell, placed.select(is_close), report)
         return report
 
     def _close_pairs(self, placed: _Placements) -> tuple[Array, Array, Array]:
-        """(n, 2) pairs with boxes closer than the minimum space; their Euclidean and
-        projected distances.
+        """Pairs of placed elements whose boxes are closer than the minimum space.
+
+        Equal pairs (elements and offset) are measured once.
+
+        Returns:
+            (n, 2) indices of placements, (n,) Euclidean distances and (n,) distances in
+            the projection metric, database units.
         """
         occurs = np.bincount(placed.element, minlength=len(self.elements)) > 0
         elements = [self.elements[number] for number in np.flatnonzero(occurs)]
         element = (np.cumsum(occurs, dtype=np.int32) - 1)[placed.element]
-        corners = [contour_box(one.contours) for one in elements]
+        corners = [contour_box(each.contours) for each in elements]
         boxes = np.array(corners, float).reshape(-1, 4)
         distance = max(self.space, 1.0)
         pairs = find_close_boxes(boxes, distance, which=element, shift=placed.xy)
@@ -391,28 +435,37 @@ class _LayerCheck:
         references.
         """
         for number, members in group_equal(placed.element):
-            element, places = self.elements[number], placed.xy[members]
+            element = self.elements[number]
+            places = placed.xy[members]
             if element.turn is None:
                 report.shapes += len(members)
                 self._check_polygon(number, places, report)
                 continue
-            found = self.check_cell(element.cell)
-            report.shapes += found.shapes * len(members)
-            report.measured("width", found.minimum_width_nm)
-            report.measured("space", found.minimum_space_nm)
-            self._copy_findings(found, report, element.turn, places)
+            cell_report = self.check_cell(element.cell)
+            report.shapes += cell_report.shapes * len(members)
+            report.measured("width", cell_report.minimum_width_nm)
+            report.measured("space", cell_report.minimum_space_nm)
+            self._copy_findings(cell_report, report, element.turn, places)
 
     def _copy_findings(
         self,
-        found: DrcReport,
+        cell_report: DrcReport,
         report: DrcReport,
         turn: Orientation,
         places: Array,
         names: dict[str, str] | None = None,
     ) -> None:
-        """Count the findings of a cell for all its instances; list the first."""
+        """Count the violations of a cell for all its instances, and list some of them.
+
+        Args:
+            cell_report: of one instance.
+            report: receives the violations.
+            turn: orientation of the instances.
+            places: (n, 2) places of the instances.
+            names: {rule: name under which it is reported}; None: no rule is renamed.
+        """
         names = names or {}
-        for (rule, layer, cell), tally in found.tallies.items():
+        for (rule, layer, cell), tally in cell_report.tallies.items():
             rule = names.get(rule, rule)
             report.add(
                 rule,
@@ -422,56 +475,70 @@ class _LayerCheck:
                 worst=tally.worst,
             )
         copies = f"; in each of {len(places):,} instances" if len(places) > 1 else ""
-        shown: dict[str, list[Violation]] = {}
-        for violation in found.violations:
-            shown.setdefault(names.get(violation.rule, violation.rule), []).append(
-                violation
-            )
-        for rule, violations in shown.items():
+        violations_of_rule: dict[str, list[Violation]] = {}
+        for violation in cell_report.violations:
+            violations_of_rule.setdefault(
+                names.get(violation.rule, violation.rule), []
+            ).append(violation)
+        for rule, violations in violations_of_rule.items():
             report.list_violations(
                 rule, _instance_violations(rule, violations, turn, places, copies)
             )
 
     def _measure_element(self, number: int) -> list[ShapeMeasurement]:
+        """Widths and notches of an element, each element once."""
         return measure_polygon(self.elements[number].designed, self.width, self.space)
 
     def _check_polygon(self, number: int, places: Array, report: DrcReport) -> None:
-        """Widths and notches of one polygon at (n, 2) places."""
-        element, unit = self.elements[number], self.content.unit_nm
+        """Report widths, notches and corners of one polygon, at each of its places.
+
+        Where only corners rounded after a rotation are known, values within
+        ``GRID_TOLERANCE`` of the limit pass.
+
+        Args:
+            number: of the element.
+            places: (n, 2) places.
+            report: receives the violations.
+        """
+        element = self.elements[number]
+        unit = self.content.unit_nm
         tolerance = (
             GRID_TOLERANCE * unit
             if element.rounded and element.designed is element.contours
             else 0.0
         )
-        for found in self.measure_element(number):
-            limit = report.limits[found.rule]
-            value = found.value * report.scale(found.rule)
-            if found.rule == "width" or value < limit - tolerance - 1e-9:
-                report.measured(found.rule, value)
+        for measurement in self.measure_element(number):
+            limit = report.limits[measurement.rule]
+            value = measurement.value * report.scale(measurement.rule)
+            if measurement.rule == "width" or value < limit - tolerance - 1e-9:
+                report.measured(measurement.rule, value)
             if value >= limit - tolerance - 1e-9:
                 continue
             box = np.array(
-                contour_box(element.contours) if element.rounded else found.box
+                contour_box(element.contours) if element.rounded else measurement.box
             )
             boxes = (
                 tuple((box + np.array([x, y, x, y])).tolist())
                 for x, y in places.tolist()
             )
-            shown = (
-                Violation(found.rule, box, value, limit, element.cell) for box in boxes
+            violations = (
+                Violation(measurement.rule, box, value, limit, element.cell)
+                for box in boxes
             )
             report.add(
-                found.rule,
+                measurement.rule,
                 len(places),
                 layer=self.layer,
                 cell=element.cell,
                 worst=value,
-                examples=shown,
+                examples=violations,
             )
 
     def _check_close(self, cell: str, placed: _Placements, report: DrcReport) -> None:
-        """Merge polygons that touch; then widths and notches of each, and the space of
-        each close pair.
+        """Check elements close to others: merge those that touch, then measure.
+
+        Reported are widths and notches of each merged polygon, and the space of each
+        close pair in the metric of the check.
         """
         report.shapes += len(placed.element)
         pairs, distance, projected = self._close_pairs(placed)
@@ -480,23 +547,26 @@ class _LayerCheck:
             pairs, distance, projected = self._close_pairs(placed)
         for number, members in group_equal(placed.element):
             self._check_polygon(number, placed.xy[members], report)
-        unit, limit = self.content.unit_nm, report.limits["space"]
-        rounded = np.array([element.rounded for element in self.elements], bool)[
+        unit = self.content.unit_nm
+        limit = report.limits["space"]
+        is_rounded = np.array([element.rounded for element in self.elements], bool)[
             placed.element
         ]
-        tolerance = GRID_TOLERANCE * unit * rounded[pairs].any(1)
+        tolerance = GRID_TOLERANCE * unit * is_rounded[pairs].any(1)
         value = unit * (distance if self.metric == "euclidean" else projected)
-        bad = (value < limit - tolerance - 1e-9) & (distance > 0)
-        worst = float(value[bad].min(initial=np.inf))
+        violating = (value < limit - tolerance - 1e-9) & (distance > 0)
+        worst = float(value[violating].min(initial=np.inf))
         report.measured("space", worst)
-        shown = self._space_violations(placed, pairs[bad], value[bad], limit)
+        violations = self._space_violations(
+            placed, pairs[violating], value[violating], limit
+        )
         report.add(
             "space",
-            int(bad.sum()),
+            int(violating.sum()),
             layer=self.layer,
             cell=cell,
             worst=worst,
-            examples=shown,
+            examples=violations,
         )
 
     def _space_violations(
@@ -508,8 +578,8 @@ class _LayerCheck:
                 self.elements[number] for number in placed.element[pair].tolist()
             ]
             moved = [
-                e.contours[0] + xy
-                for e, xy in zip(elements, placed.xy[pair], strict=True)
+                element.contours[0] + xy
+                for element, xy in zip(elements, placed.xy[pair], strict=True)
             ]
             text = f"{elements[0].cell} to {elements[1].cell}, layer {self.layer}"
             yield Violation("space", contour_box(moved), value, limit, text)
@@ -517,15 +587,24 @@ class _LayerCheck:
     def _merge_touching(
         self, cell: str, placed: _Placements, pairs: Array
     ) -> _Placements:
-        """Replace polygons that touch by their union."""
+        """Replace each group of connected polygons by their union.
+
+        Args:
+            cell: name of the cell, for the report.
+            placed: polygons.
+            pairs: (n, 2) placements that touch or overlap.
+
+        Returns:
+            Polygons that touch nothing, and the unions.
+        """
         count = len(placed.element)
         graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (count, count))
-        label = connected_components(graph, directed=False)[1]
-        single = np.bincount(label)[label] == 1
-        order = np.argsort(label, kind="stable")
-        order = order[~single[order]]
-        merged = []
-        for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        component = connected_components(graph, directed=False)[1]
+        is_single = np.bincount(component)[component] == 1
+        order = np.argsort(component, kind="stable")
+        order = order[~is_single[order]]
+        numbers = []
+        for members in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
             elements = [
                 self.elements[number] for number in placed.element[members].tolist()
             ]
@@ -536,13 +615,13 @@ class _LayerCheck:
             ]
             contours = _merged_contours(moved)
             rounded = any(element.rounded for element in elements)
-            merged.append(
+            numbers.append(
                 self._add_element(_Element(cell, None, contours, contours, rounded))
             )
         union = _Placements(
-            np.array(merged, np.int32), np.zeros((len(merged), 2), np.int32)
+            np.array(numbers, np.int32), np.zeros((len(numbers), 2), np.int32)
         )
-        return _concatenate([placed.select(single), union])
+        return _concatenate([placed.select(is_single), union])
 
     # grid
 
@@ -560,14 +639,14 @@ class _LayerCheck:
             instances[name][UPRIGHT, 0.0, 0.0] = [1, 0, 0]
         for name in self.content.topological_order():
             for (turn, *phase), (times, x, y) in instances[name].items():
-                for child, own, places in self.references(name):
+                for child, child_turn, places in self.references(name):
                     xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
                     phases = np.round(np.mod(xy + phase, step), 6) % step
                     distinct, example, which = _distinct_rows(phases)
                     for row, first, count in zip(
                         distinct, xy[example], np.bincount(which), strict=True
                     ):
-                        key = (turn.after(own), *row.tolist())
+                        key = (turn.after(child_turn), *row.tolist())
                         entry = instances[child].setdefault(
                             key, [0, x + int(first[0]), y + int(first[1])]
                         )
@@ -583,8 +662,16 @@ class _LayerCheck:
         instances: tuple[int, int, int],
         report: DrcReport,
     ) -> None:
-        """Polygons off the grid (step, x, y) in one of several alike instances (number,
-        x and y of the first).
+        """Report polygons off the grid of a cell, for equal instances at once.
+
+        Instances are equal where orientation and position modulo the grid are.
+
+        Args:
+            cell: name of the cell.
+            turn: orientation of the instances.
+            grid: step, and x and y of the instances modulo the step, database units.
+            instances: their number, and x and y of the first.
+            report: receives the violations.
         """
         step, *phase = grid
         times, x, y = instances
@@ -593,21 +680,24 @@ class _LayerCheck:
             corners = np.column_stack(turn.apply(*outline.T)) + phase
             xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
             residue = np.mod(xy[:, None] + corners, step)
-            off = (np.minimum(residue, step - residue) > 1e-6).any((1, 2))
+            is_off = (np.minimum(residue, step - residue) > 1e-6).any((1, 2))
             box = np.array(
                 contour_box([np.column_stack(turn.apply(*outline.T)).astype(np.int64)])
             )
             boxes = (
-                tuple((box + (u + x, v + y) * 2).tolist()) for u, v in xy[off].tolist()
+                tuple((box + (u + x, v + y) * 2).tolist())
+                for u, v in xy[is_off].tolist()
             )
-            shown = (Violation("off-grid", found, 0.0, limit, cell) for found in boxes)
+            violations = (
+                Violation("off-grid", at_box, 0.0, limit, cell) for at_box in boxes
+            )
             report.add(
                 "off-grid",
-                times * int(off.sum()),
+                times * int(is_off.sum()),
                 layer=self.layer,
                 cell=cell,
                 worst=0.0,
-                examples=shown,
+                examples=violations,
             )
 
 
@@ -644,10 +734,17 @@ def _turned_box(
 
 
 def _distinct_rows(rows: Array) -> tuple[Array, Array, Array]:
-    """Distinct rows, an index of each, and (n,) which of them each row is."""
-    which = np.zeros(len(rows), np.int64)
+    """Distinct rows of an array.
+
+    Returns:
+        (k, columns) distinct rows, (k,) an index of each, and (n,) which of them each
+        row equals.
+    """
+    number_of_row = np.zeros(len(rows), np.int64)
     for column in rows.T:
         values, rank = np.unique(column, return_inverse=True)
-        which = np.unique(which * len(values) + rank, return_inverse=True)[1]
-    _, example = np.unique(which, return_index=True)
-    return rows[example], example, which
+        number_of_row = np.unique(
+            number_of_row * len(values) + rank, return_inverse=True
+        )[1]
+    _, example = np.unique(number_of_row, return_index=True)
+    return rows[example], example, number_of_row

@@ -47,13 +47,13 @@ def compare(plan: MaskPlan, content: MaskLibrary) -> ReadbackComparison:
         plan: that was written.
         content: of the file; of cells with many placements the sums are enough.
     """
-    found = mask_differences(library_of(plan), content)
+    differences = mask_differences(library_of(plan), content)
     try:
         times = content.drawn_counts()
     except MaskFileError as error:
-        return ReadbackComparison(0, (*found, str(error)))
-    pillars = sum(times.get(c.name, 0) for c in plan.classes)
-    return ReadbackComparison(pillars, tuple(found))
+        return ReadbackComparison(0, (*differences, str(error)))
+    pillars = sum(times.get(pillar.name, 0) for pillar in plan.classes)
+    return ReadbackComparison(pillars, tuple(differences))
 
 
 def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
@@ -65,42 +65,51 @@ def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
         library: that was written.
         content: of the file.
     """
-    found = []
+    differences = []
     if abs(content.unit_nm / library.unit_nm - 1) > 1e-12:
-        found.append(f"database unit {content.unit_nm} nm, planned {library.unit_nm}")
+        differences.append(
+            f"database unit {content.unit_nm} nm, planned {library.unit_nm}"
+        )
     missing = sorted(library.cells.keys() - content.cells.keys())
-    strange = sorted(content.cells.keys() - library.cells.keys())
-    if missing or strange:
-        names = ", ".join([*missing, *strange][:5])
+    extra = sorted(content.cells.keys() - library.cells.keys())
+    if missing or extra:
+        names = ", ".join([*missing, *extra][:5])
         return [
-            *found,
-            f"{len(missing)} cells are missing, {len(strange)} too many: {names}",
+            *differences,
+            f"{len(missing)} cells are missing, {len(extra)} too many: {names}",
         ]
     for name, cell in library.cells.items():
         read = content.cells[name]
-        found += shape_differences(cell, read)
+        differences += shape_differences(cell, read)
         merged = read.sums is not None
-        planned = _sums(cell, merged=merged)
-        there = _sums(read, merged=merged)
-        for who in sorted(planned.keys() | there.keys(), key=str):
-            wanted = planned.get(who, (0,) * 5)
-            got = there.get(who, (0,) * 5)
-            if wanted != got:
-                found.append(f"cell {name}: {who[0]}: {_difference(wanted, got)}")
-    return found
+        planned_sums = _sums(cell, merged=merged)
+        read_sums = _sums(read, merged=merged)
+        for child in sorted(planned_sums.keys() | read_sums.keys(), key=str):
+            expected = planned_sums.get(child, (0,) * 5)
+            actual = read_sums.get(child, (0,) * 5)
+            if expected != actual:
+                differences.append(
+                    f"cell {name}: {child[0]}: {_difference(expected, actual)}"
+                )
+    return differences
 
 
-def _difference(planned: Sum, found: Sum) -> str:
+def _difference(planned: Sum, read: Sum) -> str:
     """What differs between the sums of a child, in words."""
-    (n, x, y, turned, _), (m, u, v, turned_there, _) = planned, found
-    if turned != turned_there:
-        return f"{turned_there} copies are turned, planned {turned}"
-    if abs(n - m) == 1:
-        sign, what = (1, "one is missing") if n > m else (-1, "one too many")
-        return f"{what}, at ({sign * (x - u)}, {sign * (y - v)})"
-    if n != m:
-        return f"{m} copies, planned {n}"
-    return f"{n} copies, not all at their places"
+    (count, x, y, turned, _), (read_count, read_x, read_y, read_turned, _) = (
+        planned,
+        read,
+    )
+    if turned != read_turned:
+        return f"{read_turned} copies are turned, planned {turned}"
+    if abs(count - read_count) == 1:
+        sign, text = (
+            (1, "one is missing") if count > read_count else (-1, "one too many")
+        )
+        return f"{text}, at ({sign * (x - read_x)}, {sign * (y - read_y)})"
+    if count != read_count:
+        return f"{read_count} copies, planned {count}"
+    return f"{count} copies, not all at their places"
 
 
 def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
@@ -110,7 +119,7 @@ def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
         planned: that was written.
         read: of the file.
     """
-    wanted, there = (
+    expected, actual = (
         Counter(
             (layer, _canonical_corners(points))
             for layer, shapes in cell.drawn().items()
@@ -118,23 +127,26 @@ def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
         )
         for cell in (planned, read)
     )
-    found = []
-    for rest, text in ((wanted - there, "missing"), (there - wanted, "not planned")):
-        layers = Counter(layer for layer, _ in rest.elements())
-        found += [
+    differences = []
+    for remainder, text in (
+        (expected - actual, "missing"),
+        (actual - expected, "not planned"),
+    ):
+        layers = Counter(layer for layer, _ in remainder.elements())
+        differences += [
             f"cell {planned.name}, layer {layer}/{datatype}: {count} polygons {text}"
             for (layer, datatype), count in sorted(layers.items())
         ]
-    return found
+    return differences
 
 
 def _canonical_corners(points: Array) -> bytes:
     """Corners from the smallest on, counter-clockwise."""
-    p = np.asarray(points, np.int64)
-    if polygon.twice_area(p) < 0:
-        p = p[::-1]
-    first = int(np.lexsort((p[:, 1], p[:, 0]))[0])
-    return np.roll(p, -first, axis=0).tobytes()
+    corners = np.asarray(points, np.int64)
+    if polygon.twice_area(corners) < 0:
+        corners = corners[::-1]
+    first = int(np.lexsort((corners[:, 1], corners[:, 0]))[0])
+    return np.roll(corners, -first, axis=0).tobytes()
 
 
 def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
@@ -145,8 +157,8 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
         merged: all orientations together, as a reader sums them.
     """
     if cell.sums is not None:
-        every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
-        return {(child, None): tuple(sums) for child, *sums in every}
+        rows = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
+        return {(child, None): tuple(sums) for child, *sums in rows}
     digests: dict[Who, RunningDigest] = {}
     for child, turn, x, y in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)

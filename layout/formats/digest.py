@@ -18,7 +18,7 @@ _FIRST, _SECOND, _THIRD = (
 )
 _ROOM = 256
 _MOST = 1 << 24  # children
-_OTHER = 8  # turns from here on are no quarter turns: alike in the hash
+_OTHER = 8  # turns from here on are no quarter turns: equal in the hash
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,10 +44,8 @@ class RunningDigest:
     """Running sums over placements; children are numbered from any integer."""
 
     def __init__(self) -> None:
-        self._sums, self._hashes = (
-            np.zeros((_ROOM, 4), np.int64),
-            np.zeros(_ROOM, np.uint64),
-        )
+        self._sums = np.zeros((_ROOM, 4), np.int64)
+        self._hashes = np.zeros(_ROOM, np.uint64)
 
     def take(self, child: Array, x: Array, y: Array, turn: Array) -> None:
         """Add placements: (n,) numbers, places and turns (0: as it is)."""
@@ -84,6 +82,7 @@ class RunningDigest:
         return PlacementDigest(count, x, y, turned, self._hashes[slot])
 
     def _grow(self, size: int) -> None:
+        """Make room for ``size`` slots; refuse more than 2^24."""
         if size > _MOST:
             raise MaskFileError(
                 f"cells numbered beyond {_MOST // 2}: too many for sums; read all placements"
@@ -96,7 +95,7 @@ class RunningDigest:
 
 @compile_loop
 def _mixed(x: int, y: int) -> np.uint64:
-    """splitmix64 of x and y side by side."""
+    """splitmix64 hash of x and y, 32 bits each."""
     z = (np.uint64(x & 0xFFFFFFFF) << np.uint64(32)) | np.uint64(y & 0xFFFFFFFF)
     z = z + _FIRST
     z = (z ^ (z >> np.uint64(30))) * _SECOND
@@ -108,25 +107,45 @@ def _mixed(x: int, y: int) -> np.uint64:
 def _take(
     slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Array
 ) -> None:
+    """Add placements to the sums of their slots, in place.
+
+    Args:
+        slot: (n,) slot of each child.
+        x, y: (n,) places.
+        turn: (n,) orientations, 0: as it is.
+        sums: (slots, 4) count, sum of x, sum of y, number turned.
+        hashes: (slots,) sum of the hashes of the places.
+    """
     for n in range(slot.shape[0]):
-        k = slot[n]
-        sums[k, 0] += 1
-        sums[k, 1] += x[n]
-        sums[k, 2] += y[n]
-        sums[k, 3] += turn[n] != 0
-        hashes[k] += _mixed(x[n], y[n]) * np.uint64(2 * min(turn[n], _OTHER) + 1)
+        number = slot[n]
+        sums[number, 0] += 1
+        sums[number, 1] += x[n]
+        sums[number, 2] += y[n]
+        sums[number, 3] += turn[n] != 0
+        hashes[number] += _mixed(x[n], y[n]) * np.uint64(2 * min(turn[n], _OTHER) + 1)
 
 
 @compile_loop
 def _sites(
     block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array
 ) -> None:
+    """Add the sites of a block of class numbers to the sums of their slots, in place.
+
+    Args:
+        block: (rows, columns) class numbers; 0: no pillar.
+        x0, y0: first site; rows run towards -y.
+        pitch: from column to column.
+        down: from row to row.
+        sums: (slots, 4) count, sum of x, sum of y, number turned.
+        hashes: (slots,) sum of the hashes of the places.
+    """
     for row in range(block.shape[0]):
         y = y0 - row * down
         for column in range(block.shape[1]):
             if block[row, column]:
-                k, x = 2 * block[row, column], x0 + column * pitch
-                sums[k, 0] += 1
-                sums[k, 1] += x
-                sums[k, 2] += y
-                hashes[k] += _mixed(x, y)
+                number = 2 * block[row, column]
+                x = x0 + column * pitch
+                sums[number, 0] += 1
+                sums[number, 1] += x
+                sums[number, 2] += y
+                hashes[number] += _mixed(x, y)

@@ -44,19 +44,24 @@ class DxfWindow:
 
 
 def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
-    """Write the pillars whose site lies in the window, and all figures; the number of
-    pillars.
+    """Write the pillars whose site lies in a window, and all figures, as DXF.
 
     Args:
         plan: of a die.
         path: of the file.
+        window: of the mask.
+
+    Returns:
+        Number of pillars.
 
     Raises:
         ProcessError: more than 200 000 pillars in the window, or ezdxf is not
             installed.
         OSError: the target cannot be written.
     """
-    sites = [s for lattice in plan.lattices for s in sites_in(plan, lattice, window)]
+    sites = [
+        site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
+    ]
     if len(sites) > MOST_PILLARS:
         raise ProcessError(
             f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
@@ -66,9 +71,10 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
     with _fixed_stamps():
         drawing = _ezdxf().new("R2000", units=_UM)
         for n, (layer, name) in enumerate(names.items()):
-            made = drawing.layers.add(name, color=1 + n % _COLOURS)
-            made.description = f"{layer[0]}/{layer[1]}"
-        space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
+            dxf_layer = drawing.layers.add(name, color=1 + n % _COLOURS)
+            dxf_layer.description = f"{layer[0]}/{layer[1]}"
+        space = drawing.modelspace()
+        scale = plan.unit_nm * 1e-3
         for layer, shapes in _drawn(plan, window).polygons.items():
             for points in shapes:
                 space.add_lwpolyline(
@@ -116,6 +122,7 @@ def dxf_differences(
 
 
 def _ezdxf() -> Any:
+    """The module ezdxf, which is an optional dependency."""
     try:
         import ezdxf
     except ImportError:
@@ -143,11 +150,12 @@ def _fixed_stamps() -> Iterator[None]:
 def sites_in(
     plan: MaskPlan, lattice: PillarArray, window: DxfWindow
 ) -> Iterator[tuple[int, int, int]]:
-    """(class, x, y) of the pillars whose site lies in the window, database units.
+    """(class, x, y) of the pillars whose site lies in a window, database units.
 
     Args:
         plan: of a die.
         lattice: one of its lattices.
+        window: of the mask.
     """
     scale = 1e3 / plan.unit_nm
     half = window.size_um / 2
@@ -169,6 +177,7 @@ def sites_in(
 
 
 def _ceil(distance: float, pitch: int, count: int) -> int:
+    """Number of sites before a distance, from 0 to ``count``."""
     return int(np.clip(np.ceil(distance / pitch), 0, count))
 
 
@@ -176,10 +185,10 @@ def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
     """Everything that is written: the pillars of the window and all figures."""
     shapes: dict[LayerNumber, list[Array]] = {}
     for lattice in plan.lattices:
-        for k, x, y in sites_in(plan, lattice, window):
-            made = plan.classes[k - 1]
-            moved = [points + np.array([x, y]) for points in made.polygons]
-            shapes.setdefault(made.layer, []).extend(moved)
+        for number, x, y in sites_in(plan, lattice, window):
+            pillar = plan.classes[number - 1]
+            moved = [points + np.array([x, y]) for points in pillar.polygons]
+            shapes.setdefault(pillar.layer, []).extend(moved)
     for figure in plan.figures:
         for layer, polygons in figure.polygons.items():
             shapes.setdefault(layer, []).extend(polygons)
@@ -188,17 +197,17 @@ def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
 
 def _names(plan: MaskPlan) -> dict[LayerNumber, str]:
     """{(layer, datatype): DXF layer}, each its own."""
-    used = {made.layer for made in plan.classes} | {
+    used = {pillar.layer for pillar in plan.classes} | {
         layer for figure in plan.figures for layer in figure.polygons
     }
-    found: dict[LayerNumber, str] = {}
+    names: dict[LayerNumber, str] = {}
     for layer in sorted(used):
         name = (
             plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}")
             .upper()
             .replace(".", "_")
         )
-        found[layer] = (
-            name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
+        names[layer] = (
+            name if name not in names.values() else f"{name}_L{layer[0]}D{layer[1]}"
         )
-    return found
+    return names

@@ -56,11 +56,13 @@ def placement_limit(path: Path) -> int:
 
 
 def release_bytes(data: Array, end: int) -> None:
-    """Give back the memory of the bytes before ``end`` of a mapped file; they are read
-    again if they are looked at.
+    """Give back the memory of the bytes before ``end`` of a mapped file.
+
+    They are read again if they are looked at.
 
     Args:
         data: from :func:`map_bytes`.
+        end: byte after the last.
     """
     base: object = data.base.obj if isinstance(data.base, memoryview) else data.base
     if (

@@ -45,13 +45,13 @@ def read_gdsii(
 def parse_gdsii(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read_gdsii`, from the bytes of a GDSII stream as uint8; ``where`` names them
-    in errors.
+    """Read a GDSII stream from its bytes, as :func:`read_gdsii`.
 
     Args:
         data: bytes, uint8.
         limit: most placements that are read.
         keep: most placements of one structure that are kept; None: all.
+        where: name of the bytes in errors.
     """
     return _Reader(where, data, limit, keep).library()
 
@@ -60,19 +60,18 @@ class _Reader:
     """A cursor over the records."""
 
     def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
-        self.path, self.data, self.at, self.limit, self.keep = (
-            path,
-            data,
-            0,
-            limit,
-            keep,
-        )
+        self.path = path
+        self.data = data
+        self.at = 0
+        self.limit = limit
+        self.keep = keep
         self.begin = 0  # of the latest record
         self.placed = 0
         self.number_of: dict[str, int] = {}  # structures by first reference
         self.names: list[str] = []
 
     def fail(self, text: str, at: int | None = None) -> MaskFileError:
+        """An error that names the file and the byte."""
         return MaskFileError(
             f"{self.path}: byte {self.begin if at is None else at}: {text}"
         )
@@ -81,7 +80,8 @@ class _Reader:
         """Kind and data of the next record, which must be one of ``wanted`` (any, if
         none is named).
         """
-        self.begin, left = self.at, len(self.data) - self.at
+        self.begin = self.at
+        left = len(self.data) - self.at
         if left < 4:
             raise self.fail(
                 f"the file ends within a record ({left} bytes left); it is cut"
@@ -105,6 +105,7 @@ class _Reader:
         return kind, self.data[self.begin + 4 : self.at].tobytes()
 
     def library(self) -> MaskLibrary:
+        """Read the whole stream, from HEADER to ENDLIB."""
         self.next(gds.HEADER)
         self.next(gds.BGNLIB)
         while self.next()[0] != gds.LIBNAME:
@@ -115,7 +116,8 @@ class _Reader:
             kind, data = self.next()
         if kind != gds.UNITS or len(data) != 16:
             raise self.fail("UNITS of two numbers is missing")
-        user, meters = gds.to_float(data[:8]), gds.to_float(data[8:])
+        user = gds.to_float(data[:8])
+        meters = gds.to_float(data[8:])
         if not (1e-15 < meters < 1 and user > 0):
             raise self.fail(f"database unit of {meters} m")
         cells: dict[str, MaskCell] = {}
@@ -130,18 +132,21 @@ class _Reader:
         return MaskLibrary("", cells, meters * 1e9, kind="GDSII")
 
     def name(self, data: bytes) -> str:
+        """Name of a structure; refuse an empty name."""
         text = decode_name(data)
         if not text:
             raise self.fail("a structure or reference without a name")
         return text
 
     def number(self, name: str) -> int:
+        """Number of a structure, in the order of first reference."""
         if name not in self.number_of:
             self.number_of[name] = len(self.names)
             self.names.append(name)
         return self.number_of[name]
 
     def structure(self) -> MaskCell:
+        """Read a structure, from STRNAME to ENDSTR."""
         name = self.name(self.next(gds.STRNAME)[1])
         cell = OpenCell(name, PlacementSums(self.keep))
         while True:
@@ -164,6 +169,7 @@ class _Reader:
                     self.refuse_outside_element()
 
     def refuse_outside_element(self) -> None:
+        """Refuse a record that cannot be within an element."""
         kind = int(self.data[self.begin + 2])
         if kind in _SHAPES or kind in (gds.BGNSTR, gds.ENDSTR, gds.ENDLIB, gds.HEADER):
             raise self.fail(f"{gds.NAMES[kind]} within an element; ENDEL is missing")
@@ -181,6 +187,7 @@ class _Reader:
             self.count(len(child))
 
     def count(self, more: int) -> None:
+        """Add to the placements of the file; refuse more than the limit."""
         self.placed += more
         if self.placed > self.limit:
             raise self.fail(
@@ -190,25 +197,25 @@ class _Reader:
 
     def fields(self) -> dict[int, bytes]:
         """{kind: data} up to ENDEL."""
-        found: dict[int, bytes] = {}
+        records: dict[int, bytes] = {}
         while True:
             kind, data = self.next()
             if kind == gds.ENDEL:
-                return found
+                return records
             self.refuse_outside_element()
             if kind == gds.XY:  # writers split long outlines over several records
-                found[kind] = found.get(kind, b"") + data
+                records[kind] = records.get(kind, b"") + data
                 continue
-            if kind in found and kind not in (gds.PROPATTR, gds.PROPVALUE):
+            if kind in records and kind not in (gds.PROPATTR, gds.PROPVALUE):
                 raise self.fail(
                     f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice"
                 )
-            found[kind] = data
+            records[kind] = data
 
-    def numbers(self, found: dict[int, bytes], kind: int, count: int | None) -> Array:
+    def numbers(self, records: dict[int, bytes], kind: int, count: int | None) -> Array:
         """Integers of a record that an element needs."""
         size = 4 if kind == gds.XY else 2
-        data = found.get(kind)
+        data = records.get(kind)
         if (
             data is None
             or len(data) % size
@@ -219,111 +226,128 @@ class _Reader:
 
     def boundary(self, kind: int) -> tuple[tuple[int, int], Array]:
         """Layer and corners of an outline, closed where the file leaves it open."""
-        found = self.fields()
-        layer = int(self.numbers(found, gds.LAYER, 1)[0])
+        records = self.fields()
+        layer = int(self.numbers(records, gds.LAYER, 1)[0])
         datatype = int(
             self.numbers(
-                found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
+                records, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
             )[0]
         )
-        points = self.points(found)
+        points = self.points(records)
         closed = len(points) > 1 and (points[0] == points[-1]).all()
         return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1] if closed else points
 
-    def points(self, found: dict[int, bytes]) -> Array:
+    def points(self, records: dict[int, bytes]) -> Array:
         """(n, 2) points of an element, n >= 1."""
-        numbers = self.numbers(found, gds.XY, None)
+        numbers = self.numbers(records, gds.XY, None)
         if len(numbers) % 2 or not len(numbers):
             raise self.fail(f"element with {len(numbers)} coordinates, need pairs")
         return numbers.reshape(-1, 2)
 
     def reference(self, cell: OpenCell, kind: int) -> None:
+        """Read SREF or AREF, and place its copies in the cell."""
         start = self.begin
-        found = self.fields()
-        number = self.number(self.name(found.get(gds.SNAME, b"")))
-        turn = self.turn(found, start)
-        xy = self.numbers(found, gds.XY, 2 if kind == gds.SREF else 6)
+        records = self.fields()
+        number = self.number(self.name(records.get(gds.SNAME, b"")))
+        turn = self.turn(records, start)
+        xy = self.numbers(records, gds.XY, 2 if kind == gds.SREF else 6)
         if kind == gds.SREF:
             cell.place(number, xy[:1], xy[1:], turn)
             return
-        for x, y in self.array(found, xy, start):
+        for x, y in self.array(records, xy, start):
             cell.place(number, x, y, turn)
 
     def array(
-        self, found: dict[int, bytes], xy: Array, start: int
+        self, records: dict[int, bytes], xy: Array, start: int
     ) -> Iterator[tuple[Array, Array]]:
-        """Places of an array of references, some rows at a time, so that no memory is
-        taken before it is counted.
+        """Places of an array of references, some rows at a time.
 
-        Steps are parts of its ends: where they are no whole units, each copy stands on
-        the unit next to its place.
+        The file states three corners; steps are the sides over columns and rows. Where
+        they are no whole units, each copy stands on the unit nearest to its place.
+
+        Args:
+            records: {kind: data} of the element.
+            xy: (6,) corners.
+            start: byte of the element, for messages.
+
+        Yields:
+            (n,) x and (n,) y.
         """
-        columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
+        columns, rows = (int(size) for size in self.numbers(records, gds.COLROW, 2))
         if columns < 1 or rows < 1:
             raise self.fail(f"array of {columns} x {rows}", start)
         self.count(columns * rows)
-        across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
+        across, up = xy[2:4] - xy[:2], xy[4:] - xy[:2]
         ends = [
-            xy[:2] + across * i + along * j
+            xy[:2] + across * i + up * j
             for i in (0, 1 - 1 / columns)
             for j in (0, 1 - 1 / rows)
         ]
         if np.abs(ends).max() > FARTHEST:
             raise self.fail("array that reaches beyond 32 bits", start)
         i = np.arange(columns)
-        for part in np.array_split(np.arange(rows), -(-columns * rows // _AT_ONCE)):
-            off = (
-                part[:, None] * along[k] / rows + i * across[k] / columns
-                for k in (0, 1)
+        for part_rows in np.array_split(
+            np.arange(rows), -(-columns * rows // _AT_ONCE)
+        ):
+            offsets = (
+                part_rows[:, None] * up[axis] / rows + i * across[axis] / columns
+                for axis in (0, 1)
             )
             x, y = (
-                xy[k] + np.floor(v + 0.5).astype(np.int64).ravel()
-                for k, v in enumerate(off)
+                xy[axis] + np.floor(offset + 0.5).astype(np.int64).ravel()
+                for axis, offset in enumerate(offsets)
             )
             yield x, y
 
-    def turn(self, found: dict[int, bytes], start: int) -> Orientation:
-        flags = found.get(gds.STRANS, b"\0\0")
-        angle, size = (
-            gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d
-            for k, d in _DEFAULTS
+    def turn(self, records: dict[int, bytes], start: int) -> Orientation:
+        """Orientation of a reference: mirror, scale and angle."""
+        flags = records.get(gds.STRANS, b"\0\0")
+        angle, scale = (
+            gds.to_float(records[kind]) if len(records.get(kind, b"")) == 8 else default
+            for kind, default in _DEFAULTS
         )
-        if len(flags) != 2 or not 0 < size < 1e9:
+        if len(flags) != 2 or not 0 < scale < 1e9:
             raise self.fail(
-                f"reference scaled by {size}, or with broken STRANS; need a scale above 0",
+                f"reference scaled by {scale}, or with broken STRANS; need a scale above 0",
                 start,
             )
         # absolute angle and size (bits 13, 14) are ignored, as other readers do
-        return Orientation(angle % 360, bool(flags[0] & 128), size)
+        return Orientation(angle % 360, bool(flags[0] & 128), scale)
 
     def line(self) -> tuple[tuple[int, int], Array]:
         """Layer and outline of a path; a negative width does not scale with references,
         which is ignored as other readers do.
         """
-        found = self.fields()
+        records = self.fields()
         layer, datatype = (
-            int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE)
+            int(self.numbers(records, kind, 1)[0]) for kind in (gds.LAYER, gds.DATATYPE)
         )
-        points = self.points(found)
+        points = self.points(records)
         width, begin, end = (
-            self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
+            self.whole(records, kind) for kind in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
         )
-        ends = (
-            int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
+        path_type = (
+            int(self.numbers(records, gds.PATHTYPE, 1)[0])
+            if gds.PATHTYPE in records
+            else 0
         )
         half = abs(width) / 2
         if not half:
             return (layer & 0xFFFF, datatype & 0xFFFF), points[:1]
         extensions = {1: (half, half), 2: (half, half), 4: (float(begin), float(end))}
-        first, last = extensions.get(ends, (0.0, 0.0))
+        begin_extension, end_extension = extensions.get(path_type, (0.0, 0.0))
         outline = paths.path_outline(
-            points, half, begin=first, end=last, rounded=ends == 1
+            points,
+            half,
+            begin=begin_extension,
+            end=end_extension,
+            rounded=path_type == 1,
         )
         return (layer & 0xFFFF, datatype & 0xFFFF), outline
 
-    def whole(self, found: dict[int, bytes], kind: int) -> int:
+    def whole(self, records: dict[int, bytes], kind: int) -> int:
         """A 32-bit number that an element may have; 0 without."""
-        data = found.get(kind, bytes(4))
+        data = records.get(kind, bytes(4))
         if len(data) != 4:
             raise self.fail(f"element with a wrong {gds.NAMES[kind]}")
         return int.from_bytes(data, "big", signed=True)

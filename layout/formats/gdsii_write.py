@@ -88,6 +88,7 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
 
 
 def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
+    """Bytes of a GDSII file, piece by piece."""
     yield gds.library_head(library.name, library.unit_nm)
     for name, cell in library.cells.items():
         head = gds.integer_record(gds.BGNSTR, *gds.TIMES) + gds.text_record(
@@ -180,10 +181,10 @@ def _placements(placed: CellPlacements) -> Iterator[bytes]:
         child, turn = divmod(kind, len(placed.turns))
         start = _head(placed.children[child], placed.turns[turn])
         head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
-        for some in np.array_split(members, math.ceil(len(members) / _AT_ONCE)):
-            block = np.empty((len(some), len(head) + len(tail)), np.uint8)
+        for part in np.array_split(members, math.ceil(len(members) / _AT_ONCE)):
+            block = np.empty((len(part), len(head) + len(tail)), np.uint8)
             block[:, : len(head)], block[:, len(head) :] = head, tail
-            xy = np.column_stack([placed.x[some], placed.y[some]]).astype(">i4")
+            xy = np.column_stack([placed.x[part], placed.y[part]]).astype(">i4")
             block[:, len(head) - 8 : len(head)] = xy.view(np.uint8).reshape(-1, 8)
             yield block.tobytes()
 
@@ -198,15 +199,15 @@ def _pillars(some: PillarSites) -> Iterator[memoryview]:
 
 def _references(children: Sequence[str], lattice: PillarArray) -> Iterator[memoryview]:
     """References of a lattice to cells, in two buffers filled in turn."""
-    made = [
+    records = [
         _head(name) + gds.xy_record(np.zeros((1, 2))) + gds.gdsii_record(gds.ENDEL)
         for name in children
     ]
-    dtype = np.dtype(np.uint16 if len(made[0]) % 4 else np.uint32)
-    templates = np.frombuffer(b"".join(made), dtype).reshape(len(made), -1)
+    dtype = np.dtype(np.uint16 if len(records[0]) % 4 else np.uint32)
+    templates = np.frombuffer(b"".join(records), dtype).reshape(len(records), -1)
     size = templates.shape[1]
     buffers = np.empty((2, _BLOCK // (size * dtype.itemsize), size), dtype)
-    turn = 0
+    current = 0
     xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), dtype)
     for first, block in lattice.blocks():
         rows = np.arange(first, first + len(block))
@@ -214,11 +215,11 @@ def _references(children: Sequence[str], lattice: PillarArray) -> Iterator[memor
         row, column = 0, 0
         while row < len(block):
             row, column, used = _fill(
-                buffers[turn], block, row, column, templates, xs, ys
+                buffers[current], block, row, column, templates, xs, ys
             )
             if used:
-                yield buffers[turn, :used].data.cast("B")
-                turn = 1 - turn  # the last one is still being written
+                yield buffers[current, :used].data.cast("B")
+                current = 1 - current  # the last one is still being written
 
 
 def _words(values: Array, dtype: np.dtype[Any]) -> Array:
@@ -238,24 +239,36 @@ def _fill(
     xs: Array,
     ys: Array,
 ) -> tuple[int, int, int]:
-    """References of the sites from (row, column) on, until the buffer is full; (next
-    row, column, references).
+    """Fill a buffer with references of the sites from (row, column) on.
+
+    Args:
+        buffer: (n, words) output.
+        block: (rows, columns) class numbers; 0: no reference.
+        row, column: first site.
+        templates: (classes, words) record of each class, with places of 0.
+        xs: (columns, words) big-endian x.
+        ys: (rows, words) big-endian y.
+
+    Returns:
+        Row and column of the next site, and number of references.
     """
-    size, wide = templates.shape[1], xs.shape[1]
-    head, used = size - 3 * wide, 0
+    size = templates.shape[1]
+    words = xs.shape[1]
+    coordinates_at = size - 3 * words
+    used = 0
     while row < block.shape[0]:
         while column < block.shape[1]:
             kind = block[row, column]
             if kind:
                 if used == buffer.shape[0]:
                     return row, column, used
-                for i in range(head):
+                for i in range(coordinates_at):
                     buffer[used, i] = templates[kind - 1, i]
-                for i in range(wide):
-                    buffer[used, head + i] = xs[column, i]
-                    buffer[used, head + wide + i] = ys[row, i]
-                    buffer[used, head + 2 * wide + i] = templates[
-                        kind - 1, head + 2 * wide + i
+                for i in range(words):
+                    buffer[used, coordinates_at + i] = xs[column, i]
+                    buffer[used, coordinates_at + words + i] = ys[row, i]
+                    buffer[used, coordinates_at + 2 * words + i] = templates[
+                        kind - 1, coordinates_at + 2 * words + i
                     ]
                 used += 1
             column += 1

@@ -48,14 +48,22 @@ def field_sequence(split: FieldPlan) -> list[WriteStep]:
         split: write fields of a lens.
     """
     x, y = split.x_um.tolist(), split.y_um.tolist()
-    made = []
-    for i, row in enumerate(split.pillars):
-        held = np.flatnonzero(row)
-        for j in (held if i % 2 == 0 else held[::-1]).tolist():
-            middle = (x[j] + x[j + 1]) / 2, (y[i] + y[i + 1]) / 2
-            wide, high = x[j + 1] - x[j], y[i + 1] - y[i]
-            made.append(WriteStep(*middle, wide, high, int(row[j])))
-    return made
+    steps = []
+    for field_row, row in enumerate(split.pillars):
+        occupied = np.flatnonzero(row)
+        for field_column in (
+            occupied if field_row % 2 == 0 else occupied[::-1]
+        ).tolist():
+            centre = (
+                (x[field_column] + x[field_column + 1]) / 2,
+                (y[field_row] + y[field_row + 1]) / 2,
+            )
+            width, height = (
+                x[field_column + 1] - x[field_column],
+                y[field_row + 1] - y[field_row],
+            )
+            steps.append(WriteStep(*centre, width, height, int(row[field_column])))
+    return steps
 
 
 def write_fields(steps: Sequence[WriteStep], path: str | Path) -> None:
@@ -65,7 +73,8 @@ def write_fields(steps: Sequence[WriteStep], path: str | Path) -> None:
         steps: of a lens, or of all parts of an arrangement.
         path: of the CSV file.
     """
-    text, parts = io.StringIO(), any(step.part for step in steps)
+    text = io.StringIO()
+    parts = any(step.part for step in steps)
     out = csv.writer(text, lineterminator="\n")
     out.writerow([*FIELD_HEAD, "part"] if parts else FIELD_HEAD)
     for number, step in enumerate(steps, 1):
@@ -80,20 +89,19 @@ def charge_uC(
     doses: Mapping[LayerNumber, float],
     process: Process,
 ) -> dict[str, float]:
-    """{step: charge} of the two steps: base dose times relative dose times area.
-
-    areas: um^2 of each layer.
+    """{step: charge in uC} of both steps: base dose times relative dose times area.
 
     Args:
+        areas: um^2 of each layer.
         doses: relative dose of each layer.
         process: base dose, and layer of the aperture.
     """
-    found = {"pillars": 0.0, "aperture": 0.0}
+    charges = {"pillars": 0.0, "aperture": 0.0}
     for layer, dose in doses.items():
         step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
         area_cm2 = areas.get(layer, 0.0) * 1e-8
-        found[step] += area_cm2 * dose * process.exposure.base_uC_cm2
-    return found
+        charges[step] += area_cm2 * dose * process.exposure.base_uC_cm2
+    return charges
 
 
 def charge_lines(charges: Mapping[str, float]) -> Iterator[str]:
@@ -144,26 +152,27 @@ def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
     """
     source = plan if plan.standing is None else plan.standing
     shapes = [
-        p
-        for f in source.figures
-        if f.name == "MARKS"
-        for drawn in f.polygons.values()
-        for p in drawn
+        shape
+        for figure in source.figures
+        if figure.name == "MARKS"
+        for drawn in figure.polygons.values()
+        for shape in drawn
     ]
     boxes = (
         [
-            (c.min(0), c.max(0))
-            for c in region.union_contours(shapes)
-            if polygon.twice_area(c) > 0
+            (contour.min(0), contour.max(0))
+            for contour in region.union_contours(shapes)
+            if polygon.twice_area(contour) > 0
         ]
         if shapes
         else []
     )
     scale = plan.unit_nm * nm
-    found = [
-        (*((a + b) / 2 * scale).tolist(), *((b - a) * scale).tolist()) for a, b in boxes
+    marks = [
+        (*((low + high) / 2 * scale).tolist(), *((high - low) * scale).tolist())
+        for low, high in boxes
     ]
-    return sorted(found, key=lambda m: (round(m[1]), round(m[0])))
+    return sorted(marks, key=lambda mark: (round(mark[1]), round(mark[0])))
 
 
 def job_sheet(
@@ -193,6 +202,7 @@ def _lines(
     files: Mapping[str, int],
     verdict: str,
 ) -> Iterator[str]:
+    """Lines of the job sheet of a lens: files, writer, doses, fields and marks."""
     yield f"JOB SHEET  mask {plan.name}  process {process.name!r}  tone {process.tone}"
     yield verdict
     yield ""
@@ -213,8 +223,8 @@ def _lines(
     yield f"  no border cuts a pillar; least distance {split.clearance_um / nm:.1f} nm"
     yield ""
     yield "Marks (middle x, y; width x height):"
-    for x, y, wide, high in marks_um(plan):
-        yield f"  ({x:.3f}, {y:.3f}); {wide:.3f} x {high:.3f}"
+    for x, y, width, height in marks_um(plan):
+        yield f"  ({x:.3f}, {y:.3f}); {width:.3f} x {height:.3f}"
     if any(figure.name == "VERNIERS" for figure in plan.figures):
         die = process.die
         yield ""
@@ -279,7 +289,7 @@ def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
         raise MaskFileError(
             f"{path}: cannot be read as a dose table ({error})"
         ) from None
-    found: dict[LayerNumber, float] = {}
+    doses: dict[LayerNumber, float] = {}
     for number, row in enumerate(rows, 2):
         try:
             layer = (int(row["layer"]), int(row["datatype"]))
@@ -288,12 +298,12 @@ def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
             raise MaskFileError(
                 f"{path}, line {number}: need columns {', '.join(DOSE_HEAD[:3])} of numbers"
             ) from None
-        if layer in found or not 0 < dose < 1e6:
+        if layer in doses or not 0 < dose < 1e6:
             raise MaskFileError(
                 f"{path}, line {number}: layer {layer} with dose {dose}: twice, or no dose above 0"
             )
-        found[layer] = dose
-    return found
+        doses[layer] = dose
+    return doses
 
 
 def layers_without_dose(

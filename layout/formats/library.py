@@ -55,9 +55,9 @@ class Orientation:
                 x, y = -y, x
             return x, y
         angle = math.radians(self.angle_deg)
-        c = self.scale * math.cos(angle)
-        s = self.scale * math.sin(angle)
-        turned = np.rint(c * x - s * y), np.rint(s * x + c * y)
+        cosine = self.scale * math.cos(angle)
+        sine = self.scale * math.sin(angle)
+        turned = np.rint(cosine * x - sine * y), np.rint(sine * x + cosine * y)
         return turned[0].astype(np.int64), turned[1].astype(np.int64)
 
     def after(self, inner: "Orientation") -> "Orientation":
@@ -133,10 +133,12 @@ class CellReference:
 
     def places(self) -> tuple[Array, Array]:
         """x and y of all instances, (count,) each, row by row."""
-        i, j = np.arange(self.columns), np.arange(self.rows)[:, None]
+        column, row = np.arange(self.columns), np.arange(self.rows)[:, None]
         x, y = (
-            at + i * a + j * u
-            for at, a, u in zip((self.x, self.y), self.across, self.up, strict=True)
+            origin + column * step + row * row_step
+            for origin, step, row_step in zip(
+                (self.x, self.y), self.across, self.up, strict=True
+            )
         )
         return x.ravel(), y.ravel()
 
@@ -178,13 +180,14 @@ class PillarSites:
 
     def sums(self) -> dict[str, tuple[int, ...]]:
         """{cell: count, sums of x and y, turned, hash} of those that occur."""
-        array, digest = self.lattice, RunningDigest()
+        array = self.lattice
+        digest = RunningDigest()
         for first, block in array.blocks():
             y = array.y0 - first * array.down
             digest.sites(block, array.x0, y, (array.pitch, array.down))
-        found = digest.of(np.arange(1, len(self.children) + 1))
-        every = (tuple(int(v[k]) for v in found) for k in range(len(self.children)))
-        pairs = zip(self.children, every, strict=True)
+        digests = digest.of(np.arange(1, len(self.children) + 1))
+        rows = (tuple(int(v[k]) for v in digests) for k in range(len(self.children)))
+        pairs = zip(self.children, rows, strict=True)
         return {child: sums for child, sums in pairs if sums[0]}
 
 
@@ -237,12 +240,12 @@ class MaskCell:
 
     def counts(self) -> dict[tuple[str, Orientation], int]:
         """How often each cell is placed in each orientation; of sums all together."""
-        found: Counter[tuple[str, Orientation]] = Counter()
+        counts: Counter[tuple[str, Orientation]] = Counter()
         if self.sums is not None:
             for child, count in zip(
                 self.placed.children, self.sums.count.tolist(), strict=True
             ):
-                found[child, QUARTERS[0]] += count
+                counts[child, QUARTERS[0]] += count
         total = np.zeros(len(self.placed.children) * len(self.placed.turns), np.int64)
         for first in range(0, len(self.placed.child), _AT_ONCE):
             kinds = self.placed.kinds(slice(first, first + _AT_ONCE))
@@ -250,14 +253,16 @@ class MaskCell:
         for kind in np.flatnonzero(total).tolist():
             number, turn = divmod(kind, len(self.placed.turns))
             key = self.placed.children[number], self.placed.turns[turn]
-            found[key] += int(total[kind])
-        for one in self.references:
-            found[one.child, one.turn] += one.count
+            counts[key] += int(total[kind])
+        for reference in self.references:
+            counts[reference.child, reference.turn] += reference.count
         if self.pillars is not None:
-            n = self.pillars.lattice.counts(len(self.pillars.children))
-            for child, count in zip(self.pillars.children, n[1:].tolist(), strict=True):
-                found[child, QUARTERS[0]] += count
-        return {key: count for key, count in found.items() if count}
+            pillar_counts = self.pillars.lattice.counts(len(self.pillars.children))
+            for child, count in zip(
+                self.pillars.children, pillar_counts[1:].tolist(), strict=True
+            ):
+                counts[child, QUARTERS[0]] += count
+        return {key: count for key, count in counts.items() if count}
 
     def instances(
         self, among: Collection[str] | None = None
@@ -272,21 +277,21 @@ class MaskCell:
         """
         placed = self.kept()
         among = set(self.children if among is None else among)
-        wanted = np.array([name in among for name in placed.children], bool)
-        for first in range(0, len(placed.child) if wanted.any() else 0, _AT_ONCE):
+        is_listed = np.array([name in among for name in placed.children], bool)
+        for first in range(0, len(placed.child) if is_listed.any() else 0, _AT_ONCE):
             block = slice(first, first + _AT_ONCE)
             x = placed.x[block]
             y = placed.y[block]
             kinds = placed.kinds(block)
-            if not wanted.all():
-                chosen = wanted[placed.child[block]]
+            if not is_listed.all():
+                chosen = is_listed[placed.child[block]]
                 x, y, kinds = x[chosen], y[chosen], kinds[chosen]
             for kind, members in group_equal(kinds):
                 child, turn = divmod(kind, len(placed.turns))
                 yield placed.children[child], placed.turns[turn], x[members], y[members]
-        for one in self.references:
-            if one.child in among:
-                yield one.child, one.turn, *one.places()
+        for reference in self.references:
+            if reference.child in among:
+                yield reference.child, reference.turn, *reference.places()
         if self.pillars is not None and among.intersection(self.pillars.children):
             for name, x, y in self.pillars.places():
                 if name in among:
@@ -294,10 +299,12 @@ class MaskCell:
 
     def drawn(self) -> dict[LayerNumber, list[Array]]:
         """Polygons of each layer, true circles as polygons of 64 corners."""
-        found = {layer: list(shapes) for layer, shapes in self.polygons.items()}
+        polygons = {layer: list(shapes) for layer, shapes in self.polygons.items()}
         for layer, circles in self.circles.items():
-            found.setdefault(layer, []).extend(circle_polygon(*one) for one in circles)
-        return found
+            polygons.setdefault(layer, []).extend(
+                circle_polygon(*circle) for circle in circles
+            )
+        return polygons
 
     @property
     def layers(self) -> set[LayerNumber]:
@@ -345,9 +352,9 @@ class MaskLibrary:
     @property
     def skipped(self) -> Counter[str]:
         """Elements of the cells that draw nothing: {kind: number}, texts among them."""
-        found = sum((cell.skipped for cell in self.cells.values()), Counter())
+        skipped = sum((cell.skipped for cell in self.cells.values()), Counter())
         texts = sum(cell.texts for cell in self.cells.values())
-        return found + Counter(text=texts)
+        return skipped + Counter(text=texts)
 
     def cell(self, name: str) -> MaskCell:
         """The cell of a name.
@@ -374,14 +381,14 @@ class MaskLibrary:
             raise MaskFileError(
                 f"no cell {top!r} in the mask; top cells: {', '.join(self.tops[:8])}"
             )
-        kept: set[str] = set()
+        reached: set[str] = set()
         waiting = [top]
         while waiting:
             name = waiting.pop()
-            if name in self.cells and name not in kept:
-                kept.add(name)
+            if name in self.cells and name not in reached:
+                reached.add(name)
                 waiting += self.cells[name].children
-        cells = {name: cell for name, cell in self.cells.items() if name in kept}
+        cells = {name: cell for name, cell in self.cells.items() if name in reached}
         return dataclasses.replace(self, cells=cells)
 
     def walk(self, top: str) -> Iterator[tuple[str, Orientation, Array, Array]]:
@@ -400,22 +407,33 @@ class MaskLibrary:
     def _walk(
         self, name: str, turn: Orientation, x: int, y: int, above: tuple[str, ...]
     ) -> Iterator[tuple[str, Orientation, Array, Array]]:
-        """All cells below an instance of one."""
+        """All cells below one instance of a cell, depth first.
+
+        Args:
+            name: of the cell.
+            turn: orientation of the instance.
+            x, y: its place.
+            above: names of the cells that it is in.
+        """
         if name in above or len(above) > MAX_DEPTH:
             raise MaskFileError(
                 f"cell {name!r} places itself through {' > '.join(above[:9])}; the "
                 "file is no mask"
             )
-        for child, own, px, py in self.cell(name).instances():
-            inner = turn.after(own)
+        for child, child_turn, px, py in self.cell(name).instances():
+            inner = turn.after(child_turn)
             px, py = turn.apply(px.astype(np.int64), py.astype(np.int64))
             px, py = px + x, py + y
             if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
                 raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
             yield child, inner, px.astype(np.int32), py.astype(np.int32)
             if self.cell(child).children:
-                for u, v in zip(px.tolist(), py.tolist(), strict=True):
-                    yield from self._walk(child, inner, u, v, (*above, name))
+                for instance_x, instance_y in zip(
+                    px.tolist(), py.tolist(), strict=True
+                ):
+                    yield from self._walk(
+                        child, inner, instance_x, instance_y, (*above, name)
+                    )
 
     def places(self, top: str) -> dict[str, tuple[Array, Array]]:
         """{cell: x and y of all its instances} of the cells below ``top`` that place
@@ -424,11 +442,14 @@ class MaskLibrary:
         Raises:
             MaskFileError: as :meth:`walk`.
         """
-        found: dict[str, list[tuple[Array, Array]]] = {}
+        parts_of_cell: dict[str, list[tuple[Array, Array]]] = {}
         for name, _, x, y in self.walk(top):
             if name != top and not self.cell(name).children:
-                found.setdefault(name, []).append((x, y))
-        joined = {name: list(zip(*parts, strict=True)) for name, parts in found.items()}
+                parts_of_cell.setdefault(name, []).append((x, y))
+        joined = {
+            name: list(zip(*parts, strict=True))
+            for name, parts in parts_of_cell.items()
+        }
         return {
             n: (np.concatenate(x), np.concatenate(y)) for n, (x, y) in joined.items()
         }
@@ -472,38 +493,40 @@ class MaskLibrary:
         Raises:
             MaskFileError: as :meth:`topological_order`.
         """
-        found: Counter[LayerNumber] = Counter()
+        counts: Counter[LayerNumber] = Counter()
         for name, times in self.drawn_counts().items():
             cell = self.cells[name]
             for shapes in (cell.polygons, cell.circles):
-                found.update({k: times * len(some) for k, some in shapes.items()})
-        return found
+                counts.update(
+                    {layer: times * len(listed) for layer, listed in shapes.items()}
+                )
+        return counts
 
     def areas_um2(self) -> dict[LayerNumber, float]:
         """{layer: sum of the areas of all shapes below the top cells}."""
         weight = dict.fromkeys(self.topological_order(), 0.0)
         weight |= dict.fromkeys(self.tops, (1e-3 * self.unit_nm) ** 2)
-        found: dict[LayerNumber, float] = {}
+        areas: dict[LayerNumber, float] = {}
         for name in weight:
             cell = self.cells[name]
             for (child, turn), count in cell.counts().items():
                 weight[child] += weight[name] * count * turn.scale**2
             for layer, shapes in cell.polygons.items():
                 area = sum(abs(polygon.twice_area(p)) / 2 for p in shapes)
-                found[layer] = found.get(layer, 0.0) + weight[name] * area
+                areas[layer] = areas.get(layer, 0.0) + weight[name] * area
             for layer, circles in cell.circles.items():
                 area = sum(math.pi * radius**2 for *_, radius in circles)
-                found[layer] = found.get(layer, 0.0) + weight[name] * area
-        return found
+                areas[layer] = areas.get(layer, 0.0) + weight[name] * area
+        return areas
 
     def refuse_beyond(self, limit: int) -> None:
-        """Refuse a mask that is too large to be taken apart.
+        """Refuse a mask that is too large to be expanded.
 
         Args:
-            limit: shapes; instances of a cell that holds nothing count as one each.
+            limit: shapes; instances of an empty cell count as one shape each.
 
         Raises:
-            MaskFileError: more than these; as :meth:`topological_order`.
+            MaskFileError: more shapes; as :meth:`topological_order`.
         """
         times = self.drawn_counts()
         total = sum(count * self.cells[name].shapes for name, count in times.items())
@@ -519,14 +542,14 @@ def library_of(plan: MaskPlan) -> MaskLibrary:
     """A plan as cells: pillar classes that occur, figures, lattices, and the top cell."""
     occurs = plan.counts()[1:] > 0
     pairs = list(zip(plan.classes, occurs.tolist(), strict=True))
-    children = tuple(made.name if used else "" for made, used in pairs)
+    children = tuple(pillar.name if used else "" for pillar, used in pairs)
     cells = [
-        MaskCell(made.name, {made.layer: list(made.polygons)})
-        for made, used in pairs
+        MaskCell(pillar.name, {pillar.layer: list(pillar.polygons)})
+        for pillar, used in pairs
         if used
     ]
     for figure in plan.figures:
-        shapes = {layer: list(some) for layer, some in figure.polygons.items()}
+        shapes = {layer: list(polygons) for layer, polygons in figure.polygons.items()}
         cells.append(MaskCell(figure.name, shapes))
     cells += [
         MaskCell(lattice.name, pillars=PillarSites(lattice, children))
@@ -599,10 +622,11 @@ class PolygonStack:
 
 
 def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
-    """Every polygon below ``top``; true circles as polygons of 64 corners.
+    """Every polygon below a cell; true circles as polygons of 64 corners.
 
     Args:
         library: of the cells.
+        top: name of the cell.
 
     Raises:
         MaskFileError: as :meth:`MaskLibrary.walk`.
@@ -627,21 +651,23 @@ def equal_shapes(
     Raises:
         MaskFileError: as :meth:`MaskLibrary.walk`.
     """
-    found: dict[Hashable, list[PolygonStack]] = {}
+    stacks: dict[Hashable, list[PolygonStack]] = {}
     for top in library.tops:
         for stack in flatten_stacks(library, top):
             for outline in stack.outlines:
-                same = key(stack), np.ascontiguousarray(outline).tobytes()
-                one = dataclasses.replace(stack, outlines=outline[None])
-                found.setdefault(same, []).append(one)
-    return found
+                shape_key = key(stack), np.ascontiguousarray(outline).tobytes()
+                single = dataclasses.replace(stack, outlines=outline[None])
+                stacks.setdefault(shape_key, []).append(single)
+    return stacks
 
 
 def _turned(outlines: Array, turn: Orientation) -> Array:
     """(k, n, 2) corners in some orientation, counter-clockwise again."""
     outlines = outlines.astype(np.int64)
-    made = np.stack(turn.apply(outlines[..., 0], outlines[..., 1]), -1)
-    after = np.roll(made, -1, axis=1)
-    area = (made[..., 0] * after[..., 1] - after[..., 0] * made[..., 1]).sum(1)
-    made[area < 0] = made[area < 0, ::-1]
-    return made
+    turned = np.stack(turn.apply(outlines[..., 0], outlines[..., 1]), -1)
+    following = np.roll(turned, -1, axis=1)
+    area = (
+        turned[..., 0] * following[..., 1] - following[..., 0] * turned[..., 1]
+    ).sum(1)
+    turned[area < 0] = turned[area < 0, ::-1]
+    return turned

@@ -66,7 +66,9 @@ class CellReader:
     """Reads the records of one cell."""
 
     def __init__(self, cell: OpenCell, budget: ReadBudget) -> None:
-        self.cell, self.budget, self.modal = cell, budget, ModalState()
+        self.cell = cell
+        self.budget = budget
+        self.modal = ModalState()
 
     def record(self, c: ByteCursor, kind: int) -> bool:
         """Read the record of this kind that stands at the cursor; False where cells
@@ -114,24 +116,23 @@ class CellReader:
             ]
         )
         while True:
-            size = min(_BATCH, c.left // 2 + 1)
-            out = np.empty((4, size), np.int32)
+            room = min(_BATCH, c.left // 2 + 1)
+            out = np.empty((4, room), np.int32)
             at, count = scan_placements(c.data, c.at, c.end, state, out)
-            moved, c.at = at > c.at, int(at)
+            has_moved, c.at = at > c.at, int(at)
             if count:
                 child, x, y, turn = (row.copy() for row in out[:, :count])
                 self._count(c, count)
                 self.cell.held.add(child, x, y, turn.astype(np.uint8))
-                m.placement_x, m.placement_y, m.child = (
-                    int(state[0]),
-                    int(state[1]),
-                    int(state[3]),
-                )
+                m.placement_x = int(state[0])
+                m.placement_y = int(state[1])
+                m.child = int(state[3])
             m.relative = bool(state[2])
-            if not moved:
+            if not has_moved:
                 return
 
     def _count(self, c: ByteCursor, more: int) -> None:
+        """Add to the placements and copies of the file; refuse more than the limit."""
         self.budget.used += more
         if self.budget.used > self.budget.limit:
             raise c.fail(
@@ -140,36 +141,47 @@ class CellReader:
             )
 
     def _need(self, c: ByteCursor, value: Value | None, what: str) -> Value:
+        """A modal value; refuse a record that lacks it."""
         if value is None:
             raise c.fail(f"record without {what}, and none before it in this cell")
         return value
 
     def _position(
-        self, c: ByteCursor, info: int, bits: tuple[int, int], now: tuple[int, int]
+        self, c: ByteCursor, info: int, bits: tuple[int, int], previous: tuple[int, int]
     ) -> tuple[int, int]:
-        place = []
-        for bit, old in zip(bits, now, strict=True):
+        """(x, y) of an element: stated, relative to the previous one, or equal to it.
+
+        Args:
+            c: cursor at the coordinates.
+            info: byte of the record that says which coordinates follow.
+            bits: bits of x and of y in ``info``.
+            previous: modal x and y.
+        """
+        position = []
+        for bit, old in zip(bits, previous, strict=True):
             new = c.coordinate() if info & bit else None
-            relative = self.modal.relative
-            place.append(
-                old if new is None else c.within(old + new) if relative else new
-            )
-        return place[0], place[1]
+            if new is not None and self.modal.relative:
+                new = c.within(old + new)
+            position.append(old if new is None else new)
+        return position[0], position[1]
 
     def _repeated(
         self, c: ByteCursor, info: int, bit: int, x: int, y: int
     ) -> tuple[Array, Array]:
+        """(n,) x and (n,) y of an element and its repetition, if the record has one."""
         if not info & bit:
             return np.array([x]), np.array([y])
         self.modal.repetition = c.repetition(self.modal.repetition, self.budget.left)
-        moved = self.modal.repetition
-        for offsets, start in ((moved.x, x), (moved.y, y)):
+        copies = self.modal.repetition
+        for offsets, start in ((copies.x, x), (copies.y, y)):
             c.within(int(offsets.max()) + start)
             c.within(int(offsets.min()) + start)
-        return moved.x + moved.x.dtype.type(x), moved.y + moved.y.dtype.type(y)
+        return copies.x + copies.x.dtype.type(x), copies.y + copies.y.dtype.type(y)
 
     def _placement(self, c: ByteCursor, kind: int) -> None:
-        info, m = c.byte(), self.modal
+        """Read PLACEMENT, with quarter turns, or with any angle and scale."""
+        info = c.byte()
+        m = self.modal
         if info & 0x80:
             m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
         child = m.child
@@ -193,6 +205,7 @@ class CellReader:
         self.cell.place(number, x, y, turn)
 
     def _layer(self, c: ByteCursor, info: int) -> None:
+        """Read layer and datatype where the record states them."""
         if info & 1:
             self.modal.layer = c.unsigned()
         if info & 2:
@@ -226,7 +239,9 @@ class CellReader:
         )
 
     def _rectangle(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        """Read RECTANGLE."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x40:
             m.width = c.within(c.unsigned())
@@ -234,19 +249,28 @@ class CellReader:
             m.height = m.width
         elif info & 0x20:
             m.height = c.within(c.unsigned())
-        w = self._need(c, m.width, "width")
-        h = self._need(c, m.height, "height")
-        self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
+        width = self._need(c, m.width, "width")
+        height = self._need(c, m.height, "height")
+        self._polygons(
+            c,
+            info,
+            np.array([[0, 0], [width, 0], [width, height], [0, height]]),
+            "RECTANGLE",
+        )
 
     def _polygon(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        """Read POLYGON."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x20:
             m.points = c.points()
         self._polygons(c, info, self._need(c, m.points, "point list"), "POLYGON")
 
     def _path(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        """Read PATH as its outline; a path of width 0 draws nothing."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x40:
             m.half_width = c.within(c.unsigned())
@@ -272,7 +296,9 @@ class CellReader:
         return c.coordinate()
 
     def _trapezoid(self, c: ByteCursor, kind: int) -> None:
-        info, m = c.byte(), self.modal
+        """Read TRAPEZOID: a w by h box, two sides slanted by a and b."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         self._size(c, info)
         a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
@@ -291,13 +317,16 @@ class CellReader:
         )
 
     def _size(self, c: ByteCursor, info: int) -> None:
+        """Read width and height where the record states them."""
         if info & 0x40:
             self.modal.width = c.within(c.unsigned())
         if info & 0x20:
             self.modal.height = c.within(c.unsigned())
 
     def _compact(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        """Read CTRAPEZOID, one of the types of a table."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x80:
             m.kind = c.unsigned()
@@ -307,15 +336,19 @@ class CellReader:
             raise c.fail(
                 f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}"
             )
-        wide, high = trapezoids.required_sides(kind)
-        w = self._need(c, m.width, "width") if wide else 0
-        h = self._need(c, m.height, "height") if high else 0
-        size = trapezoids.dependent_size(kind, w, h)
+        needs_width, needs_height = trapezoids.required_sides(kind)
+        width = self._need(c, m.width, "width") if needs_width else 0
+        height = self._need(c, m.height, "height") if needs_height else 0
+        size = trapezoids.dependent_size(kind, width, height)
         m.width, m.height = size
-        self._polygons(c, info, trapezoids.compact_trapezoid(kind, w, h), "CTRAPEZOID")
+        self._polygons(
+            c, info, trapezoids.compact_trapezoid(kind, width, height), "CTRAPEZOID"
+        )
 
     def _circle(self, c: ByteCursor) -> None:
-        info, m = c.byte(), self.modal
+        """Read CIRCLE; a circle of radius 0 draws nothing."""
+        info = c.byte()
+        m = self.modal
         self._layer(c, info)
         if info & 0x20:
             m.radius = c.within(c.unsigned())
@@ -340,7 +373,8 @@ class CellReader:
 
     def _text(self, c: ByteCursor) -> None:
         """Texts are counted, no more."""
-        info, m = c.byte(), self.modal
+        info = c.byte()
+        m = self.modal
         if info & 0x40:
             _ = c.unsigned() if info & 0x20 else c.string()
         for bit in (1, 2):

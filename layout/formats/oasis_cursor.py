@@ -39,7 +39,10 @@ class ByteCursor:
         end: int | None = None,
         block: int = -1,
     ) -> None:
-        self.path, self.data, self.at, self.block = path, data, at, block
+        self.path = path
+        self.data = data
+        self.at = at
+        self.block = block
         self.end = len(data) if end is None else end
         self.begin = at  # of the latest record
 
@@ -139,7 +142,8 @@ class ByteCursor:
         """A point list, from (0, 0) on: (n, 2), as it closes to a polygon, or as a path
         has it.
         """
-        form, count = self.unsigned(), self.unsigned()
+        form = self.unsigned()
+        count = self.unsigned()
         if form > 5:
             raise self.fail(f"point list of type {form}, need 0 to 5")
         if not 0 < count <= self.left:
@@ -166,11 +170,13 @@ class ByteCursor:
         return np.array([x, y], np.int64).T
 
     def _step(self, form: int, n: int) -> tuple[int, int]:
+        """Step of a point list: along one axis, in 4 or 8 directions, or any."""
         if form < 2:
             size = self.signed()
             return (size, 0) if n % 2 == form else (0, size)
         if form in (2, 3):
-            word, bits = self.unsigned(), form
+            word = self.unsigned()
+            bits = form
             dx, dy = DIRECTIONS[word & (1 << bits) - 1]
             return dx * (word >> bits), dy * (word >> bits)
         return self.delta()
@@ -192,11 +198,11 @@ class ByteCursor:
             count = self._count(limit)
             grid = self.unsigned() if form % 2 else 1
             steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
-            line = self._sums(steps)
+            offsets = self._sums(steps)
             return (
-                RepetitionOffsets(line, 0 * line)
+                RepetitionOffsets(offsets, 0 * offsets)
                 if form < 6
-                else RepetitionOffsets(0 * line, line)
+                else RepetitionOffsets(0 * offsets, offsets)
             )
         if form in (8, 9):
             return self._vectors(form, limit)
@@ -204,12 +210,12 @@ class ByteCursor:
             count = self._count(limit)
             grid = self.unsigned() if form == 11 else 1
             x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
-            at = sum_deltas(self.data, self.at, self.end, self.within(grid), x, y)
-            if at < 0:
+            position = sum_deltas(self.data, self.at, self.end, self.within(grid), x, y)
+            if position < 0:
                 raise self.fail(
                     f"list of {count - 1} steps that is cut or leaves 32 bits"
                 )
-            self.at = at
+            self.at = position
             return RepetitionOffsets(x, y)
         raise self.fail(f"repetition of type {form}, need 0 to 11")
 
@@ -221,11 +227,13 @@ class ByteCursor:
         return count
 
     def _sums(self, steps: list[int]) -> Array:
+        """(n,) running sums of steps; refused beyond 32 bits."""
         if sum(steps) > FARTHEST:
             raise self.fail("repetition that leaves 32 bits")
         return np.cumsum(np.array(steps, np.int64))
 
     def _matrix(self, form: int, limit: int) -> RepetitionOffsets:
+        """Repetition on a lattice along x, along y, or along both."""
         columns = self.unsigned() + 2 if form != 3 else 1
         rows = self.unsigned() + 2 if form != 2 else 1
         step_x = self.unsigned() if form != 3 else 0
@@ -233,6 +241,7 @@ class ByteCursor:
         return self._grid(columns, rows, (step_x, 0), (0, step_y), limit)
 
     def _vectors(self, form: int, limit: int) -> RepetitionOffsets:
+        """Repetition along one or two vectors of any direction."""
         first = self.unsigned() + 2
         second = self.unsigned() + 2 if form == 8 else 1
         along = self.delta()
@@ -241,18 +250,32 @@ class ByteCursor:
         )
 
     def _grid(
-        self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int
+        self,
+        columns: int,
+        rows: int,
+        step: tuple[int, int],
+        row_step: tuple[int, int],
+        limit: int,
     ) -> RepetitionOffsets:
-        if n * m > min(limit, MOST_COPIES):
+        """Offsets of columns x rows copies, row by row, within 32 bits.
+
+        Args:
+            columns, rows: number of copies each way.
+            step: (x, y) from column to column.
+            row_step: (x, y) from row to row.
+            limit: most copies.
+        """
+        if columns * rows > min(limit, MOST_COPIES):
             most = min(limit, MOST_COPIES)
             raise self.fail(
-                f"repetition of {n} x {m} = {n * m:,} copies, at most {most:,} more are read"
+                f"repetition of {columns} x {rows} = {columns * rows:,} copies, at most {most:,} more are read"
             )
-        for i in (0, 1):
-            self.within(abs(n * a[i]) + abs(m * b[i]))
-        along, across = np.arange(n), np.arange(m)[:, None]
+        for axis in (0, 1):
+            self.within(abs(columns * step[axis]) + abs(rows * row_step[axis]))
+        column, row = np.arange(columns), np.arange(rows)[:, None]
         x, y = (
-            (along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32)
-            for k in (0, 1)
+            (column * step[axis]).astype(np.int32)
+            + (row * row_step[axis]).astype(np.int32)
+            for axis in (0, 1)
         )
         return RepetitionOffsets(x.ravel(), y.ravel())

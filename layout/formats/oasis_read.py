@@ -51,13 +51,13 @@ def read_oasis(
 def parse_oasis(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read_oasis`, from the bytes of an OASIS file as uint8; ``where`` names them
-    in errors.
+    """Read an OASIS file from its bytes, as :func:`read_oasis`.
 
     Args:
         data: bytes, uint8.
         limit: most placements and copies that are read.
         keep: most placements of one cell that are kept; None: all.
+        where: name of the bytes in errors.
     """
     return _Reader(ByteCursor(where, data), limit, keep).whole_file()
 
@@ -66,7 +66,9 @@ class _Reader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
     def __init__(self, cursor: ByteCursor, limit: int, keep: int | None) -> None:
-        self.file, self.budget, self.keep = cursor, ReadBudget(limit), keep
+        self.file = cursor
+        self.budget = ReadBudget(limit)
+        self.keep = keep
         self.cell: CellReader | None = None
         self.cells: list[OpenCell] = []
         self.names: dict[int, str] = {}
@@ -84,10 +86,12 @@ class _Reader:
         if self.end_at is None:
             raise c.fail("the file ends without END; it is cut")
         self._check_end(offsets_here)
-        cells, names = self._contents(), self.layer_names
+        cells = self._contents()
+        names = self.layer_names
         return MaskLibrary("", cells, unit_nm, names, kind="OASIS")
 
     def _start(self) -> tuple[float, bool]:
+        """Read START: database unit, and whether the table offsets are in it."""
         c = self.file
         c.begin = c.at
         if c.byte() != oasis.START:
@@ -104,6 +108,7 @@ class _Reader:
         return 1e3 / steps, offsets_here
 
     def _offsets(self, c: ByteCursor) -> None:
+        """Read and ignore the six table offsets."""
         for _ in range(6):
             if c.unsigned() > 1:
                 raise c.fail("table offset with a flag beyond 1")
@@ -120,6 +125,7 @@ class _Reader:
             self._record(c, c.byte())
 
     def _record(self, c: ByteCursor, kind: int) -> None:
+        """Read one record of the file level, or pass it to the open cell."""
         if kind in (oasis.CELL_REF, oasis.CELL):
             self._begin_cell(
                 c.within(c.unsigned())
@@ -150,15 +156,18 @@ class _Reader:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
 
     def _begin_cell(self, key: Child) -> None:
+        """Open a cell, by its number or its name."""
         self.cells.append(OpenCell(key, PlacementSums(self.keep)))
         self.cell = CellReader(self.cells[-1], self.budget)
 
     def _block(self, c: ByteCursor) -> None:
+        """Unpack a CBLOCK and read its records; sizes are checked first."""
         if c is not self.file:
             raise c.fail("a compressed block within another")
         if c.unsigned() != 0:
             raise c.fail("a compressed block of an unknown method, need deflate")
-        size, packed = c.unsigned(), c.unsigned()
+        size = c.unsigned()
+        packed = c.unsigned()
         if packed > c.left or size > packed * _LARGEST_RATIO + 64:
             raise c.fail(
                 f"compressed block of {packed} bytes for {size}, with {c.left} left in the file"
@@ -182,6 +191,7 @@ class _Reader:
         self._records(ByteCursor(c.path, np.frombuffer(raw, np.uint8), block=c.begin))
 
     def _cell_name(self, c: ByteCursor, explicit: bool) -> None:
+        """Read CELLNAME, numbered in order or explicitly."""
         name = c.string(name=True)
         self.explicit.add(explicit)
         number = c.within(c.unsigned()) if explicit else len(self.names)
@@ -193,6 +203,7 @@ class _Reader:
         self.cell = None
 
     def _layer_name(self, c: ByteCursor, kind: int) -> None:
+        """Read LAYERNAME; kept for a single layer and datatype."""
         name = c.string(name=True)
         first = [self._interval(c) for _ in range(2)]
         if kind == oasis.LAYERNAME and None not in first:
@@ -208,6 +219,7 @@ class _Reader:
         return numbers[0] if form == 3 else None
 
     def _other_name(self, c: ByteCursor, kind: int) -> None:
+        """Read and ignore a name of another table."""
         c.string()
         if kind in _NUMBERED_NAMES:
             c.unsigned()
@@ -227,6 +239,7 @@ class _Reader:
             self._property_value(c)
 
     def _property_value(self, c: ByteCursor) -> None:
+        """Read and ignore a value of a property."""
         form = c.byte()
         if form <= 7:
             c.at -= 1
@@ -241,6 +254,7 @@ class _Reader:
             raise c.fail(f"property value of type {form}, need 0 to 15")
 
     def _check_end(self, offsets_before: bool) -> None:
+        """Check the size of END, its offsets, and the CRC-32 where there is one."""
         c = self.file
         c.begin = self.end_at or 0
         if c.end - c.begin != oasis.END_SIZE:
@@ -254,23 +268,24 @@ class _Reader:
         if scheme not in (0, 1, 2) or c.left != (4 if scheme else 0):
             raise c.fail(f"validation scheme {scheme} with {c.left} bytes left")
         if scheme == 1:
-            found = zlib.crc32(c.data[: c.at].data)
-            wanted = struct.unpack("<I", c.take(4))[0]
-            if found != wanted:
+            computed = zlib.crc32(c.data[: c.at].data)
+            stated = struct.unpack("<I", c.take(4))[0]
+            if computed != stated:
                 raise c.fail(
-                    f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged"
+                    f"checksum {computed:08x}, the file says {stated:08x}; the file is damaged"
                 )
 
     def _contents(self) -> dict[str, MaskCell]:
-        made: dict[str, MaskCell] = {}
+        """{name: cell}, once all names are known."""
+        cells: dict[str, MaskCell] = {}
         for cell in self.cells:
             try:
                 name = cell.key if isinstance(cell.key, str) else self.names[cell.key]
                 content = cell.close(name, self.names)
             except KeyError as error:
                 raise self.file.fail(f"cell number {error} has no name") from None
-            if name in made:
+            if name in cells:
                 raise self.file.fail(f"cell {name!r} comes twice")
-            made[name] = content
-        made.pop(CONTEXT_CELL, None)
-        return made
+            cells[name] = content
+        cells.pop(CONTEXT_CELL, None)
+        return cells

@@ -20,9 +20,10 @@ KINDS = len(_CORNERS)
 
 
 def compact_trapezoid(kind: int, w: int, h: int) -> Array:
-    """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25.
+    """(n, 2) corners of a compact trapezoid.
 
     Args:
+        kind: 0 to 25.
         w: width.
         h: height.
     """
@@ -51,7 +52,9 @@ def dependent_size(kind: int, w: int, h: int) -> tuple[int, int]:
     """Width and height, of which a compact trapezoid of one size sets the other.
 
     Args:
-        kind: 0 to 25. w, h: sizes; of kinds 16 to 23 and 25 one of them does not count.
+        kind: 0 to 25.
+        w: width; not used by kinds 20 and 21.
+        h: height; not used by kinds 16 to 19, 22, 23 and 25.
     """
     if kind in (16, 17, 18, 19, 25):
         return w, w
@@ -63,9 +66,13 @@ def dependent_size(kind: int, w: int, h: int) -> tuple[int, int]:
 
 
 def slanted_trapezoid(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
-    """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans.
+    """(4, 2) corners of a trapezoid within a box.
 
     Args:
+        w: width of the box.
+        h: height of the box.
+        a: offset of one end of the first slanted side from the other.
+        b: the same of the second slanted side.
         upright: whether the parallel sides are upright.
     """
     if upright:

@@ -78,6 +78,7 @@ def cell_name(number: int, name: str) -> bytes:
 
     Args:
         number: that references use.
+        name: of the cell.
     """
     return (
         bytes([oasis.CELLNAME_REF])
@@ -94,14 +95,17 @@ def layer_name(layer: LayerNumber, name: str) -> bytes:
 
 
 def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
+    """Records of all cells, piece by piece."""
     for name, cell in library.cells.items():
         yield bytes([oasis.CELL_REF]) + oasis.unsigned_integer(number[name])
         for layer, polygons in cell.polygons.items():
             shapes = b"".join(polygon_element(layer, points) for points in polygons)
             yield oasis.compressed_block(shapes, _LEVEL)
         for layer, circles in cell.circles.items():
-            yield b"".join(_circle(layer, *one) for one in circles)
-        yield b"".join(_copies(one, number[one.child]) for one in cell.references)
+            yield b"".join(_circle(layer, *element) for element in circles)
+        yield b"".join(
+            _copies(element, number[element.child]) for element in cell.references
+        )
         yield from _placements(cell, number)
         if cell.pillars is not None:
             yield from _pillars(cell.pillars.numbered(number))
@@ -141,29 +145,32 @@ def g_delta(dx: int, dy: int) -> bytes:
 
 
 def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
+    """CIRCLE record, in database units."""
     numbers = b"".join(oasis.unsigned_integer(n) for n in (*layer, radius))
     place = oasis.signed_integer(x) + oasis.signed_integer(y)
     return bytes([oasis.CIRCLE, 0b00111011]) + numbers + place
 
 
-def _copies(one: CellReference, number: int) -> bytes:
+def _copies(reference: CellReference, number: int) -> bytes:
     """A placement, repeated where it stands for an array."""
-    repeated = one.count > 1
-    placed = _placement(number, one.turn, one.x, one.y, repeated=repeated)
+    repeated = reference.count > 1
+    placed = _placement(
+        number, reference.turn, reference.x, reference.y, repeated=repeated
+    )
     if not repeated:
         return placed
-    if min(one.columns, one.rows) > 1:
-        sizes = oasis.unsigned_integer(one.columns - 2) + oasis.unsigned_integer(
-            one.rows - 2
+    if min(reference.columns, reference.rows) > 1:
+        sizes = oasis.unsigned_integer(reference.columns - 2) + oasis.unsigned_integer(
+            reference.rows - 2
         )
-        steps = g_delta(*one.across) + g_delta(*one.up)
+        steps = g_delta(*reference.across) + g_delta(*reference.up)
         return placed + oasis.unsigned_integer(8) + sizes + steps
-    along = one.across if one.rows == 1 else one.up
+    step = reference.across if reference.rows == 1 else reference.up
     return (
         placed
         + oasis.unsigned_integer(9)
-        + oasis.unsigned_integer(one.count - 2)
-        + g_delta(*along)
+        + oasis.unsigned_integer(reference.count - 2)
+        + g_delta(*step)
     )
 
 
@@ -186,11 +193,11 @@ def _placement(
 def _placements(cell: MaskCell, number: dict[str, int]) -> Iterator[bytes]:
     """Placements of a cell: those of quarter turns relative to each other."""
     placed = cell.kept()
-    own = np.array([number[name] for name in placed.children], np.int64)
+    numbers = np.array([number[name] for name in placed.children], np.int64)
     quarter = placed.turn < len(QUARTERS)
     yield b"".join(
         _placement(
-            int(own[placed.child[n]]),
+            int(numbers[placed.child[n]]),
             placed.turns[int(placed.turn[n])],
             int(placed.x[n]),
             int(placed.y[n]),
@@ -198,17 +205,24 @@ def _placements(cell: MaskCell, number: dict[str, int]) -> Iterator[bytes]:
         for n in np.flatnonzero(~quarter).tolist()
     )
     where = slice(None) if quarter.all() else np.flatnonzero(quarter)
-    yield from _listed(own, placed, where)
+    yield from _listed(numbers, placed, where)
 
 
 def _listed(
-    own: Array, placed: CellPlacements, where: slice | Array
+    numbers: Array, placed: CellPlacements, chosen: slice | Array
 ) -> Iterator[bytes]:
+    """Compressed blocks of placements of quarter turns.
+
+    Args:
+        numbers: (children,) reference number of each child.
+        placed: placements.
+        chosen: which of them.
+    """
     columns = placed.child, placed.x, placed.y, placed.turn
-    child, x, y, turn = (column[where] for column in columns)
+    child, x, y, turn = (column[chosen] for column in columns)
     for first in range(0, len(x), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        yield _block(own[child[some]], x[some], y[some], turn[some], _LEVEL)
+        block = slice(first, first + _AT_ONCE)
+        yield _block(numbers[child[block]], x[block], y[block], turn[block], _LEVEL)
 
 
 def _block(child: Array, x: Array, y: Array, turn: Array, level: int) -> bytes:
@@ -237,6 +251,7 @@ def _pillars(lattice: PillarArray) -> Iterator[bytes]:
 
 
 def _tile(tile: Array, steps: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
+    """Compressed block of the pillars of a tile of sites; empty for none."""
     row, column = np.nonzero(tile)
     if not len(row):
         return b""
@@ -269,13 +284,13 @@ def _put_unsigned(out: Array, at: int, value: int) -> int:
 
 @compile_loop
 def _put_signed(out: Array, at: int, value: int) -> int:
+    """Write a signed integer, the sign in its lowest bit; the position after it."""
     return _put_unsigned(out, at, (-value << 1) | 1 if value < 0 else value << 1)
 
 
 @compile_loop
 def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
-    """Placements in their order: the first at its place, each other relative to the one
-    before; bytes used.
+    """Placements in order: the first absolute, each other relative to the previous.
 
     Args:
         child: (n,) reference numbers.
@@ -283,6 +298,9 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
         y: (n,) places.
         turn: (n,) quarter turns and mirror, 0 to 7.
         out: room for ``LARGEST_RECORD`` bytes a placement and 2 more.
+
+    Returns:
+        Bytes used.
     """
     out[0] = 15  # XYABSOLUTE
     at, last_x, last_y = 1, 0, 0

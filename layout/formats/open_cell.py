@@ -38,12 +38,12 @@ def has_area(points: Array) -> bool:
 
 @dataclass(eq=False, slots=True)
 class PlacementSums:
-    """Placements of a cell while it is read: kept up to a number (None: all), beyond it
-    only their sums.
+    """Placements of a cell while it is read: stored up to a number, summed beyond it.
 
-    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged:
-    how many of them are large;
-    small: placements in the others.
+    keep: that number; None: all are stored. parts: (child, x, y, turn) of the stored
+    placements; child as the reader numbers it. count: placements so far. digest: sums,
+    where there are more than ``keep``. merged: how many of the parts are large. small:
+    placements in the other parts.
     """
 
     keep: int | None = None
@@ -54,7 +54,14 @@ class PlacementSums:
     small: int = 0
 
     def add(self, child: Array, x: Array, y: Array, turn: Array) -> None:
-        """Take in some more."""
+        """Add placements: kept up to ``keep`` of them, summed beyond it.
+
+        Args:
+            child: (n,) numbers.
+            x: (n,) places.
+            y: (n,) places.
+            turn: (n,) orientations.
+        """
         self.count += len(child)
         if self.digest is None:
             self.parts.append((child, x, y, turn))
@@ -69,8 +76,10 @@ class PlacementSums:
         self.digest.take(child, x, y, turn)
 
     def _merge(self, more: int) -> None:
-        """Make one of the last parts where they are many: large arrays go back to the
-        system when they are let go.
+        """Join the last parts once they are large; memory then returns to the system.
+
+        Args:
+            more: placements of the part added last.
         """
         self.small += more
         if self.small >= LARGE_PART:
@@ -79,17 +88,17 @@ class PlacementSums:
                 for part in zip(*self.parts[self.merged :], strict=True)
             )
             self.parts[self.merged :] = [(child, x, y, turn)]
-            self.merged, self.small = self.merged + 1, 0
+            self.merged = self.merged + 1
+            self.small = 0
 
     def columns(self) -> tuple[Array, Array, Array, Array]:
-        """child, x, y, turn of all that is kept; the parts are let go, one column after
-        the other.
-        """
+        """child, x, y, turn of all placements; parts are released column by column."""
         columns = [list(part) for part in zip(*self.parts, strict=True)]
-        self.parts, made = [], []
+        self.parts = []
+        joined = []
         while columns:
-            made.append(np.concatenate(columns.pop(0)))
-        return made[0], made[1], made[2], made[3]
+            joined.append(np.concatenate(columns.pop(0)))
+        return joined[0], joined[1], joined[2], joined[3]
 
 
 @dataclass(eq=False, slots=True)
@@ -142,12 +151,16 @@ class OpenCell:
         Raises:
             KeyError: a reference number without a name.
         """
-        own = {number: child for child, number in self.names.items()}
+        child_of_number = {number: child for child, number in self.names.items()}
 
         def named(numbers: Array) -> tuple[str, ...]:
-            return tuple(own[k] if k < 0 else table[k] for k in numbers.tolist())
+            return tuple(
+                child_of_number[k] if k < 0 else table[k] for k in numbers.tolist()
+            )
 
-        placed, sums, digest = NOTHING, None, self.held.digest
+        placed = NOTHING
+        sums = None
+        digest = self.held.digest
         if digest is not None:
             placed = dataclasses.replace(NOTHING, children=named(digest.children))
             sums = digest.of(digest.children)
@@ -162,8 +175,13 @@ class OpenCell:
 
 
 def _numbered(child: Array) -> tuple[Array, Array]:
-    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it
-    is changed in place.
+    """Numbers that occur, and the index of each child among them.
+
+    Args:
+        child: (n,) int32 numbers; changed in place.
+
+    Returns:
+        (used,) numbers, rising, and (n,) int32 index into them.
     """
     low, high = int(child.min()), int(child.max())
     if high - low >= 1 << 22:
@@ -173,10 +191,10 @@ def _numbered(child: Array) -> tuple[Array, Array]:
     pieces = [
         child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
     ]  # numpy widens what it indexes by
-    for some in pieces:
-        some -= low
-        occurs[some] = True
+    for piece in pieces:
+        piece -= low
+        occurs[piece] = True
     lookup = np.cumsum(occurs, dtype=np.int32) - 1
-    for some in pieces:
-        some[:] = lookup[some]
+    for piece in pieces:
+        piece[:] = lookup[piece]
     return np.flatnonzero(occurs) + low, child

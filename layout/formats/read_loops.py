@@ -13,10 +13,11 @@ _MOST_NAMES = 65536
 
 
 def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, int]:
-    """Plain GDSII references from byte ``at`` on, all with names of one length.
+    """Plain GDSII references in a row, all with names of one length.
 
     Args:
         data: bytes of the file.
+        at: first byte.
 
     Returns:
         (names, index into names, x, y, byte after the last); nothing where the next
@@ -31,78 +32,91 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
     first = np.empty(min(_MOST_NAMES, most), np.int64)
     slots = np.full(4 << len(first).bit_length(), -1, np.int32)
     count, names = _srefs(data, at, size, out, slots, first)
-    found = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
+    name_bytes = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
     child, x, y = out[:, :count]
-    return found, child, x, y, at + count * size
+    return name_bytes, child, x, y, at + count * size
 
 
 @compile_loop
 def _srefs(
     data: Array, at: int, size: int, out: Array, slots: Array, first: Array
 ) -> tuple[int, int]:
-    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where
-    each stands first.
+    """Read a run of plain SREF records of equal size.
+
+    Args:
+        data: bytes of the file.
+        at: first byte of the run.
+        size: bytes of each record, from SREF to ENDEL.
+        out: (3, n) output: index of the name, x and y of each.
+        slots: hash table of the names: index, or -1.
+        first: output, byte at which each name stands first.
+
+    Returns:
+        Number of references and of names; the run ends at any other record.
     """
     child, x, y = out[0], out[1], out[2]
-    names, mask = 0, slots.shape[0] - 1
+    names = 0
+    mask = slots.shape[0] - 1
     for n in range(out.shape[1]):
-        p = at + n * size
-        q = p + size - 16
+        start = at + n * size
+        coordinates = start + size - 16
         if not (
-            data[p] == 0
-            and data[p + 1] == 4
-            and data[p + 2] == 10
-            and data[p + 3] == 0
-            and data[p + 4] == 0
+            data[start] == 0
+            and data[start + 1] == 4
+            and data[start + 2] == 10
+            and data[start + 3] == 0
+            and data[start + 4] == 0
         ):
             return n, names
         if not (
-            data[p + 5] == size - 20
+            data[start + 5] == size - 20
             and size > 24
-            and data[p + 6] == 18
-            and data[p + 7] == 6
+            and data[start + 6] == 18
+            and data[start + 7] == 6
         ):
             return n, names
         if not (
-            data[q] == 0
-            and data[q + 1] == 12
-            and data[q + 2] == 16
-            and data[q + 3] == 3
+            data[coordinates] == 0
+            and data[coordinates + 1] == 12
+            and data[coordinates + 2] == 16
+            and data[coordinates + 3] == 3
         ):
             return n, names
         if not (
-            data[q + 12] == 0
-            and data[q + 13] == 4
-            and data[q + 14] == 17
-            and data[q + 15] == 0
+            data[coordinates + 12] == 0
+            and data[coordinates + 13] == 4
+            and data[coordinates + 14] == 17
+            and data[coordinates + 15] == 0
         ):
             return n, names
         key = 0
-        for i in range(p + 8, q):
+        for i in range(start + 8, coordinates):
             key = (key * 131 + int(data[i])) & 0x7FFFFFFF
         slot = (key ^ key >> 15) & mask
         while slots[slot] >= 0:
-            other, same = first[slots[slot]], True
-            for i in range(q - p - 8):
-                if data[other + i] != data[p + 8 + i]:
-                    same = False
+            stored = first[slots[slot]]
+            is_equal = True
+            for i in range(coordinates - start - 8):
+                if data[stored + i] != data[start + 8 + i]:
+                    is_equal = False
                     break
-            if same:
+            if is_equal:
                 break
             slot = (slot + 1) & mask
         if slots[slot] < 0:
             if names == first.shape[0]:
                 return n, names
-            slots[slot], first[names] = names, p + 8
+            slots[slot], first[names] = names, start + 8
             names += 1
         child[n] = slots[slot]
-        x[n] = _big_endian(data, q + 4)
-        y[n] = _big_endian(data, q + 8)
+        x[n] = _big_endian(data, coordinates + 4)
+        y[n] = _big_endian(data, coordinates + 8)
     return out.shape[1], names
 
 
 @compile_loop
 def _big_endian(data: Array, at: int) -> int:
+    """Signed big-endian 32-bit number."""
     value = 0
     for i in range(4):
         value = value << 8 | (int(data[at + i]) + 0)  # 64 bits wide, compiled or not
@@ -111,11 +125,13 @@ def _big_endian(data: Array, at: int) -> int:
 
 @compile_loop
 def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
-    """A variable-length integer of at most 6 bytes and the position after it; -1 where
-    it is cut or longer.
+    """A variable-length integer of at most 6 bytes, and the position after it.
+
+    The position is -1 where the integer is cut or longer.
 
     Args:
         data: bytes.
+        at: first byte.
         end: of the bytes.
     """
     value, shift = 0, 0
@@ -133,22 +149,26 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
 def scan_placements(
     data: Array, at: int, end: int, state: Array, out: Array
 ) -> tuple[int, int]:
-    """OASIS placements by reference number without repetition, and switches of the
-    coordinate mode.
+    """Read OASIS placements by reference number without repetition.
 
-    out: (4, n) child, x, y, turn of each, filled.
-    state: (4,) placement x, y, whether relative, and the cell placed last (-1: none),
-    kept up to date.
+    Switches between absolute and relative coordinates are read too.
 
     Args:
         data: bytes.
         at: first byte.
         end: of the bytes.
+        state: (4,) x, y, whether relative, and cell of the last placement (-1: none);
+            updated.
+        out: (4, n) output: child, x, y, turn of each.
 
     Returns:
         (position of the first record that is something else or broken, placements read)
     """
-    count, child, x, y, turn = 0, out[0], out[1], out[2], out[3]
+    count = 0
+    child = out[0]
+    x = out[1]
+    y = out[2]
+    turn = out[3]
     while at < end and count < out.shape[1]:
         kind = data[at]
         if kind == 15 or kind == 16:
@@ -162,15 +182,17 @@ def scan_placements(
             or data[at + 1] & 0xC0 == 0x80
         ):
             break
-        info, p, number = data[at + 1], at + 2, state[3]
+        info = data[at + 1]
+        position = at + 2
+        number = state[3]
         if info & 0x80:
-            number, p = unsigned_at(data, p, end)
+            number, position = unsigned_at(data, position, end)
         dx, dy = 0, 0
-        if p > 0 and info & 0x20:
-            dx, p = unsigned_at(data, p, end)
-        if p > 0 and info & 0x10:
-            dy, p = unsigned_at(data, p, end)
-        if p < 0 or number < 0:
+        if position > 0 and info & 0x20:
+            dx, position = unsigned_at(data, position, end)
+        if position > 0 and info & 0x10:
+            dy, position = unsigned_at(data, position, end)
+        if position < 0 or number < 0:
             break
         new_x = -(dx >> 1) if dx & 1 else dx >> 1
         new_y = -(dy >> 1) if dy & 1 else dy >> 1
@@ -181,22 +203,25 @@ def scan_placements(
         state[0], state[1], state[3] = new_x, new_y, number
         child[count], x[count], y[count] = number, new_x, new_y
         turn[count] = (info >> 1 & 3) | (info & 1) << 2
-        count, at = count + 1, p
+        count = count + 1
+        at = position
     return at, count
 
 
 @compile_loop
 def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
-    """Running sums of the g-deltas of a repetition; x[0], y[0] are given.
+    """Running sums of the g-deltas of a repetition.
 
     Args:
         data: bytes.
         at: first byte.
         end: of the bytes.
         grid: factor of all steps.
+        x: (n,) output; x[0] is set.
+        y: (n,) output; y[0] is set.
 
     Returns:
-        the position after the last, or -1 where the list is cut or leaves 32 bits.
+        Position after the last, or -1 where the list is cut or leaves 32 bits.
     """
     for n in range(1, x.shape[0]):
         word, at = unsigned_at(data, at, end)
@@ -209,21 +234,18 @@ def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) ->
                 return -1
             dy = -(word >> 1) if word & 1 else word >> 1
         else:
-            direction, size = word >> 1 & 7, word >> 4
-            dx = (
-                0
-                if direction == 1 or direction == 3
-                else (-size if direction in (2, 5, 6) else size)
-            )
-            dy = (
-                0
-                if direction == 0 or direction == 2
-                else (-size if direction in (3, 6, 7) else size)
-            )
+            direction = word >> 1 & 7
+            size = word >> 4
+            dx = -size if direction in (2, 5, 6) else size
+            if direction == 1 or direction == 3:
+                dx = 0
+            dy = -size if direction in (3, 6, 7) else size
+            if direction == 0 or direction == 2:
+                dy = 0
         if abs(dx) > FARTHEST or abs(dy) > FARTHEST:
             return -1
-        far_x, far_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid
-        if abs(far_x) > FARTHEST or abs(far_y) > FARTHEST:
+        next_x, next_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid
+        if abs(next_x) > FARTHEST or abs(next_y) > FARTHEST:
             return -1
-        x[n], y[n] = far_x, far_y
+        x[n], y[n] = next_x, next_y
     return at

@@ -77,24 +77,24 @@ def draw_mask(
     """
     names.check_cell_name(name)
     diameters = source.diameters if isinstance(source, Lens) else source
-    across, down = (pitch_units(step, process) for step in diameters.steps_um)
-    found, classes = _drawn(source, process)
-    rows, columns = found.sites.shape
-    x0, y0, axis = _origin((rows, columns), (across, down), process.rules.grid_nm)
-    sites = found.sites.upside_down()
+    pitch, row_pitch = (pitch_units(step, process) for step in diameters.steps_um)
+    drawn_classes, classes = _drawn(source, process)
+    rows, columns = drawn_classes.sites.shape
+    x0, y0, axis = _origin((rows, columns), (pitch, row_pitch), process.rules.grid_nm)
+    sites = drawn_classes.sites.upside_down()
     lattice = PillarArray(
         "LENS",
         rows,
         columns,
-        across,
+        pitch,
         x0,
         y0,
         sites.source,
         sites.array,
-        down,
+        row_pitch,
         diameters.lattice.centred,
     )
-    bare = MaskPlan(
+    drawn_plan = MaskPlan(
         name=name,
         classes=classes,
         lattices=(lattice,),
@@ -107,13 +107,15 @@ def draw_mask(
     radius_um = diameters.radius_um + diameters.pitch_um / 2
     if furniture == "die":
         label = _label(source, radius_um)
-        bare = die.add_die_frame(bare, process, radius_um=radius_um, label=label)
+        drawn_plan = die.add_die_frame(
+            drawn_plan, process, radius_um=radius_um, label=label
+        )
     elif furniture == "aperture":
-        bare = die.open_aperture(bare, process, radius_um=radius_um)
+        drawn_plan = die.open_aperture(drawn_plan, process, radius_um=radius_um)
     if process.tone == "negative":
-        bare = tone.reverse_tone(bare, process)
-    check_layers(bare, process.layers)
-    return DrawnMask(bare, found, radius_um)
+        drawn_plan = tone.reverse_tone(drawn_plan, process)
+    check_layers(drawn_plan, process.layers)
+    return DrawnMask(drawn_plan, drawn_classes, radius_um)
 
 
 def _word(source: Lens | DiameterMap) -> str:
@@ -132,36 +134,36 @@ def die_surroundings(
     clear_um: float,
     label: str,
 ) -> DrawnMask:
-    """Marks, label, dose test and witness cells of the pillars of ``source`` around a
-    die of other things.
-
-    clear_um: half the width, about the middle, that the test structures leave free.
+    """Marks, label, dose test and witness cells around a die of other things.
 
     Args:
+        source: lens whose pillars the test structures repeat.
         process: rules, layers and die.
         name: of the top cell.
         size_um: (x, y) of the die.
+        clear_um: half the width, about the middle, that the test structures leave free.
+        label: text on the die.
 
     Raises:
         ProcessError: as :func:`plan`.
     """
-    own = dataclasses.replace(
+    frame_process = dataclasses.replace(
         process, die=dataclasses.replace(process.die, size_um=size_um, label=label)
     )
-    made = draw_mask(source, own, name=name, furniture="none")
-    whole = die.add_die_frame(
-        made.plan, own, radius_um=clear_um, label=label, around=True
+    lens_mask = draw_mask(source, frame_process, name=name, furniture="none")
+    framed = die.add_die_frame(
+        lens_mask.plan, frame_process, radius_um=clear_um, label=label, around=True
     )
-    figures = [f for f in whole.figures if f.name != "APERTURE"]
-    aperture = next(f for f in whole.figures if f.name == "APERTURE")
+    figures = [figure for figure in framed.figures if figure.name != "APERTURE"]
+    aperture = next(figure for figure in framed.figures if figure.name == "APERTURE")
     openings = {
         layer: shapes[1:] for layer, shapes in aperture.polygons.items()
     }  # without that of the lens
-    bare = whole.replace(
-        lattices=whole.lattices[:0:-1],
+    frame = framed.replace(
+        lattices=framed.lattices[:0:-1],
         figures=(dataclasses.replace(aperture, polygons=openings), *figures),
     )
-    return dataclasses.replace(made, plan=bare)
+    return dataclasses.replace(lens_mask, plan=frame)
 
 
 def wafer_mark(
@@ -172,9 +174,10 @@ def wafer_mark(
     mark_um: float,
     width_um: float,
 ) -> DrawnMask:
-    """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
+    """An alignment cross of a wafer, with witness cells.
 
     Args:
+        source: lens whose pillars the witness cells repeat.
         process: rules and layers.
         name: of the top cell.
         mark_um: arm length.
@@ -183,23 +186,25 @@ def wafer_mark(
     Raises:
         ProcessError: as :func:`plan`.
     """
-    made = draw_mask(source, process, name=name, furniture="none")
-    bare = die.add_wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
-    return dataclasses.replace(made, plan=bare)
+    lens_mask = draw_mask(source, process, name=name, furniture="none")
+    mark = die.add_wafer_mark(
+        lens_mask.plan, process, mark_um=mark_um, width_um=width_um
+    )
+    return dataclasses.replace(lens_mask, plan=mark)
 
 
 def _drawn(
     source: Lens | DiameterMap, process: Process
 ) -> tuple[cells.DrawnClasses, tuple[PillarClass, ...]]:
-    """The pillars as classes, and what is drawn for each."""
+    """The pillars of a lens as classes, and the polygons of each."""
     if isinstance(source, Lens):
         disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
         if source.diameters.angle_rad is not None or not disc:
             return shaped.shape_classes(source, process, unit_nm=UNIT_NM)
-    found = cells.quantise_diameters(
+    drawn_classes = cells.quantise_diameters(
         source.diameters if isinstance(source, Lens) else source, process
     )
-    return found, _plain_classes(found.diameters_nm, process)
+    return drawn_classes, _plain_classes(drawn_classes.diameters_nm, process)
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:
@@ -235,6 +240,7 @@ def _origin(
 
 
 def _plain_classes(diameters: Array, process: Process) -> tuple[PillarClass, ...]:
+    """Classes of round pillars: polygons of the drawn diameters, nm."""
     rules = process.rules
     return pillar_classes(
         diameters,
@@ -256,22 +262,27 @@ def check_layers(plan: MaskPlan, layers: LayerTable) -> None:
     Raises:
         ProcessError: such a datatype.
     """
-    fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
-    kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
-    seen: dict[LayerNumber, str] = {}
+    fixed = {
+        getattr(layers, field.name): field.name for field in dataclasses.fields(layers)
+    }
+    kind_of_number = {
+        getattr(layers, field.name)[0]: field.name
+        for field in dataclasses.fields(layers)
+    }
+    kind_of_layer: dict[LayerNumber, str] = {}
     drawn: list[tuple[LayerNumber, str]] = [
-        (made.layer, made.role) for made in plan.classes
+        (pillar.layer, pillar.role) for pillar in plan.classes
     ]
     drawn += [
-        (layer, kinds[layer[0]])
+        (layer, kind_of_number[layer[0]])
         for figure in plan.figures
         for layer in figure.polygons
-        if layer[0] in kinds
+        if layer[0] in kind_of_number
     ]
     for layer, kind in drawn:
-        taken = seen.setdefault(layer, kind)
-        if fixed.get(layer, kind) != kind or taken != kind:
-            other = taken if taken != kind else fixed[layer]
+        first_kind = kind_of_layer.setdefault(layer, kind)
+        if fixed.get(layer, kind) != kind or first_kind != kind:
+            other = first_kind if first_kind != kind else fixed[layer]
             raise ProcessError(
                 f"layer {layer[0]}/{layer[1]} is a dose of the {kind} layer and the {other} layer; give "
                 f"{kind} and {other} different layer numbers"
@@ -279,6 +290,7 @@ def check_layers(plan: MaskPlan, layers: LayerTable) -> None:
 
 
 def _label(source: Lens | DiameterMap, radius_um: float) -> str:
+    """Default label of a die: profile, wavelength, diameter and pitch of the lens."""
     pitch_nm = (source.diameters if isinstance(source, Lens) else source).pitch_um / nm
     size = f"{2 * radius_um / 1e3:.3g}MM P{pitch_nm:.4g}"
     if isinstance(source, Lens):

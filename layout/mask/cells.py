@@ -24,9 +24,8 @@ class DrawnClasses:
     """Quantised drawn pillars.
 
     sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
-    whole nm, thinnest first.
-    counts: (k,) pillars of each class. rounding_nm: largest difference between wanted
-    and drawn diameter.
+    whole nm, thinnest first. counts: (k,) pillars of each class. rounding_nm: largest
+    difference between the exact and the drawn diameter.
     """
 
     sites: ScratchArray
@@ -52,13 +51,15 @@ def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses
     """
     counts = np.zeros(1 << 16, np.int64)
 
-    def counted() -> Iterator[tuple[int, Array]]:
+    def count_blocks() -> Iterator[tuple[int, Array]]:
         for first, block in drawn_blocks(diameters, process):
-            found = np.bincount(block.ravel())
-            counts[: len(found)] += found
+            block_counts = np.bincount(block.ravel())
+            counts[: len(block_counts)] += block_counts
             yield first, block
 
-    drawn = hold_on_disk(diameters.diameter_um.shape, np.dtype(np.uint16), counted())
+    drawn = hold_on_disk(
+        diameters.diameter_um.shape, np.dtype(np.uint16), count_blocks()
+    )
     if counts[1:].sum() == 0:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     used = np.flatnonzero(counts)
@@ -84,15 +85,15 @@ def drawn_blocks(
 ) -> Iterator[tuple[int, Array]]:
     """(first row, drawn diameters in steps) of blocks of rows.
 
-    The bias is looked up in a table of 1/16 nm; isolation is worked out where the
-    process knows it.
+    The bias is looked up in a table of 1/16 nm. Isolation is computed where the process
+    has a bias for it.
     """
     pitch = diameters.pitch_um
     step = process.rules.diameter_step_nm
     table = np.arange(round(pitch * _FINE / nm) + 2) / _FINE
-    straight = np.rint(process.written_diameter_nm(table) / step)
-    straight[0] = 0
-    lookup = np.clip(straight, 0, 65535).astype(np.uint16)
+    drawn_steps = np.rint(process.written_diameter_nm(table) / step)
+    drawn_steps[0] = 0
+    lookup = np.clip(drawn_steps, 0, 65535).astype(np.uint16)
     for first, block, alone in with_isolation(diameters, process):
         drawn = lookup.take(
             np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32)
@@ -106,33 +107,36 @@ def drawn_blocks(
 def with_isolation(
     diameters: DiameterMap, process: Process
 ) -> Iterator[tuple[int, Array, Array | None]]:
-    """(first row, designed sizes, how alone each pillar stands) of blocks of rows of
-    some ``sites``.
-
-    The third is None where the process asks for none.
+    """Designed sizes and isolation of the pillars, in blocks of rows.
 
     Args:
         diameters: designed sizes.
+        process: bias of isolated pillars, and its range.
+
+    Yields:
+        (first row, sizes in um, isolation from 0 to 1); the third is None where the
+        process has no such bias.
     """
-    design, bias = diameters.diameter_um, process.bias
-    reach = (
+    design = diameters.diameter_um
+    bias = process.bias
+    halo = (
         isolation.isolation_halo(diameters.steps_um[1], bias.range_um)
         if bias.isolated_nm
         else 0
     )
-    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * reach)
+    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * halo)
     for first in range(0, design.shape[0], size):
         end = min(first + size, design.shape[0])
-        begin = max(0, first - reach)
-        around = np.asarray(design[begin : end + reach])
-        here = slice(first - begin, end - begin)
+        extended_first = max(0, first - halo)
+        extended = np.asarray(design[extended_first : end + halo])
+        own_rows = slice(first - extended_first, end - extended_first)
         alone = None
-        if reach:
+        if halo:
             lattice = diameters.lattice.centred
             alone = isolation.isolation_map(
-                around > 0, diameters.steps_um, bias.range_um, centred=lattice
-            )[here]
-        yield first, around[here], alone
+                extended > 0, diameters.steps_um, bias.range_um, centred=lattice
+            )[own_rows]
+        yield first, extended[own_rows], alone
 
 
 def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) -> None:
@@ -140,17 +144,29 @@ def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) 
     rows, columns = np.nonzero((alone > 0) & (design > 0))
     if not len(rows):
         return
-    wanted = process.written_diameter_nm(
+    drawn_nm = process.written_diameter_nm(
         design[rows, columns] / nm, alone[rows, columns]
     )
     drawn[rows, columns] = np.clip(
-        np.rint(wanted / process.rules.diameter_step_nm), 0, 65535
+        np.rint(drawn_nm / process.rules.diameter_step_nm), 0, 65535
     )
 
 
 def _refuse_impossible(
     drawn: Array, design: Array, first: int, pitch_um: float, step: int
 ) -> None:
+    """Refuse drawn pillars as wide as the pitch, or of diameter 0.
+
+    Args:
+        drawn: (rows, columns) drawn diameters in steps.
+        design: (rows, columns) designed diameters, um.
+        first: number of the first row.
+        pitch_um: of the lattice.
+        step: diameter step, nm.
+
+    Raises:
+        ProcessError: such a pillar, with row and column.
+    """
     widest = int(drawn.max(initial=0)) * step * nm
     if widest >= pitch_um:
         row, column = divmod(int(drawn.argmax()), drawn.shape[1])
@@ -158,9 +174,9 @@ def _refuse_impossible(
             f"drawn diameter at row {first + row}, column {column} is {widest:g} um, need less than the pitch of "
             f"{pitch_um:g} um; cap the diameters or check the bias"
         )
-    vanished = (drawn == 0) & (design > 0)
-    if vanished.any():
-        row, column = (int(i) for i in np.argwhere(vanished)[0])
+    has_vanished = (drawn == 0) & (design > 0)
+    if has_vanished.any():
+        row, column = (int(i) for i in np.argwhere(has_vanished)[0])
         raise ProcessError(
             f"pillar at row {first + row}, column {column}, {design[row, column]} um wide, would be drawn "
             f"with diameter 0 (step {step} nm); raise the smallest diameter or check the bias"

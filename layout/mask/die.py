@@ -38,24 +38,26 @@ def add_die_frame(
     label: str,
     around: bool = False,
 ) -> MaskPlan:
-    """``plan`` (the lens alone) with everything else that stands on its die.
+    """The plan of a lens with everything else on its die.
 
     Args:
-        radius_um: of the aperture. label: text, where the process gives none.
-        around: other things stand there, which ``radius_um`` from the middle leaves
-            room for along x.
+        plan: the lens alone.
+        process: layers and die.
+        radius_um: of the aperture.
+        label: text, where the process gives none.
+        around: whether the die holds other things, for which ``radius_um`` about the
+            middle stays free along x.
 
     Raises:
         ProcessError: the die is too small for the aperture and its test structures,
-            which would lie on each other, or
-            the label cannot be drawn.
+            which would overlap, or the label cannot be drawn.
     """
     unit = DatabaseUnits(plan)
     die = _outline(process, unit, radius_um)
     classes, lattices, windows = _tests(plan, process, unit, radius_um, die)
     crosses, mark_windows = marks.alignment_crosses(process, unit, die)
     scales = marks.vernier_scales(process, unit, die)
-    words, label_window = _label(process, unit, die, label)
+    letters, label_window = _label(process, unit, die, label)
     _refuse_overlaps(
         {
             "DOSETEST": windows[:1],
@@ -84,7 +86,7 @@ def add_die_frame(
             if scales.drawn
             else []
         ),
-        FigureCell("LABEL", {layers.labels: words}),
+        FigureCell("LABEL", {layers.labels: letters}),
         FigureCell("OUTLINE", {layers.outline: (die.polygon,)}),
     )
     return plan.replace(
@@ -94,20 +96,22 @@ def add_die_frame(
         layer_names={**plan.layer_names, **_layer_names(process, classes)},
         doses={
             **plan.doses,
-            **{made.layer: made.dose for made in classes},
+            **{pillar.layer: pillar.dose for pillar in classes},
             **_plain_doses(process),
         },
     )
 
 
 def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
-    """``plan`` (the lens alone) with the opening of its aperture and nothing else.
+    """The plan of a lens with the opening of its aperture and nothing else.
 
     Args:
+        plan: the lens alone.
         process: layers.
         radius_um: of the opening.
     """
-    layer, unit = process.layers.aperture, DatabaseUnits(plan)
+    layer = process.layers.aperture
+    unit = DatabaseUnits(plan)
     figure = FigureCell(
         "APERTURE",
         {layer: (aperture_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
@@ -122,24 +126,27 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
 def add_wafer_mark(
     plan: MaskPlan, process: Process, *, mark_um: float, width_um: float
 ) -> MaskPlan:
-    """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells
-    between two of its arms.
+    """An alignment cross of a wafer about (0, 0), coarse and fine.
 
-    plan: of a lens, whose pillars the witness cells repeat.
+    Witness cells stand between two of its arms.
 
     Args:
+        plan: of a lens, whose pillars the witness cells repeat.
         process: layers.
         mark_um: arm length.
         width_um: line width.
     """
-    unit, layers = DatabaseUnits(plan), process.layers
-    sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
-    some = [
-        _variant(made, "witness", f"W{n}", layers.witness, 1.0)
-        for n, made in enumerate(_spread(sizes, _ON_WAFER))
+    unit = DatabaseUnits(plan)
+    layers = process.layers
+    sizes = sorted(plan.classes, key=lambda pillar: pillar.diameter_units)
+    witnesses = [
+        _variant(pillar, "witness", f"W{n}", layers.witness, 1.0)
+        for n, pillar in enumerate(_spread(sizes, _ON_WAFER))
     ]
     sites = _blocks(
-        np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK, plan.lattices[0]
+        np.arange(len(witnesses))[None] + len(plan.classes) + 1,
+        _BLOCK,
+        plan.lattices[0],
     )
     middle = unit(mark_um / 4)
     lattice = _centred("WITNESS", sites, plan, middle)
@@ -158,7 +165,7 @@ def add_wafer_mark(
         layers.witness: "witness",
     }
     return plan.replace(
-        classes=(*plan.classes, *_same_length(some, plan)),
+        classes=(*plan.classes, *_same_length(witnesses, plan)),
         lattices=(lattice,),
         figures=figures,
         layer_names=names,
@@ -167,18 +174,21 @@ def add_wafer_mark(
 
 
 def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
-    """Polygon of the area of a circle whose edges stay within half a grid step of it,
-    at most 8000 vertices.
+    """Polygon of the area of a circle, with edges within half a grid step of it.
+
+    It has at most 8000 vertices.
 
     Args:
         radius: database units.
         centre: x and y, database units.
+        grid: step of the coordinates.
     """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
     return polygon.disc_polygon(radius, centre, count, grid)
 
 
 def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
+    """Outline of the die about the lens axis; without a size, as large as needed."""
     die = process.die
     size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
     half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
@@ -192,51 +202,71 @@ def _tests(
     radius_um: float,
     die: MarkBox,
 ) -> tuple[list[PillarClass], list[PillarArray], list[MarkBox]]:
-    """Dose array left of the lens, witness cells right of it: classes, lattices,
-    openings.
+    """Dose array on the left of the lens, witness cells on its right.
+
+    The dose array repeats six diameters at nine doses, in blocks of 16 by 16 pillars.
+    The witness cells repeat eight diameters at dose 1, in blocks of 40 by 40.
+
+    Args:
+        plan: the lens alone.
+        process: layers and die.
+        unit: from um to database units.
+        radius_um: of the aperture.
+        die: outline of the die.
+
+    Returns:
+        Classes, lattices, and the openings around both.
+
+    Raises:
+        ProcessError: no room between aperture and edge of the die.
     """
-    undosed = {made.diameter_units: made for made in plan.classes}
-    sizes = [undosed[d] for d in sorted(undosed)]
+    class_of_diameter = {pillar.diameter_units: pillar for pillar in plan.classes}
+    diameters = [class_of_diameter[units] for units in sorted(class_of_diameter)]
     doses = [
         _variant(
-            made,
+            pillar,
             "dose",
-            f"T{k}{made.name[1:4]}_{n}",
-            (process.layers.dose[0], process.layers.dose[1] + k),
+            f"T{level}{pillar.name[1:4]}_{index}",
+            (process.layers.dose[0], process.layers.dose[1] + level),
             dose,
         )
-        for k, dose in enumerate(DOSES)
-        for n, made in enumerate(_spread(sizes, _TESTED))
+        for level, dose in enumerate(DOSES)
+        for index, pillar in enumerate(_spread(diameters, _TESTED))
     ]
     witnesses = [
-        _variant(made, "witness", f"W{n}", process.layers.witness, 1.0)
-        for n, made in enumerate(_spread(sizes, _WITNESSED))
+        _variant(pillar, "witness", f"W{index}", process.layers.witness, 1.0)
+        for index, pillar in enumerate(_spread(diameters, _WITNESSED))
     ]
-    first = len(plan.classes) + 1
-    own = plan.lattices[0]
+    first_number = len(plan.classes) + 1
+    lens_lattice = plan.lattices[0]
     dose_map = _blocks(
-        np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK, own
+        np.arange(first_number, first_number + len(doses)).reshape(len(DOSES), -1),
+        _BLOCK,
+        lens_lattice,
     )
     columns = 2 if len(witnesses) > 1 else 1
-    numbers = np.arange(first + len(doses), first + len(doses) + len(witnesses))
+    numbers = np.arange(
+        first_number + len(doses), first_number + len(doses) + len(witnesses)
+    )
     witness_map = _blocks(
         np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns),
         _WITNESS,
-        own,
+        lens_lattice,
     )
-    inner = unit(radius_um + CLEAR_UM)
-    outer = die.right - unit(process.die.street_um + CLEAR_UM)
-    middle = (inner + outer) // 2
-    lattices, windows = [], []
+    least_x = unit(radius_um + CLEAR_UM)
+    largest_x = die.right - unit(process.die.street_um + CLEAR_UM)
+    centre_x = (least_x + largest_x) // 2
+    lattices = []
+    windows = []
     for name, sites, x in (
-        ("DOSETEST", dose_map, -middle),
-        ("WITNESS", witness_map, middle),
+        ("DOSETEST", dose_map, -centre_x),
+        ("WITNESS", witness_map, centre_x),
     ):
         lattice = _centred(name, sites, plan, x)
         box = _extent(lattice)
         if (
-            min(abs(box.left), abs(box.right)) < inner
-            or max(abs(box.left), abs(box.right)) > outer
+            min(abs(box.left), abs(box.right)) < least_x
+            or max(abs(box.left), abs(box.right)) > largest_x
         ):
             need = (
                 (box.right - box.left) / unit.per_um
@@ -258,11 +288,19 @@ def _refuse_overlaps(
     unit: DatabaseUnits,
     die: MarkBox,
 ) -> None:
-    """Raises: ProcessError: a structure stands on another one or on the aperture, by
-    name.
+    """Refuse structures that overlap each other or the aperture.
+
+    Args:
+        boxes: {name: boxes of the structures}.
+        aperture: centre and radius, database units.
+        unit: from um to database units.
+        die: outline of the die, for the message.
+
+    Raises:
+        ProcessError: the first overlap, with the names of both.
     """
     (x, y), radius = aperture
-    found = [
+    overlaps = [
         f"{name} and the aperture"
         for name, own in boxes.items()
         for box in own
@@ -271,28 +309,31 @@ def _refuse_overlaps(
         )
         < radius
     ]
-    found += [
-        f"{one} and {other}"
-        for one, other in itertools.combinations(boxes, 2)
-        if any(a.meets(b) for a in boxes[one] for b in boxes[other])
+    overlaps += [
+        f"{first} and {second}"
+        for first, second in itertools.combinations(boxes, 2)
+        if any(a.meets(b) for a in boxes[first] for b in boxes[second])
     ]
-    if found:
+    if overlaps:
         size = f"{(die.right - die.left) / unit.per_um:.0f} x {(die.top - die.bottom) / unit.per_um:.0f} um"
-        ways = {
+        remedies = {
             "VERNIERS": "set die.verniers = false",
             "MARKS": "draw smaller marks (die.mark_um)",
         }
-        more = "".join(f", or {way}" for name, way in ways.items() if name in found[0])
+        advice = "".join(
+            f", or {remedy}" for name, remedy in remedies.items() if name in overlaps[0]
+        )
         raise ProcessError(
-            f"{found[0]} overlap on a die of {size}; raise die.margin_um or die.size_um{more}"
+            f"{overlaps[0]} overlap on a die of {size}; raise die.margin_um or die.size_um{advice}"
         )
 
 
 def _variant(
-    made: PillarClass, role: Role, name: str, layer: tuple[int, int], dose: float
+    pillar: PillarClass, role: Role, name: str, layer: tuple[int, int], dose: float
 ) -> PillarClass:
+    """A pillar class of the same shape in another role, layer and dose."""
     return dataclasses.replace(
-        made, role=role, name=name, layer=layer, dose=dose, goal=dose
+        pillar, role=role, name=name, layer=layer, dose=dose, goal=dose
     )
 
 
@@ -305,8 +346,8 @@ def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass
             f"{len(classes)} test classes, names of {length} characters; take fewer"
         )
     return [
-        dataclasses.replace(c, name=f"{c.name[0]}{n:0{digits}}")
-        for n, c in enumerate(classes)
+        dataclasses.replace(pillar, name=f"{pillar.name[0]}{number:0{digits}}")
+        for number, pillar in enumerate(classes)
     ]
 
 
@@ -319,17 +360,30 @@ def _spread(sizes: Sequence[PillarClass], count: int) -> list[PillarClass]:
 
 
 def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
-    """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with
-    spaces between, on a lattice.
+    """Sites with blocks of equal pillars, and empty sites between the blocks.
+
+    Args:
+        numbers: (rows, columns) class number of each block.
+        side: pillars along a block.
+        lattice: of the lens; on a centred lattice every other site is empty.
+
+    Returns:
+        (rows, columns) uint16 class numbers of the sites.
     """
-    step, wide = side + _SPACE, 2 if lattice.centred else 1
+    step = side + _SPACE
+    columns_per_step = 2 if lattice.centred else 1
     sites = np.zeros(
-        (numbers.shape[0] * step - _SPACE, wide * (numbers.shape[1] * step - _SPACE)),
+        (
+            numbers.shape[0] * step - _SPACE,
+            columns_per_step * (numbers.shape[1] * step - _SPACE),
+        ),
         np.uint16,
     )
-    for (i, j), number in np.ndenumerate(numbers):
+    for (row, column), number in np.ndenumerate(numbers):
         sites[
-            i * step : i * step + side, wide * j * step : wide * (j * step + side)
+            row * step : row * step + side,
+            columns_per_step * column * step : columns_per_step
+            * (column * step + side),
         ] = number
     if lattice.centred:  # every other site, those of neighbouring rows in turn
         sites[np.add.outer(*map(np.arange, sites.shape)) % 2 == 1] = 0
@@ -337,17 +391,31 @@ def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
 
 
 def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
-    """Sites about (x, 0), as far apart as those of the lens."""
-    (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
-    left = x - (columns - 1) * like.pitch // 2
-    top = (rows - 1) * like.down // 2
-    made = PillarArray.of(
-        name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid
+    """A lattice of sites about (x, 0), with the pitches of the lens.
+
+    Args:
+        name: of the lattice.
+        sites: (rows, columns) class numbers.
+        plan: the lens, with its lattice and grid.
+        x: of the centre, database units.
+    """
+    (rows, columns), grid, lens_lattice = sites.shape, plan.grid, plan.lattices[0]
+    left = x - (columns - 1) * lens_lattice.pitch // 2
+    top = (rows - 1) * lens_lattice.down // 2
+    lattice = PillarArray.of(
+        name,
+        sites,
+        pitch=lens_lattice.pitch,
+        x0=left // grid * grid,
+        y0=top // grid * grid,
     )
-    return dataclasses.replace(made, row_pitch=like.row_pitch, centred=like.centred)
+    return dataclasses.replace(
+        lattice, row_pitch=lens_lattice.row_pitch, centred=lens_lattice.centred
+    )
 
 
 def _extent(lattice: PillarArray) -> MarkBox:
+    """Box around a lattice, half a lattice constant beyond its outer sites."""
     right = (lattice.columns - 1) * lattice.pitch
     bottom = (lattice.rows - 1) * lattice.down
     box = MarkBox(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
@@ -357,34 +425,49 @@ def _extent(lattice: PillarArray) -> MarkBox:
 def _label(
     process: Process, unit: DatabaseUnits, die: MarkBox, default: str
 ) -> tuple[tuple[Array, ...], MarkBox]:
-    """Along the lower edge, between the crosses; letters as large as fit, 35 um high at
-    most.
+    """Letters of the label along the lower edge of the die, and the box around them.
+
+    The letters are as large as fit between the crosses, 35 um high at most.
+
+    Args:
+        process: label and die.
+        unit: from um to database units.
+        die: outline of the die.
+        default: text where the process gives none.
+
+    Raises:
+        ProcessError: squares of the letters would be below 0.5 um.
     """
-    words = process.die.label or default
+    text = process.die.label or default
     inset = unit(process.die.street_um + CLEAR_UM)
-    room = die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * CLEAR_UM))
-    even = 2 * unit.grid  # halves of a square join letters
-    square = min(unit(5.0), room // max(1, 6 * len(words))) // even * even
+    free_width = (
+        die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * CLEAR_UM))
+    )
+    double_grid = 2 * unit.grid  # halves of a square join letters
+    square = (
+        min(unit(5.0), free_width // max(1, 6 * len(text))) // double_grid * double_grid
+    )
     if square < unit(0.5):
         raise ProcessError(
-            f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um"
+            f"label {text!r} does not fit on the die; shorten die.label or raise die.margin_um"
         )
-    long = font.text_width(words, square)
-    x, y = -(long // 2) // unit.grid * unit.grid, die.bottom + inset
-    box = MarkBox(x, y, x + long, y + 7 * square).grown(unit(CLEAR_UM / 2))
-    return font.text_rectangles(words, x=x, y=y, square=square), box
+    width = font.text_width(text, square)
+    x, y = -(width // 2) // unit.grid * unit.grid, die.bottom + inset
+    box = MarkBox(x, y, x + width, y + 7 * square).grown(unit(CLEAR_UM / 2))
+    return font.text_rectangles(text, x=x, y=y, square=square), box
 
 
 def _layer_names(
     process: Process, classes: Sequence[PillarClass]
 ) -> dict[tuple[int, int], str]:
+    """{layer: name} of the dose array and of all that is around the lens."""
     layers = process.layers
-    found = {
-        made.layer: f"dose_test_dose_{made.dose:.2f}"
-        for made in classes
-        if made.layer[0] == layers.dose[0]
+    dose_names = {
+        pillar.layer: f"dose_test_dose_{pillar.dose:.2f}"
+        for pillar in classes
+        if pillar.layer[0] == layers.dose[0]
     }
-    return found | {
+    return dose_names | {
         layers.aperture: "aperture",
         layers.marks: "marks",
         layers.labels: "label",

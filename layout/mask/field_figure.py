@@ -10,20 +10,29 @@ from layout.process.process import Process
 
 
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
-    """``plan`` with one rectangle for each write field, clipped to the lens.
+    """The plan with one rectangle for each write field, clipped to the lens.
 
     Args:
+        plan: with the lens as its first lattice.
         split: write fields of the lens.
         process: layers.
     """
     lattice = plan.lattices[0]
 
-    def edges(sites: np.ndarray, most: int, step: int) -> list[int]:
-        return [int(s) * step - step // 2 for s in np.unique(np.clip(sites, 0, most))]
+    def borders(sites: np.ndarray, last_site: int, step: int) -> list[int]:
+        return [
+            int(site) * step - step // 2
+            for site in np.unique(np.clip(sites, 0, last_site))
+        ]
 
-    xs = [lattice.x0 + v for v in edges(split.columns, lattice.columns, lattice.pitch)]
+    xs = [
+        lattice.x0 + border
+        for border in borders(split.columns, lattice.columns, lattice.pitch)
+    ]
     first_row = lattice.y0 - (lattice.rows - 1) * lattice.down
-    ys = [first_row + v for v in edges(split.rows, lattice.rows, lattice.down)]
+    ys = [
+        first_row + border for border in borders(split.rows, lattice.rows, lattice.down)
+    ]
     boxes = tuple(
         np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
         // plan.grid

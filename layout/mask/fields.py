@@ -83,42 +83,43 @@ class FieldPlan:
 def split_write_fields(
     diameters: DiameterMap, process: Process, *, drawn: DrawnClasses | None = None
 ) -> FieldPlan:
-    """Fields for the pillars as they are drawn (bias taken off), found in blocks of
-    rows.
+    """Write fields for the pillars as they are drawn (bias taken off).
 
     Args:
-        drawn: the pillars of this map, quantised; left out: quantised here.
         diameters: of the lens.
         process: bias, steps and write field.
+        drawn: the pillars of this map, quantised; None: quantised here.
 
     Raises:
         ProcessError: a field smaller than the pitch; as
             :func:`layout.mask.cells.quantise_diameters`.
     """
-    settings, (pitch, down) = process.write_field, diameters.steps_um
-    across, sites = (int(settings.size_um / step + 1e-9) for step in (pitch, down))
-    if min(across, sites) < 1:
+    settings, (pitch, row_pitch) = process.write_field, diameters.steps_um
+    field_columns, field_rows = (
+        int(settings.size_um / step + 1e-9) for step in (pitch, row_pitch)
+    )
+    if min(field_columns, field_rows) < 1:
         raise ProcessError(
             f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it"
         )
-    made = quantise_diameters(diameters, process) if drawn is None else drawn
-    seen = _Seen.of(diameters, made, settings.size_um)
-    rows = _edges(settings, seen.rows, sites)
-    columns = _edges(settings, seen.columns, across)
+    classes = quantise_diameters(diameters, process) if drawn is None else drawn
+    occupied = _Seen.of(diameters, classes, settings.size_um)
+    rows = _edges(settings, occupied.rows, field_rows)
+    columns = _edges(settings, occupied.columns, field_columns)
     clearance = (
-        min(pitch, down) - float(made.diameters_nm[-1]) * nm
+        min(pitch, row_pitch) - float(classes.diameters_nm[-1]) * nm
     ) / 2  # below 0 where borders cut pillars
-    counts = _counted(made, rows, columns)
+    counts = _counted(classes, rows, columns)
     return FieldPlan(
         rows,
         columns,
-        made.sites.shape,
+        classes.sites.shape,
         pitch,
         settings.mode,
         counts,
-        seen.cut,
+        occupied.cut,
         clearance,
-        down,
+        row_pitch,
     )
 
 
@@ -133,46 +134,73 @@ class _Seen:
     cut: int = 0
 
     @classmethod
-    def of(cls, diameters: DiameterMap, made: DrawnClasses, size_um: float) -> "_Seen":
-        """In one pass over the classes."""
-        shape = made.sites.shape
-        table = np.r_[0.0, made.diameters_nm * nm]
-        found = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
-        near_x = _near(diameters.x_um, size_um)
-        near_y = _near(diameters.y_um, size_um)
-        columns = np.flatnonzero(near_x < np.inf)
-        for first, block in made.sites.blocks():
-            found.rows[first : first + len(block)] = block.any(1)
-            found.columns |= block.any(0)
-            rows = np.flatnonzero(near_y[first : first + len(block)] < np.inf)
-            upright = table[block[:, columns]] > 2 * near_x[columns]
-            level = table[block[rows]] > 2 * near_y[first + rows, None]
-            found.cut += int(
-                upright.sum() + level.sum() - (upright[rows] & level[:, columns]).sum()
+    def of(
+        cls, diameters: DiameterMap, classes: DrawnClasses, size_um: float
+    ) -> "_Seen":
+        """Occupied rows and columns, and pillars that a raster about the axis cuts.
+
+        A border cuts a pillar whose radius exceeds the distance between them.
+
+        Args:
+            diameters: of the lens.
+            classes: its drawn pillars.
+            size_um: side of a field.
+        """
+        shape = classes.sites.shape
+        diameter_of_class = np.r_[0.0, classes.diameters_nm * nm]
+        occupied = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
+        distance_x = _near(diameters.x_um, size_um)
+        distance_y = _near(diameters.y_um, size_um)
+        columns = np.flatnonzero(distance_x < np.inf)
+        for first, block in classes.sites.blocks():
+            occupied.rows[first : first + len(block)] = block.any(1)
+            occupied.columns |= block.any(0)
+            rows = np.flatnonzero(distance_y[first : first + len(block)] < np.inf)
+            cut_by_x = diameter_of_class[block[:, columns]] > 2 * distance_x[columns]
+            cut_by_y = (
+                diameter_of_class[block[rows]] > 2 * distance_y[first + rows, None]
             )
-        return found
+            occupied.cut += int(
+                cut_by_x.sum()
+                + cut_by_y.sum()
+                - (cut_by_x[rows] & cut_by_y[:, columns]).sum()
+            )
+        return occupied
 
 
-def _counted(made: DrawnClasses, rows: Array, columns: Array) -> Array:
+def _counted(classes: DrawnClasses, rows: Array, columns: Array) -> Array:
     """(y fields, x fields) pillars in each field."""
-    down = np.clip(rows, 0, made.sites.shape[0]).tolist()
-    across = np.clip(columns, 0, made.sites.shape[1]).tolist()
-    step = max(1, BLOCK_SITES // max(1, made.sites.shape[1]))
-    found = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
-    for i, (first, end) in enumerate(itertools.pairwise(down)):
-        held = np.zeros(made.sites.shape[1], np.int64)
+    down = np.clip(rows, 0, classes.sites.shape[0]).tolist()
+    across = np.clip(columns, 0, classes.sites.shape[1]).tolist()
+    step = max(1, BLOCK_SITES // max(1, classes.sites.shape[1]))
+    counts = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
+    for field_row, (first, end) in enumerate(itertools.pairwise(down)):
+        column_counts = np.zeros(classes.sites.shape[1], np.int64)
         for begin in range(first, end, step):
-            held += np.count_nonzero(
-                made.sites.source(begin, min(begin + step, end)), axis=0
+            column_counts += np.count_nonzero(
+                classes.sites.source(begin, min(begin + step, end)), axis=0
             )
-        found[i] = [held[a:b].sum() for a, b in itertools.pairwise(across)]
-    return found
+        counts[field_row] = [
+            column_counts[left:right].sum()
+            for left, right in itertools.pairwise(across)
+        ]
+    return counts
 
 
 def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
-    """Field borders along one axis, from which lattice lines hold pillars."""
-    held = np.flatnonzero(occupied)
-    first, span = int(held[0]), int(held[-1] - held[0] + 1)
+    """Field borders along one axis, as numbers of lattice lines.
+
+    ``floating``: equal parts of the occupied span. Else fields of ``sites`` lines, the
+    raster centred on the span.
+
+    Args:
+        settings: mode of the write fields.
+        occupied: (lines,) which lattice lines hold pillars.
+        sites: most lines of a field.
+    """
+    lines = np.flatnonzero(occupied)
+    first = int(lines[0])
+    span = int(lines[-1] - lines[0] + 1)
     count = -(-span // sites)
     if settings.mode == "floating":
         return np.asarray(first + np.arange(count + 1) * span // count)
@@ -182,9 +210,10 @@ def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
 
 
 def _near(positions_um: Array, size_um: float) -> Array:
-    """Distance from each lattice line to the nearest border, inf where it is beyond the
-    pitch.
+    """(lines,) distance from each lattice line to the nearest border of a raster, um.
+
+    The raster has a corner on the axis; inf where the border is beyond half a pitch.
     """
-    away = abs(positions_um - size_um * np.rint(positions_um / size_um))
+    distance = abs(positions_um - size_um * np.rint(positions_um / size_um))
     pitch = positions_um[1] - positions_um[0] if len(positions_um) > 1 else np.inf
-    return np.asarray(np.where(away < pitch / 2 + 1e-9, away, np.inf))
+    return np.asarray(np.where(distance < pitch / 2 + 1e-9, distance, np.inf))

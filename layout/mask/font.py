@@ -33,9 +33,9 @@ def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, 
     """Rectangles of a line of text, small letters as capitals.
 
     Args:
-        x, y: lower left corner; square: side of one square of the letters, even; all in
-            database units.
         words: the line of text.
+        x, y: lower left corner, database units.
+        square: side of one square of the letters, even, database units.
 
     Raises:
         ProcessError: a character that the font does not hold.
@@ -54,7 +54,19 @@ def text_width(words: str, square: int) -> int:
 
 
 def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
-    for n, letter in enumerate(words.upper()):
+    """Rectangles of a line of text: runs of squares in each row of a letter.
+
+    Where two rows meet at a corner alone, two half squares join them.
+
+    Args:
+        words: the line of text.
+        x, y: lower left corner, database units.
+        square: side of one square, even.
+
+    Raises:
+        ProcessError: a character that the font does not hold.
+    """
+    for position, letter in enumerate(words.upper()):
         if letter not in _GLYPHS:
             raise ProcessError(
                 f"label {words!r}: no {letter!r} in the font; use letters, digits and {_others()}"
@@ -64,19 +76,25 @@ def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
             bottom = y + (6 - row) * square
             for first, end in _runs(bits):
                 yield _box(
-                    x + (n * 6 + first) * square, bottom, (end - first) * square, square
+                    x + (position * 6 + first) * square,
+                    bottom,
+                    (end - first) * square,
+                    square,
                 )
         for row, (above, below) in enumerate(itertools.pairwise(rows)):
             for column, rises in _joints(above, below):
-                left = x + (n * 6 + column) * square
-                at = y + (6 - row) * square
+                left = x + (position * 6 + column) * square
+                border = y + (6 - row) * square
                 half = square // 2
-                yield _box(left - half * rises, at, half, half)
-                yield _box(left - half * (not rises), at - half, half, half)
+                yield _box(left - half * rises, border, half, half)
+                yield _box(left - half * (not rises), border - half, half, half)
 
 
-def _box(left: int, bottom: int, wide: int, high: int) -> Array:
-    return rectilinear.box_corners(np.array([left, bottom, left + wide, bottom + high]))
+def _box(left: int, bottom: int, width: int, height: int) -> Array:
+    """(4, 2) corners of a rectangle."""
+    return rectilinear.box_corners(
+        np.array([left, bottom, left + width, bottom + height])
+    )
 
 
 def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
@@ -84,23 +102,31 @@ def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
     square is the right one.
     """
     for column in range(1, 5):
-        left, right = 5 - column, 4 - column
+        left_bit, right_bit = 5 - column, 4 - column
         upper, lower = (
-            (bits >> left & 1, bits >> right & 1) for bits in (above, below)
+            (bits >> left_bit & 1, bits >> right_bit & 1) for bits in (above, below)
         )
         if {upper, lower} == {(0, 1), (1, 0)}:
             yield column, upper == (0, 1)
 
 
 def _runs(bits: int) -> Iterator[tuple[int, int]]:
-    columns = [c for c in range(5) if bits >> (4 - c) & 1]
-    for c in columns:
-        if c - 1 not in columns:
-            end = c
+    """(first column, column after the last) of the runs of set bits of a row."""
+    columns = [column for column in range(5) if bits >> (4 - column) & 1]
+    for column in columns:
+        if column - 1 not in columns:
+            end = column
             while end in columns:
                 end += 1
-            yield c, end
+            yield column, end
 
 
 def _others() -> str:
-    return " ".join(sorted(c for c in _GLYPHS if not c.isalnum() and c != " "))
+    """Characters of the font that are no letters, digits or space."""
+    return " ".join(
+        sorted(
+            character
+            for character in _GLYPHS
+            if not character.isalnum() and character != " "
+        )
+    )

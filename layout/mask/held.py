@@ -11,7 +11,7 @@ import numpy as np
 from layout.mask.plan import BLOCK_SITES, PillarArray, RowSource
 from metalens.core.arrays import Array
 
-MOST_BYTES = 1 << 27  # kept in memory
+MOST_BYTES = 1 << 27  # of an array in memory
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -61,11 +61,9 @@ class DatabaseUnits:
     """From micrometres to database units on the grid."""
 
     def __init__(self, plan: MaskPlan) -> None:
-        self.per_um, self.grid, self.pitch = (
-            1e3 / plan.unit_nm,
-            plan.grid,
-            plan.lattices[0].constant,
-        )
+        self.per_um = 1e3 / plan.unit_nm
+        self.grid = plan.grid
+        self.pitch = plan.lattices[0].constant
 
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid
@@ -92,15 +90,18 @@ class VernierScales:
 def alignment_crosses(
     process: Process, unit: DatabaseUnits, die: MarkBox
 ) -> tuple[tuple[Array, ...], list[MarkBox]]:
-    """A cross in each corner, a fine one beside it, and beside the upper left an F,
-    unlike all its turns and mirrors.
+    """A coarse and a fine cross in each corner of the die, and an F in one corner.
 
-    Shapes, and the windows that the aperture opens around them.
+    The F, next to the upper left cross, differs from all its rotations and mirror
+    images.
 
     Args:
         process: size of marks and street.
         unit: of the plan.
         die: outline of the die.
+
+    Returns:
+        Polygons, and the windows that the aperture opens around them.
     """
     arm = unit(process.die.mark_um / 2)
     width = unit(process.die.mark_width_um / 2)
@@ -109,14 +110,17 @@ def alignment_crosses(
     thin = _thin(width, unit)
     shapes: list[Array] = []
     boxes = []
-    for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-        x, y = sx * (die.right - inset), sy * (die.top - inset)
-        away = y - sy * (arm + unit(CLEAR_UM) + fine)
-        for at, reach, half in (((x, y), arm, width), ((x, away), fine, thin)):
-            shapes.append(cross_polygon(*at, reach, half))
+    for sign_x, sign_y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        x, y = sign_x * (die.right - inset), sign_y * (die.top - inset)
+        fine_y = y - sign_y * (arm + unit(CLEAR_UM) + fine)
+        for centre, reach, half in (((x, y), arm, width), ((x, fine_y), fine, thin)):
+            shapes.append(cross_polygon(*centre, reach, half))
             boxes.append(
                 MarkBox(
-                    at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach
+                    centre[0] - reach,
+                    centre[1] - reach,
+                    centre[0] + reach,
+                    centre[1] + reach,
                 ).grown(unit(CLEAR_UM / 2))
             )
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
@@ -164,7 +168,8 @@ def wafer_cross(
         mark_um: arm length.
         width_um: line width.
     """
-    arm, half = unit(mark_um / 2), unit(width_um / 2)
+    arm = unit(mark_um / 2)
+    half = unit(width_um / 2)
     inner = arm // _FINE // unit.grid * unit.grid * 2
     thin = _thin(half, unit)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
@@ -176,18 +181,19 @@ def wafer_cross(
 
 
 def _thin(half: int, unit: DatabaseUnits) -> int:
+    """Half the line width of a fine cross, from that of the coarse cross."""
     return max(unit.grid, half // _FINE // unit.grid * unit.grid)
 
 
 def vernier_scales(
     process: Process, unit: DatabaseUnits, die: MarkBox
 ) -> VernierScales:
-    """Verniers along x and y and a box in a box, from the upper right cross to the
-    left; none where none are wanted.
+    """Verniers along x and y and a box in a box, left of the upper right cross.
 
     Args:
-        process: pitch and step of the verniers.
+        process: pitch and step of the verniers, and whether there are any.
         unit: of the plan.
+        die: outline of the die.
 
     Raises:
         ProcessError: the die is too narrow for them, or the step of the vernier is
@@ -201,42 +207,65 @@ def vernier_scales(
         raise ProcessError(
             f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
         )
-    long, clear = BARS * (pitch + step) + pitch // 2, unit(CLEAR_UM)
+    half_length = BARS * (pitch + step) + pitch // 2
+    clear = unit(CLEAR_UM)
     arm = unit(process.die.mark_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM)
-    high = unit(_LONG_UM + 2 * _GAP_UM)
-    top = die.top - inset - high
+    bar_height = unit(_LONG_UM + 2 * _GAP_UM)
+    top = die.top - inset - bar_height
     right = die.right - inset - 2 * arm - 2 * clear
-    upright = right - high, die.top - inset - long
-    outer = unit(_OUTER_UM / 2)
-    middle = upright[0] - high - clear - outer, die.top - inset - outer
-    level = middle[0] - outer - clear - long, top
+    vertical = right - bar_height, die.top - inset - half_length
+    half_outer = unit(_OUTER_UM / 2)
+    box_centre = (
+        vertical[0] - bar_height - clear - half_outer,
+        die.top - inset - half_outer,
+    )
+    horizontal = box_centre[0] - half_outer - clear - half_length, top
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
-    if level[0] - long < die.left + inset + 2 * arm + 2 * clear + 5 * square:
-        need = (
-            die.right - level[0] + long + inset + 2 * arm + 2 * clear + 5 * square
+    if (
+        horizontal[0] - half_length
+        < die.left + inset + 2 * arm + 2 * clear + 5 * square
+    ):
+        need_um = (
+            die.right
+            - horizontal[0]
+            + half_length
+            + inset
+            + 2 * arm
+            + 2 * clear
+            + 5 * square
         ) / unit.per_um
         raise ProcessError(
-            f"the die is too narrow for VERNIERS: {need:.0f} um are needed; raise die.margin_um or die.size_um, or set "
+            f"the die is too narrow for VERNIERS: {need_um:.0f} um are needed; raise die.margin_um or die.size_um, or set "
             "die.verniers = false"
         )
-    drawn, openings = [], []
-    for at, turned in ((level, False), (upright, True)):
-        one, two = _vernier(unit, pitch, step)
-        drawn += [_placed(bar, at, turned) for bar in one]
-        openings += [_placed(bar, at, turned) for bar in two]
-    x, y = middle
-    half = unit(_INNER_UM / 2)
-    drawn.append(MarkBox(x - half, y - half, x + half, y + half).polygon)
-    openings.append(MarkBox(x - outer, y - outer, x + outer, y + outer).polygon)
+    drawn = []
+    openings = []
+    for centre, is_vertical in ((horizontal, False), (vertical, True)):
+        bars, windows = _vernier(unit, pitch, step)
+        drawn += [_placed(bar, centre, is_vertical) for bar in bars]
+        openings += [_placed(bar, centre, is_vertical) for bar in windows]
+    x, y = box_centre
+    half_inner = unit(_INNER_UM / 2)
+    drawn.append(
+        MarkBox(x - half_inner, y - half_inner, x + half_inner, y + half_inner).polygon
+    )
+    openings.append(
+        MarkBox(x - half_outer, y - half_outer, x + half_outer, y + half_outer).polygon
+    )
     return VernierScales(tuple(drawn), tuple(openings))
 
 
 def _vernier(
     unit: DatabaseUnits, pitch: int, step: int
 ) -> tuple[list[Array], list[Array]]:
-    """Bars about (0, 0): drawn ones above, within a window of the film; openings of the
-    film below.
+    """Bars of a vernier about (0, 0), in database units.
+
+    The drawn bars, ``pitch`` apart, stand above the axis. The bars opened in the film,
+    ``pitch + step`` apart, are below it.
+
+    Returns:
+        Drawn bars; openings, the last of which is the window around the drawn bars.
     """
     half = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid)
     gap = unit(_GAP_UM)
@@ -244,13 +273,13 @@ def _vernier(
         MarkBox(x - half, gap, x + half, gap + long).polygon
         for x, long in _bars(unit, pitch)
     ]
-    opened = [
+    openings = [
         MarkBox(x - half, -gap - long, x + half, -gap).polygon
         for x, long in _bars(unit, pitch + step)
     ]
     reach = BARS * pitch + pitch // 2
     return drawn, [
-        *opened,
+        *openings,
         unit.snapped(MarkBox(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon,
     ]
 
@@ -270,6 +299,7 @@ def _placed(shape: Array, at: tuple[int, int], upright: bool) -> Array:
 
 
 def _letter_f(x: int, y: int, s: int) -> Array:
+    """(10, 2) corners of an F, 5 by 7 squares of side s, from (x, y) up."""
     corners = [
         (0, 0),
         (1, 0),

@@ -35,17 +35,14 @@ class PillarClass:
     """All pillars of one diameter (and dose): one cell of the mask.
 
     name: of the cell. diameter_nm, diameter_units: of the circle that ``outline``
-    stands for, as drawn.
-    layer: (layer, datatype). outline: (n, 2) of the pillar, convex or not,
-    counter-clockwise. drawn: polygons that are
-    written (the outline itself; in pieces where it has holes; or what is left of the
-    lattice square for a negative
-    tone). dose: relative to the base dose. goal: wanted exposure of the edge, relative
-    to dose-to-size (1 but in a dose
-    test). round: whether the outline stands for a circle of that diameter; else the
-    diameter is the size of the shape.
-    holes: what is left out of the outline, clockwise.
-    role: a pillar of the lens, of the dose test or of the witness cells.
+    stands for, as drawn. layer: (layer, datatype). outline: (n, 2) of the pillar,
+    convex or not, counter-clockwise. drawn: polygons that are written: the outline
+    itself; pieces where it has holes; or the lattice square without the pillar, for a
+    negative tone. dose: relative to the base dose. goal: exposure of the edge that is
+    sought, relative to dose to size (1 but in a dose test). round: whether the outline
+    stands for a circle of that diameter; else the diameter is the size of the shape.
+    holes: in the outline, clockwise. role: a pillar of the lens, of the dose test or of
+    the witness cells.
     """
 
     name: str
@@ -106,6 +103,7 @@ class PillarArray:
     unit_um: float = 1e-3
 
     def __post_init__(self) -> None:
+        """Refuse an illegal name, and sites beyond 32 bits."""
         names.check_cell_name(self.name)
         right = self.x0 + self.columns * self.pitch
         bottom = self.y0 - self.rows * self.down
@@ -234,8 +232,9 @@ class PillarArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FigureCell:
-    """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database
-    units.
+    """A cell of fixed polygons, such as marks or the label.
+
+    polygons: {(layer, datatype): polygons}, each (n, 2) in database units.
     """
 
     name: str
@@ -256,16 +255,12 @@ class MaskPlan:
     """Everything that goes into a mask file.
 
     name: of the top cell. unit_nm: database unit. grid: step of all coordinates, in
-    database units.
-    classes: pillar classes; number k of a lattice is ``classes[k - 1]``. lattices: the
-    lens first.
-    layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that
-    is exposed.
-    axis: of the lens in database units (off (0, 0) by at most half a grid step, where
-    the lattice cannot be centred
-    on the grid).
-    standing: for a negative tone, the mask of what stays; None where the drawn shapes
-    stay.
+    database units. classes: pillar classes; number k of a lattice is ``classes[k -
+    1]``. lattices: the lens first. layer_names: shown by viewers. doses: relative dose
+    of each (layer, datatype) that is exposed. axis: of the lens in database units (off
+    (0, 0) by at most half a grid step, where the lattice cannot be centred on the
+    grid). standing: for a negative tone, the mask of what stays; None where the drawn
+    shapes stay.
     """
 
     name: str
@@ -289,7 +284,11 @@ class MaskPlan:
     @property
     def cell_names(self) -> list[str]:
         """Pillar classes, figures, lattices, top: in the order of the file."""
-        return [*(made.name for made in self.classes), *self.placed_names, self.name]
+        return [
+            *(pillar.name for pillar in self.classes),
+            *self.placed_names,
+            self.name,
+        ]
 
     @property
     def placed_names(self) -> list[str]:
@@ -302,13 +301,15 @@ class MaskPlan:
     @property
     def layers(self) -> set[LayerNumber]:
         """All that are drawn on."""
-        used = {made.layer for made in self.classes}
-        return used | {layer for f in self.figures for layer in f.polygons}
+        used = {pillar.layer for pillar in self.classes}
+        return used | {layer for figure in self.figures for layer in figure.polygons}
 
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
         none = np.zeros(len(self.classes) + 1, np.int64)
-        return sum((l.counts(len(self.classes)) for l in self.lattices), none)
+        return sum(
+            (lattice.counts(len(self.classes)) for lattice in self.lattices), none
+        )
 
     def replace(self, **changes: object) -> "MaskPlan":
         """A copy with other values."""
@@ -337,20 +338,22 @@ def pillar_classes(
         shape: ``round`` or ``shot``.
         prefix: first letter of the names.
     """
-    digits = max((len(str(int(d))) for d in diameters), default=1)
-    made = []
-    for d in diameters:
+    digits = max((len(str(int(diameter))) for diameter in diameters), default=1)
+    classes = []
+    for diameter in diameters:
         outline = (
-            polygon.pillar_polygon(int(d) / grid, vertices=vertices, shape=shape).points
+            polygon.pillar_polygon(
+                int(diameter) / grid, vertices=vertices, shape=shape
+            ).points
             * grid
         )
-        made.append(
+        classes.append(
             PillarClass(
-                f"{prefix}{int(d):0{digits}}",
-                float(d) * unit_nm,
-                int(d),
+                f"{prefix}{int(diameter):0{digits}}",
+                float(diameter) * unit_nm,
+                int(diameter),
                 layer,
                 outline,
             )
         )
-    return tuple(made)
+    return tuple(classes)

@@ -27,7 +27,7 @@ _LENGTHS = 1 << 20  # above any drawn size in nm
 def shape_classes(
     source: Lens, process: Process, *, unit_nm: float
 ) -> tuple[DrawnClasses, tuple[PillarClass, ...]]:
-    """The pillars of a lens as classes, and what is drawn for each.
+    """The pillars of a lens as classes, with the polygons of each.
 
     Args:
         source: lens of shaped or rotated pillars.
@@ -39,10 +39,11 @@ def shape_classes(
             grid or the bias closes.
         LensError: no pillar.
     """
-    d, cell = source.diameters, source.cell
-    turns = _turns(cell, d, process)
+    diameters = source.diameters
+    cell = source.cell
+    turns = _turns(cell, diameters, process)
     counts: dict[int, int] = {}
-    for _, block in _keys(d, process, turns):
+    for _, block in _keys(diameters, process, turns):
         for key, count in zip(*np.unique(block, return_counts=True), strict=True):
             counts[int(key)] = counts.get(int(key), 0) + int(count)
     used = np.array(sorted(key for key in counts if key), np.int64)
@@ -52,55 +53,69 @@ def shape_classes(
         raise ProcessError(
             f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
         )
-    kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
-    every = np.r_[0, used]
+    dtype: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
+    sorted_keys = np.r_[0, used]
     numbered = (
-        (first, np.searchsorted(every, block).astype(kind))
-        for first, block in _keys(d, process, turns)
+        (first, np.searchsorted(sorted_keys, block).astype(dtype))
+        for first, block in _keys(diameters, process, turns)
     )
-    sites = hold_on_disk(d.diameter_um.shape, kind, numbered)
-    made = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
-    across = np.array(
-        [2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made]
+    sites = hold_on_disk(diameters.diameter_um.shape, dtype, numbered)
+    classes = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
+    widths_nm = np.array(
+        [2 * float(np.hypot(*pillar.outline.T).max()) * unit_nm for pillar in classes]
     )
-    found = np.array([counts[int(key)] for key in used])
-    return DrawnClasses(sites, across, found, process.rules.diameter_step_nm / 2), made
+    class_counts = np.array([counts[int(key)] for key in used])
+    return DrawnClasses(
+        sites, widths_nm, class_counts, process.rules.diameter_step_nm / 2
+    ), classes
 
 
-def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
-    """Classes of turns; 1 where none is turned."""
-    if d.angle_rad is None:
+def _turns(cell: Cell, diameters: DiameterMap, process: Process) -> int:
+    """Number of distinct drawn rotations; 1 where no pillar is rotated."""
+    if diameters.angle_rad is None:
         return 1
-    whole = 180.0 if cell.outline(cell.pitch_um / 2).repeats(math.pi) else 360.0
-    return max(1, round(whole / process.rules.angle_step_deg))
+    period_deg = 180.0 if cell.outline(cell.pitch_um / 2).repeats(math.pi) else 360.0
+    return max(1, round(period_deg / process.rules.angle_step_deg))
 
 
-def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, Array]]:
-    """(first row, key) of blocks of rows; 0 for no pillar.
+def _keys(
+    diameters: DiameterMap, process: Process, turns: int
+) -> Iterator[tuple[int, Array]]:
+    """Integer key of each pillar's drawn shape, in blocks of rows.
 
-    key: drawn size in nm, plus ``_LENGTHS`` times the second number of the shape; times
-    the turns, plus the turn. The
-    second number is the drawn length of pillars of two sizes; of others the whole nm
-    that the bias of the lone one
-    differs by, less the least (0 where the process knows none): two pillars that are
-    drawn as wide, one of them
-    alone, are not of one design.
+    key = (drawn + 2^20 second) turns + turn, with the drawn size in nm. ``second`` is
+    the drawn length of pillars of two sizes. For others it is isolation times |isolated
+    bias|, in nm: pillars of equal drawn size and different isolation have other
+    designs.
+
+    Args:
+        diameters: sizes, lengths and rotations.
+        process: bias and steps.
+        turns: number of distinct rotations.
+
+    Yields:
+        (first row, (rows, columns) keys); 0 for no pillar.
     """
-    lone = process.bias.isolated_nm
-    for first, block, alone in with_isolation(d, process):
+    isolated_nm = process.bias.isolated_nm
+    for first, block, isolation_block in with_isolation(diameters, process):
         rows = slice(first, first + len(block))
         design = np.asarray(block, float) / nm
-        beside = 0.0 if alone is None else alone
-        drawn = _steps(design, design, process, beside)
-        if d.length_um is not None:
+        isolation = 0.0 if isolation_block is None else isolation_block
+        drawn = _steps(design, design, process, isolation)
+        if diameters.length_um is not None:
             drawn += _LENGTHS * _steps(
-                np.asarray(d.length_um[rows], float) / nm, design, process, beside
+                np.asarray(diameters.length_um[rows], float) / nm,
+                design,
+                process,
+                isolation,
             )
-        elif alone is not None:
-            drawn += _LENGTHS * np.rint(alone * abs(lone)).astype(np.int64)
+        elif isolation_block is not None:
+            drawn += _LENGTHS * np.rint(isolation_block * abs(isolated_nm)).astype(
+                np.int64
+            )
         turn = np.zeros(design.shape, np.int64)
-        if d.angle_rad is not None:
-            degrees = np.degrees(np.asarray(d.angle_rad[rows], float))
+        if diameters.angle_rad is not None:
+            degrees = np.degrees(np.asarray(diameters.angle_rad[rows], float))
             turn = (
                 np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
             )
@@ -110,8 +125,16 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
 def _steps(
     size_nm: Array, design_nm: Array, process: Process, alone: Array | float
 ) -> Array:
-    """Sizes as they are drawn, in whole steps; ``alone``: as
-    :meth:`metalens.fabrication.Bias.drawn_nm` takes it.
+    """Drawn sizes in nm, whole steps of the process; 0 for no pillar.
+
+    Args:
+        size_nm: designed sizes.
+        design_nm: above 0 where a pillar stands.
+        process: bias and step.
+        alone: as :meth:`metalens.fabrication.Bias.drawn_nm` takes it.
+
+    Raises:
+        ProcessError: a pillar below one step.
     """
     step = process.rules.diameter_step_nm
     drawn = (
@@ -127,24 +150,37 @@ def _steps(
 def _class(
     source: Lens, key: int, process: Process, turns: int, unit_nm: float
 ) -> PillarClass:
-    """What is drawn for a key."""
-    both, turn = divmod(key, turns)
-    second, drawn = divmod(both, _LENGTHS)
+    """Pillar class of a key of :func:`_keys`: outline, holes and name.
+
+    Args:
+        source: lens of shaped or rotated pillars.
+        key: drawn size, second number and rotation.
+        process: rules and bias.
+        turns: number of distinct rotations.
+        unit_nm: database unit.
+    """
+    shape_key, turn = divmod(key, turns)
+    second, drawn = divmod(shape_key, _LENGTHS)
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
     if source.diameters.length_um is not None:
         name = f"D{drawn:05}L{second:05}"
-        made = cell_of_sizes(source.cell, float(drawn), float(second)).outline(
+        shape = cell_of_sizes(source.cell, float(drawn), float(second)).outline(
             drawn * nm
         )  # each axis by the bias of its size
     else:
-        lone = process.bias.isolated_nm
+        isolated_nm = process.bias.isolated_nm
         name += f"I{second}" if second else ""
-        made = _biased(source.cell, drawn, process, second / abs(lone) if lone else 0.0)
+        shape = _biased(
+            source.cell,
+            drawn,
+            process,
+            second / abs(isolated_nm) if isolated_nm else 0.0,
+        )
     step_nm = process.rules.grid_nm * unit_nm
     turn_rad = math.radians(turn * process.rules.angle_step_deg)
     contours = [
         _gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm
-        for part in made.parts
+        for part in shape.parts
     ]
     outline = contours[0]
     holes = tuple(hole[::-1] for hole in contours[1:])
@@ -153,9 +189,17 @@ def _class(
         if holes
         else ()
     )
-    layer, units = process.layers.pillar, round(drawn / unit_nm)
+    layer = process.layers.pillar
+    drawn_units = round(drawn / unit_nm)
     return PillarClass(
-        name, float(drawn), units, layer, outline, pieces, round=False, holes=holes
+        name,
+        float(drawn),
+        drawn_units,
+        layer,
+        outline,
+        pieces,
+        round=False,
+        holes=holes,
     )
 
 
@@ -166,21 +210,29 @@ def _gridded(
     process: Process,
     name: str,
 ) -> Array:
-    """(n, 2) whole grid steps about the site, counter-clockwise: a circle of its area,
-    any other part corner by corner.
+    """(n, 2) corners of a part on the grid, in grid steps about the site.
+
+    A circle is a polygon of equal area; any other part is rounded corner by corner.
+
+    Args:
+        part: of an outline, um.
+        turn_rad: rotation of the pillar.
+        step_nm: grid.
+        process: number of vertices.
+        name: of the class, for messages.
 
     Raises:
         ProcessError: fewer than three corners are left, or a circle of less than four
             steps.
     """
     if isinstance(part, EllipseArc) and part.half_x_um == part.half_y_um:
-        across = 2 * part.half_x_um / nm / step_nm
-        if across < 4:
+        diameter_steps = 2 * part.half_x_um / nm / step_nm
+        if diameter_steps < 4:
             raise ProcessError(
-                f"class {name}: a circle of {across * step_nm:.3g} nm; need four steps of the grid"
+                f"class {name}: a circle of {diameter_steps * step_nm:.3g} nm; need four steps of the grid"
             )
         return polygon.pillar_polygon(
-            across, vertices=process.rules.vertices, shape=process.rules.shape
+            diameter_steps, vertices=process.rules.vertices, shape=process.rules.shape
         ).points
     corners = (
         rotate_corners(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
@@ -195,14 +247,20 @@ def _gridded(
 
 
 def _biased(cell: Cell, drawn: int, process: Process, alone: float) -> Outline:
-    """The outline of a drawn size: all edges moved alike by the bias of the process.
+    """Outline of a drawn size: the bias of the process moves all edges equally.
+
+    Args:
+        cell: with the shape of the pillars.
+        drawn: size, nm.
+        process: bias.
+        alone: isolation of the pillar, 0 to 1.
 
     Raises:
         ProcessError: the bias closes a hole.
     """
-    made = float(process.bias.made_nm(np.array(float(drawn)), alone)) * nm
-    outline = cell.outline(made, grow_um=drawn * nm - made)
-    if len(outline.parts) != len(cell.outline(made).parts):
+    made_um = float(process.bias.made_nm(np.array(float(drawn)), alone)) * nm
+    outline = cell.outline(made_um, grow_um=drawn * nm - made_um)
+    if len(outline.parts) != len(cell.outline(made_um).parts):
         raise ProcessError(
             f"a {cell.shape.name} drawn {drawn} nm wide would have no hole; need a larger size"
         )

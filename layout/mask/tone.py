@@ -16,26 +16,28 @@ _WINDOW_UM = 5.0  # around marks and labels, on their own layer
 
 
 def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
-    """The mask that leaves standing what ``plan`` draws; the layers of a second step
-    (aperture) stay as they are.
+    """The mask that leaves standing what a plan draws: its gaps are drawn.
+
+    The layers of a second step (aperture) stay as they are.
 
     Args:
+        plan: of the standing pillars.
         process: layers.
 
     Raises:
         ProcessError: a pillar wider than its lattice square, lattices of different
             pitches.
     """
-    kinds = {
+    pitches = {
         (lattice.pitch, lattice.down, lattice.centred) for lattice in plan.lattices
     }
-    if len(kinds) > 1:
+    if len(pitches) > 1:
         raise ProcessError(
-            f"tone 'negative' with lattices of pitches {sorted({each[0] for each in kinds})}: put them on masks of "
+            f"tone 'negative' with lattices of pitches {sorted({pitch[0] for pitch in pitches})}: put them on masks of "
             "their own"
         )
     square = _square(plan.lattices[0], plan.grid)
-    classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
+    classes = tuple(_around(pillar, square, plan.grid) for pillar in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     clear = [
         box
@@ -47,17 +49,19 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     ]
     if clear:
         figures.append(FigureCell("CLEAR", {process.layers.pillar: tuple(clear)}))
-    kept = [
+    unexposed = [
         figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)
     ]
-    return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
+    return plan.replace(classes=classes, figures=(*unexposed, *figures), standing=plan)
 
 
 def lattice_box(lattice: PillarArray, grid: int) -> Array:
-    """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
-    the ends of every other row).
+    """(4, 2) corners around all lattice squares together.
+
+    On a centred lattice the half squares at the ends of every other row are included.
 
     Args:
+        lattice: of pillars.
         grid: step of the coordinates.
     """
     left, bottom, right, top = _square(lattice, grid)
@@ -85,63 +89,87 @@ def _square(lattice: PillarArray, grid: int) -> tuple[int, int, int, int]:
 
 
 def _around(
-    made: PillarClass, square: tuple[int, int, int, int], grid: int
+    pillar: PillarClass, square: tuple[int, int, int, int], grid: int
 ) -> PillarClass:
-    (left, bottom), (right, top) = made.outline.min(0), made.outline.max(0)
+    """A pillar class that draws its lattice square without the pillar.
+
+    Args:
+        pillar: class of the standing pillars.
+        square: left, bottom, right, top about the site.
+        grid: step of the coordinates.
+
+    Raises:
+        ProcessError: the pillar is wider than the square.
+    """
+    (left, bottom), (right, top) = pillar.outline.min(0), pillar.outline.max(0)
     if left < square[0] or bottom < square[1] or right > square[2] or top > square[3]:
         raise ProcessError(
-            f"class {made.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
+            f"class {pillar.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
             f"{square[2] - square[0]} by {square[3] - square[1]}: tone 'negative' draws what is left of the square; "
             "widen the pitch"
         )
-    left_over = region.subtract_contours(
-        [rectilinear.box_corners(np.array(square))], made.contours
+    remainder = region.subtract_contours(
+        [rectilinear.box_corners(np.array(square))], pillar.contours
     )
     return dataclasses.replace(
-        made, drawn=tuple(region.without_holes(left_over, grid=grid))
+        pillar, drawn=tuple(region.without_holes(remainder, grid=grid))
     )
 
 
 def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
-    """Rectangles over what no pillar's square covers: equal runs of neighbouring rows
-    together.
+    """Rectangles over the squares of sites without pillar.
 
-    left_of, top_of: edges of a square about its site. In columns of the grid: a brick
-    covers two of them.
+    Equal runs of empty columns in neighbouring rows are one rectangle. On a centred
+    lattice a square covers two columns.
+
+    Args:
+        lattice: of pillars.
+        left_of: left edge of a square about its site.
+        top_of: top edge.
     """
-    made: list[Array] = []
-    open_runs: dict[tuple[int, int], int] = {}
+    rectangles: list[Array] = []
+    first_row_of_run: dict[tuple[int, int], int] = {}
 
     def close(run: tuple[int, int], end: int) -> Array:
         left, right = (lattice.x0 + column * lattice.pitch + left_of for column in run)
         top, bottom = (
             lattice.y0 - row * lattice.down + top_of
-            for row in (open_runs.pop(run), end)
+            for row in (first_row_of_run.pop(run), end)
         )
         return rectilinear.box_corners(np.array([left, bottom, right, top]))
 
-    wide = 2 if lattice.centred else 1
+    site_columns = 2 if lattice.centred else 1
     for first, block in lattice.blocks():
-        free = np.ones((len(block), lattice.columns + wide - 1), bool)
-        for part in range(wide):
-            free[:, part : part + lattice.columns] &= block == 0
+        free = np.ones((len(block), lattice.columns + site_columns - 1), bool)
+        for offset in range(site_columns):
+            free[:, offset : offset + lattice.columns] &= block == 0
         for row, empty in enumerate(free, first):
             edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
             runs = set(zip(edges[::2], edges[1::2], strict=True))
-            made += [close(run, row) for run in sorted(open_runs.keys() - runs)]
-            open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
-    return made + [close(run, lattice.rows) for run in sorted(open_runs)]
+            rectangles += [
+                close(run, row) for run in sorted(first_row_of_run.keys() - runs)
+            ]
+            first_row_of_run.update(dict.fromkeys(runs - first_row_of_run.keys(), row))
+    return rectangles + [close(run, lattice.rows) for run in sorted(first_row_of_run)]
 
 
 def _surroundings(
     plan: MaskPlan, process: Process, boxes: list[Array]
 ) -> list[FigureCell]:
-    """Windows without their marks and labels, and the rest of the die."""
+    """Figures around the lattices of a negative tone: windows, and the die frame.
+
+    The window of a figure is a box 5 um wider than each of its shapes, without the
+    shapes, on the layer of the figure. The frame is the die without lattices, windows
+    and shapes.
+
+    Returns:
+        Figures; none where the plan has no outline of a die.
+    """
     die = [
-        p
+        outline
         for figure in plan.figures
         if figure.name == "OUTLINE"
-        for p in figure.polygons[process.layers.outline]
+        for outline in figure.polygons[process.layers.outline]
     ]
     if not die:
         return []
@@ -157,25 +185,28 @@ def _surroundings(
         for shapes in figure.polygons.values()
         for shape in shapes
     ]
-    taken, made = list(boxes), []
+    covered = list(boxes)
+    figures = []
     for figure in drawn:
-        left = {}
+        polygons = {}
         for layer, shapes in figure.polygons.items():
             window = region.overlap_contours(
-                region.subtract_contours([_grown(s, margin) for s in shapes], taken),
+                region.subtract_contours(
+                    [_grown(shape, margin) for shape in shapes], covered
+                ),
                 die,
             )
-            left[layer] = tuple(
+            polygons[layer] = tuple(
                 region.without_holes(
                     region.subtract_contours(window, standing), grid=plan.grid
                 )
             )
-            taken += [_grown(s, margin) for s in shapes]
-        made.append(FigureCell(figure.name, left))
-    rest = region.without_holes(
-        region.subtract_contours(die, [*taken, *standing]), grid=plan.grid
+            covered += [_grown(shape, margin) for shape in shapes]
+        figures.append(FigureCell(figure.name, polygons))
+    frame = region.without_holes(
+        region.subtract_contours(die, [*covered, *standing]), grid=plan.grid
     )
-    return [*made, FigureCell("FRAME", {process.layers.pillar: tuple(rest)})]
+    return [*figures, FigureCell("FRAME", {process.layers.pillar: tuple(frame)})]
 
 
 def _rim(boxes: list[Array], width: int, process: Process) -> FigureCell:

@@ -22,12 +22,11 @@ COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at ea
 class ExposureTable:
     """What each entry exposes at unit dose; entry 0 is no pillar.
 
-    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur.
-    goal: (entries,) wanted exposure of the edge, in units of what clears.
-    own: (entries,) exposure at the edge by the pillar itself, less what the far field
-    counts for it.
-    slope: (entries,) its fall per um that the edges move out. count: (entries,) pillars
-    of each.
+    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur. goal:
+    (entries,) exposure of the edge that is sought, over the threshold. own: (entries,)
+    exposure at the edge by the pillar itself, less what the far field counts for it.
+    slope: (entries,) fall of the exposure per um that the edges move out. count:
+    (entries,) pillars of each.
     """
 
     drawn: DrawnKinds
@@ -53,13 +52,14 @@ class ExposureTable:
 class ScatterRanges:
     """The point exposure split by how far its Gaussians reach.
 
-    far: at least six times as wide as neighbours are apart, summed on nodes over the
-    whole die. middle: reach
-    neighbours only, summed on the sites of each lattice. near: reach no neighbour.
-    Widths of far and middle are widened
-    by the mean pillar: a disc adds R^2 / 2 to the squared width of a Gaussian, the ring
-    on which it is seen R^2; any
-    other shape the mean squared distances from its centre of its area and of its edges.
+    far: at least six times as wide as the distance of neighbours, summed on nodes over
+    the whole die. middle: reach neighbours only, summed on the sites of each lattice.
+    near: reach no neighbour.
+
+    Widths of far and middle are widened by the mean pillar. A disc adds R^2 / 2 to the
+    squared width of a Gaussian, and its edge, where the exposure is evaluated, R^2. Any
+    other shape adds the mean squared distances of its area and of its edges from its
+    centre.
     """
 
     far: PointExposure
@@ -78,7 +78,10 @@ def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
 def split_ranges(
     point: PointExposure, drawn: DrawnKinds, number: Array, body: PillarArray
 ) -> ScatterRanges:
-    """Which Gaussians reach how far, for these pillars on the densest of the lattices.
+    """Split the Gaussians of a point exposure by how far they reach among the pillars.
+
+    Far: at least six lattice steps wide. Middle: others that neighbours receive. Near:
+    others. Far and middle are widened by the mean size of the pillars.
 
     Args:
         point: exposure of a beam.
@@ -89,7 +92,7 @@ def split_ranges(
     mass = number * drawn.area_um2
     total = float(mass.sum())
     wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
-    reach = np.array(
+    from_neighbours = np.array(
         [
             _neighbour_exposure(drawn, number > 0, body.steps_um, width)
             for width in point.widths_um
@@ -97,30 +100,38 @@ def split_ranges(
     )
     far = point.widths_um >= COARSE * body.nearest_um
     middle = ~far & (
-        (reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.nearest_um)
+        (from_neighbours * point.weights > _NEGLIGIBLE)
+        | (point.widths_um > body.nearest_um)
     )
 
-    def some(chosen: Array, wider: float) -> PointExposure:
+    def widened(chosen: Array, wider: float) -> PointExposure:
         return PointExposure(
             np.sqrt(point.widths_um[chosen] ** 2 + wider), point.weights[chosen]
         )
 
     return ScatterRanges(
-        some(far, wider), some(middle, wider), some(~far & ~middle, 0.0)
+        widened(far, wider), widened(middle, wider), widened(~far & ~middle, 0.0)
     )
 
 
 def _neighbour_exposure(
     drawn: DrawnKinds, used: Array, steps_um: Array, width_um: float
 ) -> float:
-    """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind
-    that receives most.
+    """Mean exposure of the edges of a pillar by equal neighbours, at the largest.
+
+    Args:
+        drawn: kinds of pillars.
+        used: (entries,) which occur.
+        steps_um: (n, 2) positions of the neighbours.
+        width_um: 1/e radius of one Gaussian of weight 1.
     """
-    found = [0.0]
+    exposures = [0.0]
     for entry in drawn.widest(used, steps_um) if used.any() else []:
-        at = drawn.edge_points_um(entry)[:, None] - steps_um
-        found.append(float(drawn.exposure_at(entry, at, width_um).sum(1).mean()))
-    return max(found)
+        positions = drawn.edge_points_um(entry)[:, None] - steps_um
+        exposures.append(
+            float(drawn.exposure_at(entry, positions, width_um).sum(1).mean())
+        )
+    return max(exposures)
 
 
 def exposure_table(
@@ -132,25 +143,28 @@ def exposure_table(
     ranges: ScatterRanges,
     body: PillarArray,
 ) -> ExposureTable:
-    """The table of a mask.
+    """What each entry of a mask exposes at its own edge, and what is sought there.
 
     Args:
-        body: the densest of the lattices.
         drawn: kinds of pillars.
-        goal: (entries,) wanted edge exposure over the threshold.
+        goal: (entries,) edge exposure sought, over the threshold.
         number: (entries,) pillars of each.
+        point: exposure of a beam.
         ranges: the same by reach.
+        body: the densest of the lattices.
 
     Raises:
         ProcessError: no pillar, or pillars so much finer than the point exposure that
-            their own dose hardly tells.
+            their own dose hardly changes their edge.
     """
     used = number > 0
     if not used.any():
         raise ProcessError("no pillar is drawn: there is nothing to expose")
     area = np.where(used, drawn.area_um2, 0.0)
-    whole, slope = drawn.edge_exposure(used, point)
-    own = np.where(used, whole - area * float(ranges.far.density(np.array(0.0))), 0.0)
+    own_and_far, slope = drawn.edge_exposure(used, point)
+    own = np.where(
+        used, own_and_far - area * float(ranges.far.density(np.array(0.0))), 0.0
+    )
     neighbours = area * _neighbour_bound(ranges.middle, body)
     if own[used].min() < _FAINT or (neighbours >= 0.9 * own)[used].any():
         thin = 1e3 * float(drawn.diameter_um[used][own[used].argmin()])
@@ -162,18 +176,23 @@ def exposure_table(
 
 
 def _neighbour_bound(middle: PointExposure, body: PillarArray) -> float:
-    """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to
-    each other, per um^2.
+    """Bound of the eigenvalues of the middle convolution without its centre, per um^2.
 
-    The sum over all other sites; or, as the whole kernel has no negative ones, what a
-    site would give to itself.
+    The smaller of two bounds: the sum of the kernel over all other sites, and its value
+    at 0 (the whole kernel has no negative eigenvalues).
+
+    Args:
+        middle: Gaussians that reach neighbours only.
+        body: lattice of pillars.
     """
     reach = 5 * float(middle.widths_um.max(initial=0.0))
-    i, j = (
+    columns, rows = (
         np.arange(-n, n + 1)
         for n in (int(np.ceil(reach / step)) for step in (body.pitch_um, body.down_um))
     )
-    distance = np.hypot(i * body.pitch_um, (j * body.down_um)[:, None])
-    sites = distance[(i + j[:, None]) % 2 == 0] if body.centred else distance
-    itself = float(middle.density(np.array(0.0)))
-    return min(itself, float(middle.density(sites).sum()) - itself)
+    distance = np.hypot(columns * body.pitch_um, (rows * body.down_um)[:, None])
+    distances = (
+        distance[(columns + rows[:, None]) % 2 == 0] if body.centred else distance
+    )
+    at_zero = float(middle.density(np.array(0.0)))
+    return min(at_zero, float(middle.density(distances).sum()) - at_zero)

@@ -80,8 +80,8 @@ def correct_plans(
             point exposure; datatypes of the doses that are layers of something else.
     """
     wanted = [solve_doses(plan, exposure) for plan in plans]
-    ladder = dose_ladder([one.spans(exposure) for one in wanted], exposure)
-    dosed = [apply_dose_classes(one, ladder) for one in wanted]
+    ladder = dose_ladder([doses.spans(exposure) for doses in wanted], exposure)
+    dosed = [apply_dose_classes(doses, ladder) for doses in wanted]
     for plan in dosed:
         if layers is not None:
             check_layers(plan, layers)
@@ -103,7 +103,11 @@ class DoseLadder:
     needed: int
 
     def nearest(self, dose: Array) -> Array:
-        """Class of the nearest dose."""
+        """Class of the nearest dose on the logarithmic scale, uint8.
+
+        Args:
+            dose: relative doses of any shape.
+        """
         span = float(np.log(self.factors[-1] / self.factors[0]))
         per_log = (len(self.factors) - 1) / span if span > 0 else 0.0
         level = np.rint(np.log(np.maximum(dose, 1e-9) / self.factors[0]) * per_log)
@@ -113,10 +117,11 @@ class DoseLadder:
 def dose_ladder(
     spans: Sequence[tuple[float, float, float]], settings: ExposureSettings
 ) -> DoseLadder:
-    """The doses of a job, at most ``maximum_classes``.
+    """The doses of a job, at most ``maximum_classes``, in a geometric series.
 
-    A quarter of the tolerance is left for the background of rounded doses and for what
-    changes across a piece of a mark.
+    A quarter of the tolerance is reserved for the background of rounded doses, and for
+    what changes across a piece of a mark. With the ratio of :meth:`WantedDoses.spans`,
+    the step is 2 ln(1 + 0.75 / ratio).
 
     Args:
         spans: of all dies of a job, from :meth:`WantedDoses.spans`.
@@ -124,7 +129,7 @@ def dose_ladder(
     """
     least = min(low for low, _, _ in spans)
     span = max(high for _, high, _ in spans) / least
-    step = 2 * np.log1p(_ROUNDED / max(share for _, _, share in spans))
+    step = 2 * np.log1p(_ROUNDED / max(ratio for _, _, ratio in spans))
     needed = max(1, int(np.ceil(np.log(span) / step - 1e-9)))
     count = min(needed, settings.maximum_classes)
     return DoseLadder(least * span ** ((np.arange(count) + 0.5) / count), needed)
@@ -134,11 +139,11 @@ def dose_ladder(
 class ExposedMarks:
     """Marks and labels in pieces of one dose each, as masses on the nodes.
 
-    boxes: (pieces, 4) left, bottom, right, top, database units.
-    figure: (pieces, 2) number of the figure, and of the layer in it.
-    own: (pieces,) exposure of the outer edges by their own shape at unit dose.
-    points, piece: (n, 2) points on the outer edges, and (n,) whose they are.
-    spots: points, areas and pieces of what stands for the pieces on the nodes.
+    boxes: (pieces, 4) left, bottom, right, top, database units. figure: (pieces, 2)
+    number of the figure, and of the layer in it. own: (pieces,) exposure of the outer
+    edges by their own shape at unit dose. points: (n, 2) points on the outer edges, um.
+    piece: (n,) piece of each point. spots: points, areas and pieces of the samples that
+    represent the pieces on the nodes.
     """
 
     grid: NodeGrid
@@ -155,8 +160,12 @@ class ExposedMarks:
         return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
 
     def doses(self, field: Array) -> Array:
-        """(pieces,) doses that give the outer edges their exposure on a background (y,
-        x) of the nodes.
+        """(pieces,) doses that give the outer edges their exposure on a background.
+
+        dose = (THRESHOLD - mean background over the points of the piece) / own.
+
+        Args:
+            field: (y, x) background on the nodes.
         """
         if not len(self.own):
             return np.empty(0)
@@ -164,8 +173,8 @@ class ExposedMarks:
         total = np.bincount(
             self.piece, self.grid.sample(field, *self.points.T), minlength=count
         )
-        around = total / np.bincount(self.piece, minlength=count)
-        return np.asarray((THRESHOLD - around) / self.own)
+        background = total / np.bincount(self.piece, minlength=count)
+        return np.asarray((THRESHOLD - background) / self.own)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -188,24 +197,33 @@ class WantedDoses:
     marks: ExposedMarks
 
     def of_pillars(self, number: int, first: int, block: Array) -> Array:
-        """(rows, columns) wanted doses of rows of a lattice; what stands where there is
-        no pillar means nothing.
+        """Dose that gives each pillar's edge its exposure, for rows of a lattice.
+
+        dose = (THRESHOLD goal - background) / own, with the exposures of
+        :class:`ExposureTable`.
 
         Args:
             number: of the lattice.
             first: row of the block.
             block: (rows, columns) classes.
+
+        Returns:
+            (rows, columns) relative doses; values at sites without pillar mean nothing.
         """
         lattice = self.lattices[number]
         grid = self.marks.grid
         table = self.table
-        field = np.empty(block.shape, np.float32)
+        background = np.empty(block.shape, np.float32)
         down = grid.y.at(lattice.rows_um(first, len(block)))
-        interpolate_from_nodes(self.far, *down, *grid.x.at(lattice.columns_um), field)
+        interpolate_from_nodes(
+            self.far, *down, *grid.x.at(lattice.columns_um), background
+        )
         if self.near:
-            field += self.near[number][first : first + len(block)]
-        own = np.where(table.used, table.own, 1.0)
-        return np.asarray(((THRESHOLD * table.goal)[block] - field) / own[block])
+            background += self.near[number][first : first + len(block)]
+        own_exposure = np.where(table.used, table.own, 1.0)
+        return np.asarray(
+            ((THRESHOLD * table.goal)[block] - background) / own_exposure[block]
+        )
 
     def classes(
         self, number: int, first: int, block: Array, ladder: DoseLadder
@@ -215,41 +233,51 @@ class WantedDoses:
         return np.where(block > 0, level, np.uint8(NONE))
 
     def spans(self, settings: ExposureSettings) -> tuple[float, float, float]:
-        """Least and largest dose, and the largest ratio of two relative changes of an
-        edge's exposure: of one that the dose changes, and of the one allowed.
+        """Least and largest dose, and how finely doses must be graded.
 
-        Where the edge is so soft that the tolerance moves it by more than a nanometre
-        of width, less is allowed.
+        A relative change of a dose changes the exposure of its own edge by less,
+        because the background stays. The ratio of both changes, over the allowed
+        relative change of the exposure, is the third number.
+
+        Allowed is the tolerance, or less where the edge is so soft that the tolerance
+        moves it by more than 0.7 nm of width.
+
+        Args:
+            settings: with the tolerance of the exposure.
         """
-        table, tolerance = self.table, settings.tolerance
-        least, largest, finest = np.inf, 0.0, 0.0
+        table = self.table
+        tolerance = settings.tolerance
+        least = np.inf
+        largest = 0.0
+        finest = 0.0
 
-        def take(dose: Array, share: Array) -> None:
+        def update(dose: Array, ratio: Array) -> None:
             nonlocal least, largest, finest
             least = min(least, float(dose.min(initial=np.inf)))
             largest = max(largest, float(dose.max(initial=0.0)))
-            finest = max(finest, float(share.max(initial=0.0)))
+            finest = max(finest, float(ratio.max(initial=0.0)))
 
         for number, lattice in enumerate(self.lattices):
             for first, block in lattice.blocks():
                 kind = block[block > 0]
                 dose = self.of_pillars(number, first, block)[block > 0]
                 goal = THRESHOLD * table.goal[kind]
-                steep = _SOFTEST_UM * table.slope[kind] / 2 / goal
-                share = dose * table.own[kind] / goal
-                take(dose, share / np.minimum(tolerance, steep * dose))
-        near = (
+                allowed_per_dose = _SOFTEST_UM * table.slope[kind] / 2 / goal
+                ratio = dose * table.own[kind] / goal
+                update(dose, ratio / np.minimum(tolerance, allowed_per_dose * dose))
+        point = (
             self.ranges.near if len(self.ranges.near.widths_um) else self.ranges.middle
         )
         dose = self.marks.doses(self.far)
-        allowed = np.minimum(tolerance, straight_edge_error(near) * dose)
-        take(dose, dose * self.marks.own / THRESHOLD / allowed)
+        allowed_change = np.minimum(tolerance, straight_edge_error(point) * dose)
+        update(dose, dose * self.marks.own / THRESHOLD / allowed_change)
         return least, largest, finest
 
 
 def straight_edge_error(point: PointExposure) -> float:
-    """Relative error of the exposure that moves both edges of a line of dose 1 by what
-    rounded doses may.
+    """Relative change of exposure that changes the width of a line by 0.7 nm.
+
+    A line of dose 1 has the slope sum weights / (sqrt(pi) widths) at its edge.
 
     Args:
         point: narrow terms of the point exposure.
@@ -259,7 +287,10 @@ def straight_edge_error(point: PointExposure) -> float:
 
 
 def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
-    """The doses that everything on a plan needs, before they are rounded to classes.
+    """The doses that all shapes of a plan need, before they are rounded to classes.
+
+    Near Gaussians are in the table of each pillar kind; middle and far Gaussians form a
+    background that depends on all doses (:func:`_backgrounds`).
 
     Args:
         plan: every dose 1.
@@ -274,40 +305,48 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
             "are drawn); draw the pillars, or set exposure.correct = false"
         )
     unit = plan.unit_nm * nm
-    lattices = [dataclasses.replace(l, unit_um=unit) for l in plan.lattices]
+    lattices = [dataclasses.replace(lattice, unit_um=unit) for lattice in plan.lattices]
     point = psf.point_exposure(exposure)
-    goal = np.array([1.0, *(made.goal for made in plan.classes)])
+    goal = np.array([1.0, *(pillar.goal for pillar in plan.classes)])
     kinds = _drawn(plan, unit)
-    number = bodies.count_pillars(lattices, len(goal))
+    counts = bodies.count_pillars(lattices, len(goal))
     densest = min(lattices, key=lambda lattice: lattice.nearest_um)
-    ranges = bodies.split_ranges(point, kinds, number, densest)
+    ranges = bodies.split_ranges(point, kinds, counts, densest)
     table = bodies.exposure_table(
-        kinds, goal, number, point=point, ranges=ranges, body=densest
+        kinds, goal, counts, point=point, ranges=ranges, body=densest
     )
-    boxes, figure, group = _pieces(plan, lattices, point, exposure.tolerance)
-    width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
-    ends = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
-    box = (*ends[:, :2].min(0).tolist(), *ends[:, 2:].max(0).tolist())
-    grid = NodeGrid.over(box, width)
-    close = PointExposure(
+    boxes, figure, shape = _pieces(plan, lattices, point, exposure.tolerance)
+    narrowest_um = (
+        float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
+    )
+    boxes_um = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
+    die_box = (*boxes_um[:, :2].min(0).tolist(), *boxes_um[:, 2:].max(0).tolist())
+    grid = NodeGrid.over(die_box, narrowest_um)
+    near_and_middle = PointExposure(
         np.r_[ranges.near.widths_um, ranges.middle.widths_um],
         np.r_[ranges.near.weights, ranges.middle.weights],
     )
-    own = rects.self_exposure(boxes * unit, group, close)
-    spots = rects.rectangle_samples(boxes * unit, width / _SPOTS)
-    marks = ExposedMarks(grid, boxes, figure, *own, spots)
+    edges = rects.self_exposure(boxes * unit, shape, near_and_middle)
+    spots = rects.rectangle_samples(boxes * unit, narrowest_um / _SPOTS)
+    marks = ExposedMarks(grid, boxes, figure, *edges, spots)
     far, near = _backgrounds(lattices, table, ranges, marks)
     return WantedDoses(plan, lattices, table, ranges, far, near, marks)
 
 
 def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
-    """The classes as discs where all stand for one, else as polygons."""
-    if all(made.round for made in plan.classes):
+    """Classes as discs where all are round, else as polygons; um."""
+    if all(pillar.round for pillar in plan.classes):
         return DrawnDiscs(
-            np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
+            np.array([0.0, *(pillar.diameter_nm * nm for pillar in plan.classes)])
         )
     return DrawnOutlines(
-        [(), *([c * unit for c in made.contours] for made in plan.classes)]
+        [
+            (),
+            *(
+                [contour * unit for contour in pillar.contours]
+                for pillar in plan.classes
+            ),
+        ]
     )
 
 
@@ -320,55 +359,70 @@ def _backgrounds(
     ranges: ScatterRanges,
     marks: ExposedMarks,
 ) -> tuple[Array, list[Array]]:
-    """Far field on the nodes and middle field on the sites that belong to the wanted
-    doses, in turn until they rest.
+    """Background exposure at the doses sought, by alternating relaxation.
+
+    The far field comes from all shapes, through the nodes; the middle field from
+    neighbours on the same lattice. Both depend on the doses, and the doses on both:
+    dose = (THRESHOLD goal - far - middle) / own. Each is relaxed with the other fixed,
+    until the far field changes by less than 1e-7, at most 12 times.
+
+    Returns:
+        (y, x) far field on the nodes, and (rows, columns) middle field of each lattice;
+        the list is empty where the point exposure has no middle range.
     """
     grid = marks.grid
     mass, goal = _masses(lattices, table, grid)
     spacing = grid.y.spacing_um, grid.x.spacing_um
-    reach = gaussian_convolution(grid.shape, spacing, point=ranges.far, hollow=False)
+    far_convolution = gaussian_convolution(
+        grid.shape, spacing, point=ranges.far, hollow=False
+    )
     middles = [
         middle_convolution(lattice, ranges)
         for lattice in lattices
         if len(ranges.middle.widths_um)
     ]
-    field = _relaxed(reach, mass, THRESHOLD * goal, marks=marks)
-    near: list[Array] = []
+    field = _relaxed(far_convolution, mass, THRESHOLD * goal, marks=marks)
+    middle_fields: list[Array] = []
     for _ in range(12 if middles else 0):
-        near, taken = [], np.zeros(grid.shape)
+        middle_fields = []
+        carried = np.zeros(grid.shape)
         for lattice, middle in zip(lattices, middles, strict=True):
-            index = np.concatenate([block for _, block in lattice.blocks()])
+            classes = np.concatenate([block for _, block in lattice.blocks()])
             across = grid.x.at(lattice.columns_um)
             down = grid.y.at(lattice.rows_um(0, lattice.rows))
-            far = np.empty(index.shape, np.float32)
-            interpolate_from_nodes(field, *down, *across, far)
-            per_own = table.per_own.take(index)
-            drive = (THRESHOLD * table.goal.take(index) - far) * per_own
-            own = _relaxed(middle, per_own, drive, bound_below=0.9)
-            near.append(own.astype(np.float32))
-            rows, columns = np.nonzero(index)
+            far_field = np.empty(classes.shape, np.float32)
+            interpolate_from_nodes(field, *down, *across, far_field)
+            per_own = table.per_own.take(classes)
+            source = (THRESHOLD * table.goal.take(classes) - far_field) * per_own
+            middle_field = _relaxed(middle, per_own, source, bound_below=0.9)
+            middle_fields.append(middle_field.astype(np.float32))
+            rows, columns = np.nonzero(classes)
             x = lattice.columns_um[columns]
             y = lattice.rows_um(0, lattice.rows)[rows]
-            taken += grid.deposit(x, y, (own * per_own)[rows, columns])
-        before = field
-        field = _relaxed(reach, mass, THRESHOLD * goal - taken, marks=marks)
-        if np.abs(field - before).max() < 1e-7:
+            carried += grid.deposit(x, y, (middle_field * per_own)[rows, columns])
+        previous = field
+        field = _relaxed(far_convolution, mass, THRESHOLD * goal - carried, marks=marks)
+        if np.abs(field - previous).max() < 1e-7:
             break
-    return field, near
+    return field, middle_fields
 
 
 def _masses(
     lattices: Sequence[PillarArray], table: ExposureTable, grid: NodeGrid
 ) -> tuple[Array, Array]:
-    """Node sums of area / own, and goal area / own."""
-    value = np.stack([table.per_own, table.per_own * table.goal])
-    out = np.zeros((2, *grid.shape))
+    """(y, x) sums over the nodes of area / own, and of goal area / own.
+
+    A pillar of dose (THRESHOLD goal - field) / own deposits area times that dose, so
+    both sums give the deposited mass for any field.
+    """
+    per_class = np.stack([table.per_own, table.per_own * table.goal])
+    sums = np.zeros((2, *grid.shape))
     for lattice in lattices:
         across = grid.x.at(lattice.columns_um)
         for first, block in lattice.blocks():
             down = grid.y.at(lattice.rows_um(first, len(block)))
-            gather_to_nodes(block, value, *down, *across, out)
-    return out[0], out[1]
+            gather_to_nodes(block, per_class, *down, *across, sums)
+    return sums[0], sums[1]
 
 
 def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:
@@ -397,29 +451,38 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
 
 
 def _relaxed(
-    reach: RadialConvolution,
+    convolution: RadialConvolution,
     mass: Array,
-    drive: Array,
+    source: Array,
     *,
     bound_below: float = 0.0,
     marks: ExposedMarks | None = None,
 ) -> Array:
-    """B = K * [drive - B mass + marks(B)], to 1e-8, by relaxation; eigenvalues of K *
-    mass lie between -bound_below and the largest row sum.
+    """Solve B = K * [source - B mass + marks(B)] for the background B, to 1e-8.
+
+    B <- B + step (K * [...] - B), with step = 2 / (2 + bound - bound_below). The
+    eigenvalues of K * mass lie between -bound_below and bound, its largest row sum.
+
+    Args:
+        convolution: with the kernel K.
+        mass: (y, x) mass that a background of 1 takes away.
+        source: (y, x) mass without background.
+        bound_below: bound of the negative eigenvalues.
+        marks: marks and labels, whose doses also depend on B; None: no marks.
     """
     has_marks = marks is not None and len(marks.own) > 0
-    all_mass = mass
+    total_mass = mass
     if marks is not None and has_marks:
-        all_mass = mass + marks.deposited(1 / marks.own)
-    bound = float(reach(all_mass).max())
+        total_mass = mass + marks.deposited(1 / marks.own)
+    bound = float(convolution(total_mass).max())
     step = 2 / (2 + bound - bound_below)
-    rate = max(1 - step * (1 - bound_below), step * (1 + bound) - 1, 1e-3)
+    convergence = max(1 - step * (1 - bound_below), step * (1 + bound) - 1, 1e-3)
     field = np.zeros_like(mass)
-    for _ in range(int(np.ceil(np.log(1e-8) / np.log(rate)))):
-        given = drive - field * mass
+    for _ in range(int(np.ceil(np.log(1e-8) / np.log(convergence)))):
+        deposited = source - field * mass
         if marks is not None and has_marks:
-            given = given + marks.deposited(marks.doses(field))
-        change = reach(given) - field
+            deposited = deposited + marks.deposited(marks.doses(field))
+        change = convolution(deposited) - field
         field += step * change
         if np.abs(change).max() < 1e-9:
             break
@@ -435,53 +498,76 @@ def _pieces(
     point: PointExposure,
     tolerance: float,
 ) -> tuple[Array, Array, Array]:
-    """Rectangles of all exposed figures, fractured to pieces of one dose each: (n, 4)
-    boxes, (n, 2) figure and layer number, (n,) shape.
+    """Rectangles of all exposed figures, fractured to pieces of one dose each.
+
+    Args:
+        plan: with marks and labels.
+        lattices: of pillars, in um; pieces are shorter near them.
+        point: exposure of a beam.
+        tolerance: relative, of the exposure.
+
+    Returns:
+        (n, 4) left, bottom, right, top in database units, (n, 2) numbers of the figure
+        and of the layer in it, and (n,) number of the connected shape.
     """
-    whole = [np.empty((0, 4), np.int64)]
-    of = [np.empty((0, 2), np.int64)]
-    group = [np.empty(0, np.int64)]
+    rectangles = [np.empty((0, 4), np.int64)]
+    layer_of_box = [np.empty((0, 2), np.int64)]
+    shape = [np.empty(0, np.int64)]
     shapes = 0
-    for f, figure in enumerate(plan.figures):
+    for figure_number, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:
             continue
-        for m, polygons in enumerate(figure.polygons.values()):
-            boxes = np.concatenate([rectilinear.split_rectilinear(p) for p in polygons])
-            whole.append(boxes)
-            of.append(np.tile([f, m], (len(boxes), 1)))
-            group.append(shapes + _touching(boxes))
-            shapes = int(group[-1].max()) + 1
-    cut, box = fracture_boxes(
-        np.concatenate(whole) // plan.grid,
+        for layer_number, polygons in enumerate(figure.polygons.values()):
+            boxes = np.concatenate(
+                [rectilinear.split_rectilinear(polygon) for polygon in polygons]
+            )
+            rectangles.append(boxes)
+            layer_of_box.append(np.tile([figure_number, layer_number], (len(boxes), 1)))
+            shape.append(shapes + _touching(boxes))
+            shapes = int(shape[-1].max()) + 1
+    pieces, rectangle = fracture_boxes(
+        np.concatenate(rectangles) // plan.grid,
         np.array([lattice.box_um for lattice in lattices]),
         step_um=plan.grid * plan.unit_nm * nm,
         point=point,
         tolerance=min(tolerance, straight_edge_error(point)),
     )
-    return cut * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
+    return (
+        pieces * plan.grid,
+        np.concatenate(layer_of_box)[rectangle],
+        np.concatenate(shape)[rectangle],
+    )
 
 
 def _touching(boxes: Array) -> Array:
     """(n,) number of the connected shape that each rectangle belongs to.
 
-    A sweep along the longer side of them all: memory grows with the touching pairs.
+    Rectangles that touch or overlap are connected. They are swept along the longer side
+    of the area, so memory grows with the number of such pairs.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     axis = int(np.argmax(boxes[:, 2:].max(0) - boxes[:, :2].min(0)))
     order = np.argsort(boxes[:, axis], kind="stable")
-    swept = boxes[order]
-    ends = np.searchsorted(swept[:, axis], swept[:, 2 + axis], side="right")
-    other, first, second = 1 - axis, [], []
+    sorted_boxes = boxes[order]
+    ends = np.searchsorted(
+        sorted_boxes[:, axis], sorted_boxes[:, 2 + axis], side="right"
+    )
+    across = 1 - axis
+    first = []
+    second = []
     for n, end in enumerate(ends.tolist()):
-        ahead = swept[n + 1 : end]
-        met = (ahead[:, other] <= swept[n, 2 + other]) & (
-            ahead[:, 2 + other] >= swept[n, other]
+        later = sorted_boxes[n + 1 : end]
+        meets = (later[:, across] <= sorted_boxes[n, 2 + across]) & (
+            later[:, 2 + across] >= sorted_boxes[n, across]
         )
-        touched = order[n + 1 : end][met]
-        second.append(touched)
-        first.append(np.full(len(touched), order[n]))
+        touching = order[n + 1 : end][meets]
+        second.append(touching)
+        first.append(np.full(len(touching), order[n]))
     i, j = np.concatenate(first), np.concatenate(second)
     pairs = coo_matrix((np.ones(len(i)), (i, j)), (len(boxes), len(boxes)))
     return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
@@ -503,30 +589,34 @@ def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
     lattices = tuple(
         _redrawn(wanted, ladder, number, lookup) for number in range(len(plan.lattices))
     )
-    figures, more = _figures(wanted, ladder)
-    replaced = {made.layer for made in plan.classes} | {
+    figures, mark_doses = _figures(wanted, ladder)
+    replaced = {pillar.layer for pillar in plan.classes} | {
         layer
         for figure in plan.figures
         if figure.name in EXPOSED
         for layer in figure.polygons
     }
-    kept, named = (
-        {layer: value for layer, value in old.items() if layer not in replaced}
-        for old in (plan.doses, plan.layer_names)
+    other_doses, other_names = (
+        {layer: value for layer, value in values.items() if layer not in replaced}
+        for values in (plan.doses, plan.layer_names)
     )
     kinds: dict[int, str] = {}
     for (number, _), name in plan.layer_names.items():
         kinds.setdefault(number, name)
     titles = {
         layer: layer_title(kinds.get(layer[0], "shape"), dose)
-        for layer, dose in more.items()
+        for layer, dose in mark_doses.items()
     }
     return plan.replace(
         classes=classes,
         lattices=lattices,
         figures=figures,
-        doses={**kept, **{made.layer: made.dose for made in classes}, **more},
-        layer_names={**named, **names, **titles},
+        doses={
+            **other_doses,
+            **{pillar.layer: pillar.dose for pillar in classes},
+            **mark_doses,
+        },
+        layer_names={**other_names, **names, **titles},
     )
 
 
@@ -543,8 +633,15 @@ def layer_title(kind: str, level: float) -> str:
 def _classes(
     wanted: WantedDoses, ladder: DoseLadder
 ) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
-    """Classes of diameter and dose, (old class, dose) -> new class number, and names of
-    their layers.
+    """Split each pillar class by the dose classes that its pillars need.
+
+    Args:
+        wanted: doses of the plan.
+        ladder: of all that is written in one job.
+
+    Returns:
+        New classes of one outline and dose each, (old class, dose class) -> number of
+        the new class, and names of their layers.
     """
     plan = wanted.plan
     occurs = np.zeros((len(plan.classes) + 1, NONE + 1), bool)
@@ -554,20 +651,22 @@ def _classes(
     used = np.argwhere(occurs[:, :NONE])
     bases: dict[str, LayerNumber] = {}
     datatypes: dict[str, set[int]] = {}
-    for made in plan.classes:
-        bases[made.role] = min(made.layer, bases.get(made.role, made.layer))
+    for pillar in plan.classes:
+        bases[pillar.role] = min(pillar.layer, bases.get(pillar.role, pillar.layer))
     for k, j in used.tolist():
         datatypes.setdefault(plan.classes[k - 1].role, set()).add(j)
     lookup = np.zeros(occurs.shape, np.uint8 if len(used) <= 255 else np.uint16)
-    classes, names = [], {}
+    classes = []
+    names = {}
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
         old = plan.classes[k - 1]
-        kind, level = old.role, float(ladder.factors[j])
-        layer = (bases[kind][0], bases[kind][1] + sorted(datatypes[kind]).index(j))
-        names[layer] = layer_title({"dose": "dose_test"}.get(kind, kind), level)
+        role = old.role
+        dose = float(ladder.factors[j])
+        layer = (bases[role][0], bases[role][1] + sorted(datatypes[role]).index(j))
+        names[layer] = layer_title({"dose": "dose_test"}.get(role, role), dose)
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
-        classes.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
+        classes.append(dataclasses.replace(old, name=name, layer=layer, dose=dose))
         lookup[k, j] = n
     return tuple(classes), lookup, names
 
@@ -575,40 +674,64 @@ def _classes(
 def _redrawn(
     wanted: WantedDoses, ladder: DoseLadder, number: int, lookup: Array
 ) -> PillarArray:
-    """A lattice with the classes of diameter and dose, in blocks of rows."""
+    """A lattice with the numbers of the new classes, held on disk.
+
+    Args:
+        wanted: doses of the plan.
+        ladder: of all that is written in one job.
+        number: of the lattice.
+        lookup: (old class, dose class) -> number of the new class.
+    """
     lattice = wanted.plan.lattices[number]
 
     def blocks() -> Iterator[tuple[int, Array]]:
         for first, block in lattice.blocks():
             yield first, lookup[block, wanted.classes(number, first, block, ladder)]
 
-    kept = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
-    return kept.within(lattice)
+    sites = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
+    return sites.within(lattice)
 
 
 def _figures(
     wanted: WantedDoses, ladder: DoseLadder
 ) -> tuple[tuple[FigureCell, ...], dict[LayerNumber, float]]:
-    """The exposed figures in pieces, each on the datatype of its dose, and the doses of
-    these.
+    """Exposed figures in pieces, each piece on the datatype of its dose.
+
+    Args:
+        wanted: doses of the plan.
+        ladder: of all that is written in one job.
+
+    Returns:
+        All figures of the plan, and the relative dose of each new layer.
     """
-    plan, marks = wanted.plan, wanted.marks
+    plan = wanted.plan
+    marks = wanted.marks
     level = ladder.nearest(marks.doses(wanted.far))
-    table = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
-    on = np.array([table[f][m] for f, m in marks.figure.tolist()], np.int64)
+    layer_numbers = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
+    layer_of_piece = np.array(
+        [
+            layer_numbers[figure_number][layer_index]
+            for figure_number, layer_index in marks.figure.tolist()
+        ],
+        np.int64,
+    )
     doses: dict[LayerNumber, float] = {}
     figures = list(plan.figures)
-    for f, figure in enumerate(plan.figures):
+    for figure_number, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:
             continue
         shapes: dict[LayerNumber, tuple[Array, ...]] = {}
-        for m, layer in enumerate(figure.polygons):
-            mine = (marks.figure == (f, m)).all(1)
-            for n, j in enumerate(np.unique(level[on == layer[0]]).tolist()):
-                some = marks.boxes[mine & (level == j)]
-                if len(some):
-                    own = (layer[0], layer[1] + n)
-                    shapes[own] = tuple(rectilinear.box_corners(box) for box in some)
-                    doses[own] = float(ladder.factors[j])
-        figures[f] = dataclasses.replace(figure, polygons=shapes)
+        for layer_index, layer in enumerate(figure.polygons):
+            in_layer = (marks.figure == (figure_number, layer_index)).all(1)
+            for offset, dose_class in enumerate(
+                np.unique(level[layer_of_piece == layer[0]]).tolist()
+            ):
+                boxes = marks.boxes[in_layer & (level == dose_class)]
+                if len(boxes):
+                    dosed_layer = (layer[0], layer[1] + offset)
+                    shapes[dosed_layer] = tuple(
+                        rectilinear.box_corners(box) for box in boxes
+                    )
+                    doses[dosed_layer] = float(ladder.factors[dose_class])
+        figures[figure_number] = dataclasses.replace(figure, polygons=shapes)
     return tuple(figures), doses

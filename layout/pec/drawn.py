@@ -19,9 +19,9 @@ from layout.shapes.moments import (
 from metalens.core.arrays import Array
 
 _RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
-_EDGE_POINTS = 48  # points along the edges that neighbours are seen from
+_EDGE_POINTS = 48  # points along the edges where exposure by neighbours is evaluated
 _PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
-_PIXEL = 1 / 6  # of it, of the raster on which the level is found
+_PIXEL = 1 / 6  # of it, of the raster on which the level is sought
 _MOST_PIXELS = 1200  # along a side
 _HALVINGS = 34
 
@@ -39,7 +39,7 @@ class DrawnDiscs:
 
     @property
     def wider_um2(self) -> Array:
-        """R^2 / 2 of the disc and R^2 of the ring on which it is seen."""
+        """R^2 / 2 of the disc, and R^2 of its edge, where the exposure is evaluated."""
         return np.asarray(1.5 * self.diameter_um**2 / 4)
 
     def edge_exposure(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
@@ -53,10 +53,11 @@ class DrawnDiscs:
             (entries,) ``own`` at unit dose, and its fall per um that all edges move
             out; 0 where not used.
         """
-        d = np.where(used, self.diameter_um, 0.0)
+        diameter = np.where(used, self.diameter_um, 0.0)
         terms = list(zip(point.widths_um, point.weights, strict=True))
         own, slope = (
-            sum(w * f(d, a) for a, w in terms) for f in (rim_of_own_disc, slope_at_rim)
+            sum(weight * formula(diameter, width) for width, weight in terms)
+            for formula in (rim_of_own_disc, slope_at_rim)
         )
         return np.asarray(own), np.where(used, slope, 0)
 
@@ -109,10 +110,12 @@ class DrawnOutlines:
         narrowest
         Gaussian).
         """
-        found = np.zeros((2, len(self.contours)))
-        for k in np.flatnonzero(used).tolist():
-            found[:, k] = _level(self.contours[k], float(self.area_um2[k]), point)
-        return found[0], found[1]
+        own_and_slope = np.zeros((2, len(self.contours)))
+        for entry in np.flatnonzero(used).tolist():
+            own_and_slope[:, entry] = _level(
+                self.contours[entry], float(self.area_um2[entry]), point
+            )
+        return own_and_slope[0], own_and_slope[1]
 
     def edge_points_um(self, entry: int) -> Array:
         """As of :class:`DrawnDiscs`, evenly spaced."""
@@ -132,18 +135,22 @@ class DrawnOutlines:
         ).reshape(at_um.shape[:-1])
 
     def widest(self, used: Array, steps_um: Array) -> list[int]:
-        """The one that reaches farthest along each of the steps."""
-        some = np.flatnonzero(used).tolist()
-        far = np.array(
-            [(np.concatenate(list(self.contours[k])) @ steps_um.T).max(0) for k in some]
+        """Entries that reach farthest along each of the steps."""
+        entries = np.flatnonzero(used).tolist()
+        reach = np.array(
+            [
+                (np.concatenate(list(self.contours[entry])) @ steps_um.T).max(0)
+                for entry in entries
+            ]
         )
-        return sorted({some[k] for k in far.argmax(0).tolist()})
+        return sorted({entries[entry] for entry in reach.argmax(0).tolist()})
 
 
 DrawnKinds = DrawnDiscs | DrawnOutlines
 
 
 def _wider(contours: Contours) -> float:
+    """Mean squared distance from the centroid, over area plus over edges, um^2."""
     area, first, second = polygon_moments(contours)
     centre = first / area
     points = points_along_edges(contours, 4 * _EDGE_POINTS) - centre
@@ -151,28 +158,36 @@ def _wider(contours: Contours) -> float:
 
 
 def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
-    """Crossings of level lines with edges: (n,) heights, Gauss weights (below 0 where
-    the edge runs down), and places.
+    """Quadrature of a shape: crossings of horizontal lines with its edges.
 
-    The integral over the shape of f(x) g(y) is the sum of weight g(y) F(place), F' = f.
+    The integral over the shape of f(x) g(y) is the sum of weight g(y) F(x), F' = f.
+    Lines are the four Gauss points of panels no higher than 0.8 ``narrow_um``.
+
+    Args:
+        contours: (n, 2) corners each, um.
+        narrow_um: width of the narrowest Gaussian.
+
+    Returns:
+        (n,) y of each crossing, its weight (below 0 where the edge runs down), and its
+        x.
     """
     start = np.concatenate(list(contours))
     end = np.concatenate([np.roll(c, -1, axis=0) for c in contours])
-    stops = np.unique(start[:, 1])
-    counts = np.maximum(np.ceil(np.diff(stops) / (_PANEL * narrow_um)).astype(int), 1)
-    left = np.concatenate(
+    levels = np.unique(start[:, 1])
+    counts = np.maximum(np.ceil(np.diff(levels) / (_PANEL * narrow_um)).astype(int), 1)
+    panel_bottom = np.concatenate(
         [
-            a + (b - a) / n * np.arange(n)
-            for a, b, n in zip(stops, stops[1:], counts, strict=False)
+            bottom + (top - bottom) / count * np.arange(count)
+            for bottom, top, count in zip(levels, levels[1:], counts, strict=False)
         ]
     )
-    wide = np.repeat(np.diff(stops) / counts, counts)
-    node, share = np.polynomial.legendre.leggauss(4)
-    y = (left[:, None] + wide[:, None] * (node + 1) / 2).ravel()
-    weight = (wide[:, None] * share / 2).ravel()
-    low = np.minimum(start[:, 1], end[:, 1])
-    high = np.maximum(start[:, 1], end[:, 1])
-    edge, line = np.nonzero((low[:, None] < y) & (y < high[:, None]))
+    panel_height = np.repeat(np.diff(levels) / counts, counts)
+    node, gauss_weight = np.polynomial.legendre.leggauss(4)
+    y = (panel_bottom[:, None] + panel_height[:, None] * (node + 1) / 2).ravel()
+    weight = (panel_height[:, None] * gauss_weight / 2).ravel()
+    lowest = np.minimum(start[:, 1], end[:, 1])
+    highest = np.maximum(start[:, 1], end[:, 1])
+    edge, line = np.nonzero((lowest[:, None] < y) & (y < highest[:, None]))
     rise = (end - start)[edge]
     place = start[edge, 0] + (y[line] - start[edge, 1]) / rise[:, 1] * rise[:, 0]
     return y[line], weight[line] * np.sign(rise[:, 1]), place
@@ -181,73 +196,87 @@ def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
 def _level(
     contours: Contours, area_um2: float, point: PointExposure
 ) -> tuple[float, float]:
-    """Level that the exposure of a shape by itself exceeds on its own area, and its
-    fall per um that edges move out.
+    """Exposure level whose contour encloses the area of the shape, and its slope.
+
+    The exposure of the shape by itself at unit dose is drawn on pixels. The level is
+    sought by bisection. slope = perimeter / (d area / d level): its fall per um that
+    the edges move out.
+
+    Args:
+        contours: (n, 2) corners each, um.
+        area_um2: of the shape.
+        point: exposure of a beam.
     """
     corners = np.concatenate(list(contours))
-    core = float(point.widths_um.min())
+    narrowest = float(point.widths_um.min())
     size = float(np.ptp(corners, axis=0).max())
-    pixel = max(_PIXEL * core, size / _MOST_PIXELS)
-    margin = min(2 * core, size)
+    pixel = max(_PIXEL * narrowest, size / _MOST_PIXELS)
+    margin = min(2 * narrowest, size)
     x, y = (
         np.arange(low - margin, high + margin + pixel, pixel)
         for low, high in zip(*_box(corners), strict=True)
     )
-    height, weight, place = _lines(contours, core)
+    line_y, weight, crossing_x = _lines(contours, narrowest)
     image = np.zeros((len(y), len(x)))
-    for width, share in zip(point.widths_um, point.weights, strict=True):
+    for width, fraction in zip(point.widths_um, point.weights, strict=True):
         bell = (
             weight
-            * np.exp(-(((y[:, None] - height) / width) ** 2))
+            * np.exp(-(((y[:, None] - line_y) / width) ** 2))
             / (np.sqrt(np.pi) * width)
         )
-        image += share / 2 * (bell @ _erf((place[:, None] - x) / width))
-    down, across = np.gradient(image)  # per pixel
+        image += fraction / 2 * (bell @ _erf((crossing_x[:, None] - x) / width))
+    slope_y, slope_x = np.gradient(image)  # per pixel
 
-    def larger(level: float) -> float:
-        return float(_above(image, down, across, level)) * pixel**2
+    def area_above(level: float) -> float:
+        return float(_above(image, slope_y, slope_x, level)) * pixel**2
 
     low, high = 0.0, float(image.max())
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if larger(middle) > area_um2 else (low, middle)
+        low, high = (middle, high) if area_above(middle) > area_um2 else (low, middle)
     level = (low + high) / 2
-    off = 0.15 * level  # a few pixels, so that their places do not tell
+    difference = 0.15 * level  # a few pixels wide, so that their places do not matter
     return level, perimeter(contours) / max(
-        (larger(level - off) - larger(level + off)) / (2 * off), 1e-12
+        (area_above(level - difference) - area_above(level + difference))
+        / (2 * difference),
+        1e-12,
     )
 
 
 @compile_loop
-def _above(image: Array, down: Array, across: Array, level: float) -> float:
-    """Pixels on which a picture is above a level: of each the share of the half plane
-    by its slope.
+def _above(image: Array, slope_y: Array, slope_x: Array, level: float) -> float:
+    """Area, in pixels, on which an image is above a level.
 
-    Straight edges of any turn are cut exactly: along one at 45 degrees all pixels are
-    cut alike, and what is off in
-    one is off in all.
+    In each pixel the image is a plane of its gradient, and the share above the level is
+    exact for it. So straight edges of any direction are cut exactly.
+
+    Args:
+        image: (y, x) values.
+        slope_y, slope_x: (y, x) gradient per pixel.
+        level: of the image.
     """
     total = 0.0
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
-            p, q = abs(down[row, column]), abs(across[row, column])
-            steep = max(p, q)
-            flat = min(p, q)
-            over = image[row, column] - level
-            beyond = (p + q) / 2 - abs(
-                over
+            rise_y, rise_x = abs(slope_y[row, column]), abs(slope_x[row, column])
+            larger = max(rise_y, rise_x)
+            smaller = min(rise_y, rise_x)
+            excess = image[row, column] - level
+            overlap = (rise_y + rise_x) / 2 - abs(
+                excess
             )  # of the corner that the edge comes to last
-            if beyond <= 0:
+            if overlap <= 0:
                 share = 0.0
-            elif beyond >= flat:
-                share = 0.5 - abs(over) / steep
+            elif overlap >= smaller:
+                share = 0.5 - abs(excess) / larger
             else:
-                share = beyond**2 / (2 * steep * flat)
-            total += 1 - share if over > 0 else share
+                share = overlap**2 / (2 * larger * smaller)
+            total += 1 - share if excess > 0 else share
     return total
 
 
 def _box(corners: Array) -> tuple[Array, Array]:
+    """(2,) lowest and (2,) highest x and y."""
     return corners.min(0), corners.max(0)
 
 

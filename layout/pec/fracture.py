@@ -25,11 +25,10 @@ _FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pieces:
-    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these
-    sides the box has of its
-    shape, in part at least.
+    """Pieces of boxes, on the grid.
 
-    of: (n,) the box it was cut from.
+    box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) whether each side
+    is, at least in part, an edge of the shape. of: (n,) the box it was cut from.
     """
 
     box: Array
@@ -37,6 +36,7 @@ class _Pieces:
     of: Array
 
     def some(self, which: Array) -> "_Pieces":
+        """The pieces of some indices, or of a mask."""
         return _Pieces(self.box[which], self.outer[which], self.of[which])
 
     def halved(self, axis: int) -> "_Pieces":
@@ -44,9 +44,11 @@ class _Pieces:
         middle = (self.box[:, axis] + self.box[:, axis + 2]) // 2
         low, high = self.box.copy(), self.box.copy()
         low[:, axis + 2], high[:, axis] = middle, middle
-        first, second = self.outer.copy(), self.outer.copy()
-        first[:, axis + 2], second[:, axis] = False, False
-        return _joined([_Pieces(low, first, self.of), _Pieces(high, second, self.of)])
+        low_outer, high_outer = self.outer.copy(), self.outer.copy()
+        low_outer[:, axis + 2], high_outer[:, axis] = False, False
+        return _joined(
+            [_Pieces(low, low_outer, self.of), _Pieces(high, high_outer, self.of)]
+        )
 
 
 def fracture_boxes(
@@ -57,17 +59,21 @@ def fracture_boxes(
     point: PointExposure,
     tolerance: float,
 ) -> tuple[Array, Array]:
-    """Boxes (n, 4) on the grid cut to pieces (m, 4) on the grid, and (m,) the box of
-    each.
+    """Cut boxes to pieces of one dose each, halving them until the background is even.
+
+    A piece is cut while its background at unit dose changes by more than a fifth of the
+    tolerance between middle and end of a side, or while it is longer than half the
+    scattering range. It is not cut below 1/64 of the range or two widths of the core.
 
     Args:
-        boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the
-            pillars, um.
-        tolerance: of the exposure; the background changes by a fifth of it between
-            middle and end of a side, or
-            the piece is a 64th of the range or two of the core short (doses that step
-            so often are even once blurred).
+        boxes: (n, 4) left, bottom, right, top in grid steps.
+        lattices: (l, 4) boxes around the pillars, um.
+        step_um: grid step.
         point: exposure of a beam.
+        tolerance: relative, of the exposure.
+
+    Returns:
+        (m, 4) pieces in grid steps, and (m,) the box of each.
 
     Raises:
         ProcessError: more than 500 000 pieces.
@@ -75,96 +81,119 @@ def fracture_boxes(
     wide = point.widths_um > 4 * point.widths_um.min()
     if not wide.any() or not len(boxes):
         return np.asarray(boxes, np.int64), np.arange(len(boxes))
-    around = PointExposure(point.widths_um[wide], point.weights[wide])
+    scattered = PointExposure(point.widths_um[wide], point.weights[wide])
     shortest = (
         max(
-            float(around.widths_um.min()) / _SHORTEST,
+            float(scattered.widths_um.min()) / _SHORTEST,
             CORNER * float(point.widths_um.min()),
         )
         / step_um
     )
-    change = _SHARE * tolerance * THRESHOLD
-    usual, corners = _ranges(around, change)
-    every = np.asarray(boxes) * step_um
+    allowed = _SHARE * tolerance * THRESHOLD
+    usual, narrower_um = _ranges(scattered, allowed)
+    boxes_um = np.asarray(boxes) * step_um
     whole = np.asarray(boxes, np.int64)
-    pairs = pairs_near(every, np.zeros(len(every)), around)
-    first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
-    done: list[_Pieces] = []
-    count, outer = 0, np.ones((len(boxes), 4), bool)
-    open_ = _Pieces(whole, outer, np.arange(len(boxes)))
-    while len(open_.box):
-        _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
-        longest = np.full(len(open_.box), _LONGEST * usual)
-        _shorten(longest, open_.box * step_um, every[open_.of], corners)
-        _shorten_near_lens(longest, open_.box * step_um, lattices, around)
-        ratio = _change(open_, every, pairs, step_um, around) / change
-        side = open_.box[:, 2:] - open_.box[:, :2]
+    pairs = pairs_near(boxes_um, np.zeros(len(boxes_um)), scattered)
+    offsets = np.searchsorted(pairs[0], np.arange(len(boxes_um) + 1))
+    finished: list[_Pieces] = []
+    count = 0
+    outer = np.ones((len(boxes), 4), bool)
+    waiting = _Pieces(whole, outer, np.arange(len(boxes)))
+    while len(waiting.box):
+        _uncover(waiting.box, waiting.of, whole, offsets, pairs[1], waiting.outer)
+        longest = np.full(len(waiting.box), _LONGEST * usual)
+        _shorten(longest, waiting.box * step_um, boxes_um[waiting.of], narrower_um)
+        _shorten_near_lens(longest, waiting.box * step_um, lattices, scattered)
+        excess = _change(waiting, boxes_um, pairs, step_um, scattered) / allowed
+        side = waiting.box[:, 2:] - waiting.box[:, :2]
         split = (side >= 2 * shortest) & (
-            (side > longest[:, None] / step_um) | (ratio > 1)
+            (side > longest[:, None] / step_um) | (excess > 1)
         )
         # the longer side where both need it
         across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))
-        done.append(open_.some(np.asarray(~split.any(1))))
-        count += len(done[-1].box)
-        open_ = _joined(
+        finished.append(waiting.some(np.asarray(~split.any(1))))
+        count += len(finished[-1].box)
+        waiting = _joined(
             [
-                open_.some(across[:, 0]).halved(0),
-                open_.some(across[:, 1] & ~across[:, 0]).halved(1),
+                waiting.some(across[:, 0]).halved(0),
+                waiting.some(across[:, 1] & ~across[:, 0]).halved(1),
             ]
         )
-        if count + len(open_.box) > MOST_PIECES:
+        if count + len(waiting.box) > MOST_PIECES:
             raise ProcessError(
                 f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
                 f"backscatter ranges {usual:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
             )
-    pieces = _joined(done)
+    pieces = _joined(finished)
     order = np.argsort(pieces.of, kind="stable")
     return pieces.box[order], pieces.of[order]
 
 
-def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
-    """Width that half of the scattered energy reaches, and the narrower ones, falling,
-    whose energy counts at corners.
+def _ranges(scattered: PointExposure, change: float) -> tuple[float, list[float]]:
+    """Scattering ranges that set the length of pieces, um.
 
-    There a Gaussian gives an eighth of its weight less than in the middle of what it
-    changes by. All that together change by less than ``change`` are left out: the
-    doses there are as even without.
+    At a corner a Gaussian gives an eighth of its weight less than at the middle of a
+    side. The narrowest ranges, which together change by less than ``change``, are left
+    out.
+
+    Args:
+        scattered: wide Gaussians of the point exposure.
+        change: allowed change of the exposure.
+
+    Returns:
+        Width up to which half of the scattered energy reaches, and the narrower widths
+        that count at corners, falling.
     """
-    order = np.argsort(around.widths_um)
-    widths = around.widths_um[order]
-    total = np.cumsum(around.weights[order])
-    usual = float(widths[np.searchsorted(total, total[-1] / 2)])
-    return usual, widths[(widths < usual) & (total > 8 * change)][::-1].tolist()
+    order = np.argsort(scattered.widths_um)
+    widths = scattered.widths_um[order]
+    energy = np.cumsum(scattered.weights[order])
+    usual = float(widths[np.searchsorted(energy, energy[-1] / 2)])
+    return usual, widths[(widths < usual) & (energy > 8 * change)][::-1].tolist()
 
 
 @compile_loop
 def _uncover(
-    box: Array, of: Array, whole: Array, first: Array, near: Array, outer: Array
+    box: Array,
+    source: Array,
+    whole: Array,
+    offsets: Array,
+    neighbour_numbers: Array,
+    outer: Array,
 ) -> None:
-    """Take sides that other boxes cover from end to end out of ``outer``: no edge is
-    there.
+    """Clear the flags ``outer`` of sides that other boxes cover from end to end.
 
-    near: numbers of the boxes around each of ``whole``, from ``first`` on.
+    Args:
+        box: (n, 4) left, bottom, right, top of the pieces, grid steps.
+        source: (n,) box that each piece was cut from.
+        whole: (boxes, 4) boxes before they were cut.
+        offsets: (boxes + 1,) first entry of each box in ``neighbour_numbers``.
+        neighbour_numbers: numbers of the boxes around each.
+        outer: (n, 4) whether a side is an edge of the shape; changed in place.
     """
-    for n in range(box.shape[0]):
-        neighbours = near[first[of[n]] : first[of[n] + 1]]
+    for piece in range(box.shape[0]):
+        neighbours = neighbour_numbers[
+            offsets[source[piece]] : offsets[source[piece] + 1]
+        ]
         for side in range(4):  # left, bottom, right, top
-            if not outer[n, side]:
+            if not outer[piece, side]:
                 continue
-            across, along, at = side % 2, 1 - side % 2, box[n, side]
-            low, reached = box[n, along], box[n, along] - 1
-            while reached < low < box[n, along + 2]:
+            across = side % 2
+            along = 1 - side % 2
+            position = box[piece, side]
+            low = box[piece, along]
+            reached = box[piece, along] - 1
+            while reached < low < box[piece, along + 2]:
                 reached = low
-                for m in neighbours:
-                    b = whole[m]
+                for number in neighbours:
+                    other = whole[number]
                     over = (
-                        b[across] < at <= b[across + 2]
+                        other[across] < position <= other[across + 2]
                         if side < 2
-                        else b[across] <= at < b[across + 2]
+                        else other[across] <= position < other[across + 2]
                     )
-                    if over and b[along] <= low:
-                        low = max(low, b[along + 2])
-            outer[n, side] = low < box[n, along + 2]
+                    if over and other[along] <= low:
+                        low = max(low, other[along + 2])
+            outer[piece, side] = low < box[piece, along + 2]
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
@@ -177,8 +206,13 @@ def _joined(parts: list[_Pieces]) -> _Pieces:
 
 
 def _shorten(longest: Array, box: Array, whole: Array, corners: list[float]) -> None:
-    """Shorter pieces near the corners of the box (n, 4) that each is of, for ranges
-    that count there.
+    """Reduce the longest allowed length of pieces near the corners of their boxes.
+
+    Args:
+        longest: (n,) um, changed in place.
+        box: (n, 4) pieces, um.
+        whole: (n, 4) the box of each piece, um.
+        corners: widths that count at corners, falling, um.
     """
     ends = [
         np.minimum(box[:, k] - whole[:, k], whole[:, k + 2] - box[:, k + 2])
@@ -189,10 +223,17 @@ def _shorten(longest: Array, box: Array, whole: Array, corners: list[float]) -> 
 
 
 def _shorten_near_lens(
-    longest: Array, box: Array, lattices: Array, around: PointExposure
+    longest: Array, box: Array, lattices: Array, scattered: PointExposure
 ) -> None:
-    """Shorter pieces near a lens, whose edge is no box."""
-    for width in np.sort(around.widths_um)[::-1].tolist():
+    """Reduce the longest allowed length of pieces near a lens, whose edge is no box.
+
+    Args:
+        longest: (n,) um, changed in place.
+        box: (n, 4) pieces, um.
+        lattices: (l, 4) boxes around the pillars, um.
+        scattered: wide Gaussians of the point exposure.
+    """
+    for width in np.sort(scattered.widths_um)[::-1].tolist():
         for left, bottom, right, top in lattices.tolist():
             x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)
             y = np.maximum(np.maximum(bottom - box[:, 3], box[:, 1] - top), 0)
@@ -201,29 +242,39 @@ def _shorten_near_lens(
 
 def _change(
     pieces: _Pieces,
-    every: Array,
+    boxes_um: Array,
     pairs: tuple[Array, Array],
     step_um: float,
-    around: PointExposure,
+    scattered: PointExposure,
 ) -> Array:
-    """(n, 2) half the change of the background of all boxes at unit dose along x and y:
-    along outer sides, and from
-    one outer side to the opposite one. every: (boxes, 4) um, and ``pairs`` of them that
-    see each other.
+    """(n, 2) half the change of the background over each piece, along x and along y.
+
+    The background of all boxes at unit dose is evaluated at 3 x 3 points of a piece.
+    Its changes along the outer sides count, and from an outer side to an opposite outer
+    side.
+
+    Args:
+        pieces: in grid steps.
+        boxes_um: (boxes, 4) left, bottom, right, top.
+        pairs: first and second box of all pairs within reach, sorted.
+        step_um: grid step.
+        scattered: wide Gaussians of the point exposure.
     """
     box = pieces.box * step_um
     middle = (box[:, :2] + box[:, 2:]) / 2
     xs = np.stack([box[:, 0], middle[:, 0], box[:, 2]], -1)
     ys = np.stack([box[:, 1], middle[:, 1], box[:, 3]], -1)
-    field = sums_of_boxes(xs, ys, pieces.of, every, pairs, around)
+    field = sums_of_boxes(xs, ys, pieces.of, boxes_um, pairs, scattered)
     along_x, along_y = (
         np.ptp(field, axis=axis) / 2 for axis in (2, 1)
     )  # of the lines bottom to top, left to right
-    held = pieces.outer
-    x = np.maximum(along_x[:, 0] * held[:, 1], along_x[:, 2] * held[:, 3])
-    y = np.maximum(along_y[:, 0] * held[:, 0], along_y[:, 2] * held[:, 2])
-    over = (
-        np.abs(field[:, :, 2] - field[:, :, 0]).max(1) / 2 * (held[:, 0] & held[:, 2])
+    outer = pieces.outer
+    x = np.maximum(along_x[:, 0] * outer[:, 1], along_x[:, 2] * outer[:, 3])
+    y = np.maximum(along_y[:, 0] * outer[:, 0], along_y[:, 2] * outer[:, 2])
+    across_x = (
+        np.abs(field[:, :, 2] - field[:, :, 0]).max(1) / 2 * (outer[:, 0] & outer[:, 2])
     )
-    up = np.abs(field[:, 2] - field[:, 0]).max(1) / 2 * (held[:, 1] & held[:, 3])
-    return np.stack([np.maximum(x, over), np.maximum(y, up)], -1)
+    across_y = (
+        np.abs(field[:, 2] - field[:, 0]).max(1) / 2 * (outer[:, 1] & outer[:, 3])
+    )
+    return np.stack([np.maximum(x, across_x), np.maximum(y, across_y)], -1)

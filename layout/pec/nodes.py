@@ -63,14 +63,14 @@ class NodeGrid:
         """
         left, bottom, right, top = box_um
         step = width_um / _PER_WIDTH
-        made = cls(NodeAxis.over(bottom, top, step), NodeAxis.over(left, right, step))
-        if made.y.count * made.x.count > MOST_NODES:
+        grid = cls(NodeAxis.over(bottom, top, step), NodeAxis.over(left, right, step))
+        if grid.y.count * grid.x.count > MOST_NODES:
             raise ProcessError(
                 f"a Gaussian of {width_um:.3g} um over a die of {right - left:.0f} x {top - bottom:.0f} um needs "
-                f"{made.y.count * made.x.count:,} nodes, at most {MOST_NODES:,}; leave out the range of the point "
+                f"{grid.y.count * grid.x.count:,} nodes, at most {MOST_NODES:,}; leave out the range of the point "
                 "exposure between a tenth of a micrometre and some micrometres, or correct a smaller die"
             )
-        return made
+        return grid
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -94,23 +94,41 @@ class NodeGrid:
 
 @compile_loop
 def _deposit(
-    xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array
+    x_node: Array,
+    x_weight: Array,
+    y_node: Array,
+    y_weight: Array,
+    mass: Array,
+    out: Array,
 ) -> None:
+    """Add masses (n,) to the 4 x 4 nodes around each place, by cubic weights."""
     for n in range(mass.shape[0]):
         for i in range(4):
             for j in range(4):
-                out[yn[n] + i, xn[n] + j] += mass[n] * yw[n, i] * xw[n, j]
+                out[y_node[n] + i, x_node[n] + j] += (
+                    mass[n] * y_weight[n, i] * x_weight[n, j]
+                )
 
 
 @compile_loop
 def _sample(
-    xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array
+    x_node: Array,
+    x_weight: Array,
+    y_node: Array,
+    y_weight: Array,
+    field: Array,
+    out: Array,
 ) -> None:
+    """Fill (n,) values of a node field, by cubic interpolation over 4 x 4 nodes."""
     for n in range(out.shape[0]):
         total = 0.0
         for i in range(4):
             for j in range(4):
-                total += field[yn[n] + i, xn[n] + j] * yw[n, i] * xw[n, j]
+                total += (
+                    field[y_node[n] + i, x_node[n] + j]
+                    * y_weight[n, i]
+                    * x_weight[n, j]
+                )
         out[n] = total
 
 
@@ -118,13 +136,19 @@ def _sample(
 def gather_to_nodes(
     block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
-    """Add what the pillars of a block of rows carry to the nodes.
+    """Add what the pillars of a block of rows carry to the nodes, by cubic weights.
 
-    block: (rows, columns) entries; value: (fields, entries), 0 for none; yn, yw:
-    (rows,), (rows, 4) nodes and weights
-    of the rows, xn, xw of the columns; out: (fields, y, x).
+    Args:
+        block: (rows, columns) entries; 0: no pillar.
+        value: (fields, entries) amount that each entry carries.
+        yn: (rows,) first node of each row.
+        yw: (rows, 4) weights.
+        xn: (columns,) first node of each column.
+        xw: (columns, 4) weights.
+        out: (fields, y, x) sums, in place.
     """
-    fields, wide = out.shape[0], out.shape[2]
+    fields = out.shape[0]
+    wide = out.shape[2]
     line = np.zeros((fields, wide))
     for row in range(block.shape[0]):
         line[:] = 0
@@ -144,14 +168,15 @@ def gather_to_nodes(
 def interpolate_from_nodes(
     field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
-    """The node field (y, x) at the sites of a block of rows: (rows, columns) float32.
+    """Interpolate a node field at the sites of a block of rows, by cubic weights.
 
     Args:
-        yn: (rows,) first nodes.
+        field: (y, x) values at the nodes.
+        yn: (rows,) first node of each row.
         yw: (rows, 4) weights.
-        xn: (columns,) first nodes.
+        xn: (columns,) first node of each column.
         xw: (columns, 4) weights.
-        out: is filled.
+        out: (rows, columns) float32, filled.
     """
     line = np.zeros(field.shape[1])
     for row in range(out.shape[0]):
@@ -192,28 +217,29 @@ def gaussian_convolution(
     point: PointExposure,
     hollow: bool,
 ) -> RadialConvolution:
-    """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5
-    widths out (exp(-25)).
+    """Convolution with a sum of Gaussians on a grid of nodes.
 
-    hollow: leave out what a node gives to itself.
+    kernel = sum weight / (pi width^2) exp(-r^2 / width^2), cut at 5 widths (exp(-25)).
 
     Args:
         shape: (y, x) nodes.
+        spacing_um: (y, x) distance of the nodes.
         point: sum of Gaussians.
+        hollow: whether a node gives nothing to itself.
     """
     from scipy import fft
 
     reach = 5 * float(point.widths_um.max(initial=0.0))
-    far = (int(np.ceil(reach / step)) for step in spacing_um)
-    ny, nx = (
+    reach_nodes = (int(np.ceil(reach / step)) for step in spacing_um)
+    rows, columns = (
         fft.next_fast_len(n + min(n, m), real=True)
-        for n, m in zip(shape, far, strict=True)
+        for n, m in zip(shape, reach_nodes, strict=True)
     )
     y, x = (
         np.minimum(np.arange(n), n - np.arange(n)) * step
-        for n, step in zip((ny, nx), spacing_um, strict=True)
+        for n, step in zip((rows, columns), spacing_um, strict=True)
     )
-    kernel = np.zeros((ny, nx))
+    kernel = np.zeros((rows, columns))
     for width, weight in zip(point.widths_um, point.weights, strict=True):
         kernel += (
             weight
@@ -222,4 +248,4 @@ def gaussian_convolution(
         )
     if hollow:
         kernel[0, 0] = 0
-    return RadialConvolution(fft.rfft2(kernel), shape, (ny, nx))
+    return RadialConvolution(fft.rfft2(kernel), shape, (rows, columns))

@@ -69,12 +69,14 @@ def point_exposure(exposure: ExposureSettings) -> PointExposure:
 def fit_point_spread(
     radius_um: Array, density: Array, *, where: str = "point exposure"
 ) -> PointExposure:
-    """Gaussians of non-negative weight through a measured radial function, by relative
-    error at each sample.
+    """Gaussians of non-negative weight through a measured radial function.
+
+    Widths are fixed, four to an octave; weights follow from non-negative least squares
+    of the relative errors, weighted by the energy.
 
     Args:
-        radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above
-            0.
+        radius_um: (n,) rising, above 0.
+        density: (n,) energy density in any unit, above 0.
         where: name of the table in errors.
 
     Raises:
@@ -85,50 +87,58 @@ def fit_point_spread(
 
     radius = np.asarray(radius_um, float)
     value = np.asarray(density, float)
-    sound = (
+    is_valid = (
         np.isfinite(value).all()
         and np.isfinite(radius).all()
         and (value > 0).all()
         and (np.diff(radius) > 0).all()
     )
-    if radius.size < 4 or not sound or radius[0] <= 0:
+    if radius.size < 4 or not is_valid or radius[0] <= 0:
         raise ProcessError(
             f"{where}: need at least 4 rising radii above 0 um, each with an energy density above 0"
         )
     steps = max(8, int(np.ceil(4 * np.log2(radius[-1] / radius[0]))))
     widths = np.geomspace(radius[0], radius[-1], steps + 1)
     energy = radius**2 * value
-    importance = (
+    sample_weight = (
         0.02 + energy / energy.max()
     ) / value  # relative errors count, most where the energy is
     design = (
         np.exp(-((radius[:, None] / widths) ** 2))
         / (np.pi * widths**2)
-        * importance[:, None]
+        * sample_weight[:, None]
     )
     scale = design.max(axis=0)
-    weights = nnls(design / scale, value * importance)[0] / scale
+    weights = nnls(design / scale, value * sample_weight)[0] / scale
     total = weights.sum()
-    keep = weights > 1e-9 * total
-    found = PointExposure(widths[keep], weights[keep] / total)
+    is_used = weights > 1e-9 * total
+    fit = PointExposure(widths[is_used], weights[is_used] / total)
     return PointExposure(
-        found.widths_um, found.weights, _fit_error(found, radius, value / total)
+        fit.widths_um, fit.weights, _fit_error(fit, radius, value / total)
     )
 
 
-def _fit_error(found: PointExposure, radius: Array, density: Array) -> float:
-    """Largest difference of the energy between the first radius and each other one,
-    table by power laws.
+def _fit_error(fit: PointExposure, radius: Array, density: Array) -> float:
+    """Largest error of the energy between the first radius and each other radius.
+
+    The energy of the table is integrated with a power law between samples.
+
+    Args:
+        fit: sum of Gaussians.
+        radius: (n,) um.
+        density: (n,) of the table, 1 / um^2.
     """
     slope = np.diff(np.log(density)) / np.diff(np.log(radius)) + 2
     start = density[:-1] * radius[:-1] ** 2
     end = density[1:] * radius[1:] ** 2
-    flat = abs(slope) < 1e-9
+    is_flat = abs(slope) < 1e-9
     ring = np.where(
-        flat, start * np.diff(np.log(radius)), (end - start) / np.where(flat, 1, slope)
+        is_flat,
+        start * np.diff(np.log(radius)),
+        (end - start) / np.where(is_flat, 1, slope),
     )
     table = 2 * np.pi * np.r_[0, np.cumsum(ring)]
-    return float(abs(found.within(radius) - found.within(radius[:1]) - table).max())
+    return float(abs(fit.within(radius) - fit.within(radius[:1]) - table).max())
 
 
 def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
@@ -165,15 +175,15 @@ def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
 def disc_exposure(
     distance_um: Array | float, diameter_um: Array | float, width_um: float
 ) -> Array:
-    """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one
-    Gaussian. Exact.
+    """Exposure by one Gaussian around a disc of unit dose, exact.
 
-    The probability that a Gaussian displacement ends within the disc: non-central
-    chi-square of 2 degrees.
+    It is the probability that a Gaussian displacement ends within the disc: non-central
+    chi-square of 2 degrees of freedom.
 
     Args:
+        distance_um: from the centre.
         diameter_um: of the disc.
-        width_um: 1/e radius.
+        width_um: 1/e radius of the Gaussian.
     """
     from scipy.special import chndtr
 

@@ -12,7 +12,7 @@ from metalens.core import threads
 from metalens.core.arrays import Array
 
 _OUTSIDE_UM = (
-    1e-4  # a point that far outside an edge tells whether another piece goes on there
+    1e-4  # another piece covers an edge where it holds a point that far outside
 )
 CORNER = 2.0  # widths of the core: an edge is round that near its ends
 
@@ -20,8 +20,7 @@ CORNER = 2.0  # widths of the core: an edge is round that near its ends
 def self_exposure(
     boxes: Array, group: Array, near: PointExposure
 ) -> tuple[Array, Array, Array]:
-    """What a shape gives to its own edges by the Gaussians that are not summed on
-    nodes, exact.
+    """Mean exposure of the edges of each piece by its own shape at unit dose, exact.
 
     Args:
         boxes: (pieces, 4) left, bottom, right, top, um.
@@ -29,83 +28,105 @@ def self_exposure(
         near: Gaussians that are not summed on nodes.
 
     Returns:
-        (pieces,) mean exposure of the outer edges of each piece by its whole group at
-        unit dose (an inner piece: of
-        its middle, less half), and the points (n, 2) of the outer edges with (n,) the
-        piece of each.
+        (pieces,) mean exposure over the outer edges of each piece (half of that in the
+        middle of a piece without outer edges), (n, 2) positions where it was evaluated,
+        um, and (n,) the piece of each position.
     """
     count = len(boxes)
     if not count:
         return np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
-    one, two = pairs_near(boxes, group, near)
-    starts = np.searchsorted(one, np.arange(count + 1))
+    first, second = pairs_near(boxes, group, near)
+    starts = np.searchsorted(first, np.arange(count + 1))
     core_um = float(near.widths_um.min()) if len(near.widths_um) else 0.0
-    points, piece = _outer(boxes, group, starts, two, CORNER * core_um)
-    inner = np.bincount(piece, minlength=count) == 0
-    at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
-    of = np.concatenate([piece, np.flatnonzero(inner)])
-    total = np.bincount(
-        of,
-        sums_of_boxes(at[:, :1], at[:, 1:], of, boxes, (one, two), near)[:, 0, 0],
+    points, piece = _outer(boxes, group, starts, second, CORNER * core_um)
+    is_inner = np.bincount(piece, minlength=count) == 0
+    positions = np.concatenate(
+        [points, (boxes[is_inner, :2] + boxes[is_inner, 2:]) / 2]
+    )
+    piece_of_position = np.concatenate([piece, np.flatnonzero(is_inner)])
+    sums = np.bincount(
+        piece_of_position,
+        sums_of_boxes(
+            positions[:, :1],
+            positions[:, 1:],
+            piece_of_position,
+            boxes,
+            (first, second),
+            near,
+        )[:, 0, 0],
         minlength=count,
     )
-    exposure = total / np.bincount(of, minlength=count)
-    return np.where(inner, exposure / 2, exposure), at, of
+    exposure = sums / np.bincount(piece_of_position, minlength=count)
+    return np.where(is_inner, exposure / 2, exposure), positions, piece_of_position
 
 
 def pairs_near(
     boxes_um: Array, group: Array, point: PointExposure
 ) -> tuple[Array, Array]:
-    """Pairs of rows (one, two), sorted, of boxes of one group that touch or lie within
-    six widths (exp(-36)).
+    """Pairs of boxes of one group that touch or lie within six widths.
+
+    Beyond six widths a Gaussian is below exp(-36).
 
     Args:
         boxes_um: (n, 4) left, bottom, right, top.
+        group: (n,) group of each box.
         point: sum of Gaussians.
+
+    Returns:
+        (pairs,) first and (pairs,) second box, sorted; each box also pairs with itself.
     """
     order = np.lexsort((boxes_um[:, 0], group))
-    boxes, group = np.ascontiguousarray(boxes_um[order]), group[order]
+    boxes = np.ascontiguousarray(boxes_um[order])
+    group = group[order]
     starts = np.flatnonzero(
         np.r_[np.ones(len(group[:1]), bool), group[1:] != group[:-1], True]
     )
     distance = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
     counts = np.zeros(len(boxes), np.int64)
     _pairs(boxes, starts, distance, counts, np.empty(0, np.int64))
-    first = np.cumsum(counts) - counts
-    near = np.empty(int(counts.sum()), np.int64)
-    _pairs(boxes, starts, distance, first, near)
-    one = order[np.repeat(np.arange(len(boxes)), counts)]
-    two = order[near]
-    rank = np.lexsort((two, one))
-    return one[rank], two[rank]
+    offsets = np.cumsum(counts) - counts
+    neighbours = np.empty(int(counts.sum()), np.int64)
+    _pairs(boxes, starts, distance, offsets, neighbours)
+    first = order[np.repeat(np.arange(len(boxes)), counts)]
+    second = order[neighbours]
+    rank = np.lexsort((second, first))
+    return first[rank], second[rank]
 
 
 @compile_loop
 def _pairs(
-    boxes: Array, starts: Array, distance: float, at: Array, near: Array
+    boxes: Array, starts: Array, distance: float, offsets: Array, neighbours: Array
 ) -> None:
-    """Boxes of a shape (sorted by their left sides) within ``distance`` of each of its
-    boxes: written to ``near`` from
-    ``at`` on, or counted there where ``near`` is empty.
+    """Boxes of the same shape within ``distance`` of each box, along x and along y.
+
+    Called twice: first it counts them, then it lists them.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top, sorted by shape, then by left side.
+        starts: (shapes + 1,) first box of each shape.
+        distance: um.
+        offsets: (n,) output, numbers of neighbours, where ``neighbours`` is empty; else
+            input, where the list of each box begins.
+        neighbours: output, box numbers; empty to count.
     """
-    for g in range(starts.shape[0] - 1):
-        for n in range(starts[g], starts[g + 1]):
-            found = 0
-            for m in range(starts[g], starts[g + 1]):
-                if boxes[m, 0] > boxes[n, 2] + distance:
+    for shape in range(starts.shape[0] - 1):
+        for box in range(starts[shape], starts[shape + 1]):
+            count = 0
+            for other in range(starts[shape], starts[shape + 1]):
+                if boxes[other, 0] > boxes[box, 2] + distance:
                     break
-                if boxes[m, 2] < boxes[n, 0] - distance:
+                if boxes[other, 2] < boxes[box, 0] - distance:
                     continue
                 if (
-                    boxes[m, 1] > boxes[n, 3] + distance
-                    or boxes[m, 3] < boxes[n, 1] - distance
+                    boxes[other, 1] > boxes[box, 3] + distance
+                    or boxes[other, 3] < boxes[box, 1] - distance
                 ):
                     continue
-                if near.shape[0] > 0:
-                    near[at[n] + found] = m
-                found += 1
-            if near.shape[0] == 0:
-                at[n] = found
+                if neighbours.shape[0] > 0:
+                    neighbours[offsets[box] + count] = other
+                count += 1
+            if neighbours.shape[0] == 0:
+                offsets[box] = count
 
 
 def sums_of_boxes(
@@ -116,91 +137,112 @@ def sums_of_boxes(
     pairs: tuple[Array, Array],
     point: PointExposure,
 ) -> Array:
-    """Exposure at the crossings of lines by those boxes of unit dose that ``pairs``
-    (sorted) hold for a row.
+    """Exposure at the crossings of lines by some boxes of unit dose, exact to rounding.
 
     Args:
-        x_um, y_um: (n, i) and (n, j) lines; row: (n,) whose boxes each of the n takes.
+        x_um: (n, i) x of the upright lines of each row.
+        y_um: (n, j) y of the level lines of each row.
+        row: (n,) box whose neighbours, by ``pairs``, expose each row.
         boxes_um: (m, 4) left, bottom, right, top.
+        pairs: first and second box of each pair, sorted.
         point: sum of Gaussians.
 
     Returns:
-        (n, j, i) exposure, exact to rounding.
+        (n, j, i) exposure.
     """
-    one, two = pairs
-    first = np.searchsorted(one, row)
-    last = np.searchsorted(one, row, side="right")
-    out = np.zeros((len(row), y_um.shape[1], x_um.shape[1]))
+    first_box, second_box = pairs
+    begin = np.searchsorted(first_box, row)
+    end = np.searchsorted(first_box, row, side="right")
+    exposure = np.zeros((len(row), y_um.shape[1], x_um.shape[1]))
     lines = (np.ascontiguousarray(x_um), np.ascontiguousarray(y_um))
     boxes = np.ascontiguousarray(boxes_um, float)
 
-    def work(start: int, stop: int) -> None:
+    def sum_rows(start: int, stop: int) -> None:
         _sum(
             *lines,
-            first,
-            last,
-            two,
+            begin,
+            end,
+            second_box,
             boxes,
             point.widths_um,
             point.weights,
             start,
             stop,
-            out,
+            exposure,
         )
 
     if len(row):
-        threads.run_split(len(row), work)
-    return out
+        threads.run_split(len(row), sum_rows)
+    return exposure
 
 
 @compile_loop
 def _sum(
-    x: Array, y: Array, first: Array, last: Array, near: Array, boxes: Array, widths: Array, weights: Array,
-    start: int, stop: int, out: Array,
+    x: Array, y: Array, begin: Array, end: Array, other: Array, boxes: Array, widths: Array, weights: Array,
+    start: int, stop: int, exposure: Array,
 ) -> None:  # fmt: skip
-    """A Gaussian over a box is a product of differences of error functions; beyond six
-    widths they are 0.
+    """Add the exposure by boxes of unit dose at the crossings of lines.
+
+    A Gaussian of width w over a box is 1/4 [erf((right - x) / w) - erf((left - x) / w)]
+    times the same along y. Boxes beyond six widths are left out.
+
+    Args:
+        x: (n, i) and y: (n, j) lines, um.
+        begin: (n,) and end: (n,) range of ``other`` for each row.
+        other: box numbers.
+        boxes: (m, 4) left, bottom, right, top, um.
+        widths: (terms,) 1/e radii, um, and weights of the Gaussians.
+        start: first row, and stop: row after the last.
+        exposure: (n, j, i) output.
     """
-    across, along = np.empty(x.shape[1]), np.empty(y.shape[1])
+    along_x, along_y = np.empty(x.shape[1]), np.empty(y.shape[1])
     for n in range(start, stop):
-        for k in range(widths.shape[0]):
-            reach, scale = 6 * widths[k], 1 / widths[k]
+        for term in range(widths.shape[0]):
+            reach = 6 * widths[term]
+            scale = 1 / widths[term]
             left, right = x[n].min() - reach, x[n].max() + reach
             bottom, top = y[n].min() - reach, y[n].max() + reach
-            for m in range(first[n], last[n]):
-                b = boxes[near[m]]
-                if b[0] > right or b[2] < left or b[1] > top or b[3] < bottom:
+            for position in range(begin[n], end[n]):
+                box = boxes[other[position]]
+                if box[0] > right or box[2] < left or box[1] > top or box[3] < bottom:
                     continue
                 for i in range(x.shape[1]):
-                    across[i] = math.erf((b[2] - x[n, i]) * scale) - math.erf(
-                        (b[0] - x[n, i]) * scale
+                    along_x[i] = math.erf((box[2] - x[n, i]) * scale) - math.erf(
+                        (box[0] - x[n, i]) * scale
                     )
                 for j in range(y.shape[1]):
-                    along[j] = math.erf((b[3] - y[n, j]) * scale) - math.erf(
-                        (b[1] - y[n, j]) * scale
+                    along_y[j] = math.erf((box[3] - y[n, j]) * scale) - math.erf(
+                        (box[1] - y[n, j]) * scale
                     )
                 for j in range(y.shape[1]):
                     for i in range(x.shape[1]):
-                        out[n, j, i] += weights[k] / 4 * along[j] * across[i]
+                        exposure[n, j, i] += weights[term] / 4 * along_y[j] * along_x[i]
 
 
 def _outer(
-    boxes: Array, group: Array, starts: Array, near: Array, corner_um: float
+    boxes: Array, group: Array, starts: Array, neighbours: Array, corner_um: float
 ) -> tuple[Array, Array]:
-    """Points (n, 2) on those parts of the sides of each piece that no other piece of
-    its shape covers, and the piece.
+    """Points on the outer sides of each piece, one for each uncovered part of a side.
 
-    near: numbers of the pieces around each, from ``starts`` on. A point is the middle
-    of its part or, within
-    ``corner_um`` of an end of the straight run that the part belongs to, of what is
-    left of the part beyond (nothing:
-    the nearest place beyond). Runs of twice that length are round: left out.
+    A point is the middle of its part. Corners of the outline are round: within
+    ``corner_um`` of the end of a straight run no point is placed, and the part is
+    clipped to what remains. Runs shorter than twice that length have no point.
+
+    Args:
+        boxes: (pieces, 4) left, bottom, right, top, um.
+        group: (pieces,) shape of each.
+        starts: (pieces + 1,) first entry of each piece in ``neighbours``.
+        neighbours: numbers of the pieces around each.
+        corner_um: length at both ends of a run.
+
+    Returns:
+        (n, 2) points, um, and (n,) the piece of each.
     """
-    room = 4 * (len(near) + len(boxes))
-    part = np.empty((room, 3))
-    piece = np.empty(room, np.int64)
-    side = np.empty(room, np.int64)
-    count = _free(boxes, starts, near, _OUTSIDE_UM, part, piece, side)
+    most_parts = 4 * (len(neighbours) + len(boxes))
+    part = np.empty((most_parts, 3))
+    piece = np.empty(most_parts, np.int64)
+    side = np.empty(most_parts, np.int64)
+    count = _free(boxes, starts, neighbours, _OUTSIDE_UM, part, piece, side)
     part, piece, side = part[:count], piece[:count], side[:count]
     low, high = _run(part, group[piece], side)
     low, high = low + corner_um, high - corner_um
@@ -215,16 +257,25 @@ def _outer(
 
 
 def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
-    """Both ends (n,) of the straight run of outline that each part (n, 3: across, from,
-    to) of a side belongs to.
+    """Both ends of the straight run of outline that each part of a side belongs to.
+
+    Parts of one shape, side and line are a run where no gap divides them.
+
+    Args:
+        part: (n, 3) coordinate across the side, and from, to along it, um.
+        group: (n,) shape of each part.
+        side: (n,) 0 left, 1 bottom, 2 right, 3 top.
+
+    Returns:
+        (n,) lower and (n,) upper end, um.
     """
     line = np.rint(part[:, 0] / _OUTSIDE_UM)
     order = np.lexsort((part[:, 1], line, side, group))
     keys = np.stack([group, side, line])[:, order]
-    distance = part[order[1:], 1] > part[order[:-1], 2] + _OUTSIDE_UM
-    new = np.r_[True, (keys[:, 1:] != keys[:, :-1]).any(0) | distance]
-    run = np.cumsum(new) - 1
-    first = np.flatnonzero(new)
+    has_gap = part[order[1:], 1] > part[order[:-1], 2] + _OUTSIDE_UM
+    starts_run = np.r_[True, (keys[:, 1:] != keys[:, :-1]).any(0) | has_gap]
+    run = np.cumsum(starts_run) - 1
+    first = np.flatnonzero(starts_run)
     low, high = np.empty(len(part)), np.empty(len(part))
     low[order], high[order] = (
         part[order[first], 1][run],
@@ -237,40 +288,48 @@ def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
 def _free(
     boxes: Array,
     starts: Array,
-    near: Array,
+    neighbours: Array,
     step: float,
-    part: Array,
-    piece: Array,
+    parts: Array,
+    pieces: Array,
     sides: Array,
 ) -> int:
-    """Fill in the free parts of all sides (across, from, to), longer than a step; how
-    many there are.
+    """Number of uncovered parts of all sides; the parts themselves are written out.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top, um.
+        starts: (n + 1,) first entry of each box in ``neighbours``.
+        neighbours: numbers of the boxes around each.
+        step: shorter parts are left out; also how far outside a side another box must
+            reach to cover it, um.
+        parts: (room, 3) output: coordinate across the side, and from, to along it.
+        pieces: (room,) output: box of each part.
+        sides: (room,) output: 0 left, 1 bottom, 2 right, 3 top.
     """
     count = 0
     for n in range(boxes.shape[0]):
-        neighbours = boxes[near[starts[n] : starts[n + 1]]]
+        around = boxes[neighbours[starts[n] : starts[n + 1]]]
         for side in range(4):  # left, bottom, right, top
             across, along = side % 2, 1 - side % 2
-            at = boxes[n, side]
-            outside = at - step if side < 2 else at + step
-            over = neighbours[
-                (neighbours[:, across] <= outside)
-                & (neighbours[:, across + 2] >= outside)
+            position = boxes[n, side]
+            outside = position - step if side < 2 else position + step
+            covering = around[
+                (around[:, across] <= outside) & (around[:, across + 2] >= outside)
             ]
-            over = over[np.argsort(over[:, along])]
+            covering = covering[np.argsort(covering[:, along])]
             low, high = boxes[n, along], boxes[n, along + 2]
-            for k in range(over.shape[0] + 1):
-                end = over[k, along] if k < over.shape[0] else high
+            for number in range(covering.shape[0] + 1):
+                end = covering[number, along] if number < covering.shape[0] else high
                 if low < high and min(end, high) - low > step:
-                    part[count, 0], part[count, 1], part[count, 2] = (
-                        at,
+                    parts[count, 0], parts[count, 1], parts[count, 2] = (
+                        position,
                         low,
                         min(end, high),
                     )
-                    piece[count], sides[count] = n, side
+                    pieces[count], sides[count] = n, side
                     count += 1
-                if k < over.shape[0]:
-                    low = max(low, over[k, along + 2])
+                if number < covering.shape[0]:
+                    low = max(low, covering[number, along + 2])
     return count
 
 
@@ -285,10 +344,14 @@ def rectangle_samples(box: Array, step_um: float) -> tuple[Array, Array, Array]:
     counts = np.maximum(np.ceil((box[:, 2:] - box[:, :2]) / step_um - 1e-9), 1).astype(
         np.int64
     )
-    of = np.repeat(np.arange(len(box)), counts.prod(1))
-    within = np.arange(len(of)) - np.repeat(
+    rectangle = np.repeat(np.arange(len(box)), counts.prod(1))
+    index = np.arange(len(rectangle)) - np.repeat(
         np.cumsum(counts.prod(1)) - counts.prod(1), counts.prod(1)
     )
-    cell = np.stack([within % counts[of, 0], within // counts[of, 0]], -1)
+    cell = np.stack([index % counts[rectangle, 0], index // counts[rectangle, 0]], -1)
     side = (box[:, 2:] - box[:, :2]) / counts
-    return box[of, :2] + (cell + 0.5) * side[of], side.prod(1)[of], of
+    return (
+        box[rectangle, :2] + (cell + 0.5) * side[rectangle],
+        side.prod(1)[rectangle],
+        rectangle,
+    )

@@ -8,7 +8,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 _LEAST = (
-    4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
+    4e-4  # weight of all neighbours together: float32 sums have it to a few percent
 )
 
 
@@ -19,32 +19,29 @@ def isolation_map(
     *,
     centred: bool = False,
 ) -> Array:
-    """How alone each site is: 0 where all neighbours of its lattice stand, 1 where none
-    does (y, x), float32.
+    """(y, x) isolation of each site, float32: 0 with all neighbours, 1 with none.
 
-    Neighbours count by exp(-r^2 / range^2) from middle to middle, within 3 ranges along
-    each axis; the site itself does
-    not. Only tiles that are neither empty nor full with all their surroundings are
-    worked on.
+    isolation = 1 - sum of exp(-r^2 / range^2) over the pillars, over the same sum with
+    all sites filled. Neighbours count within 3 ranges along each axis, the site itself
+    does not. Tiles that are empty, or full with all their surroundings, are skipped.
 
     Args:
-        present: (y, x) true where a pillar stands. steps_um: (x, y) distance of
-            neighbouring columns and rows.
-        centred: every other place alone is a site, as on a hexagonal lattice
-            (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none,
-            or those with it even.
+        present: (y, x) true where a pillar stands.
+        steps_um: (x, y) distance of neighbouring columns and rows.
         range_um: of the bias of isolated pillars.
+        centred: every other place alone is a site, as on a hexagonal lattice
+            (:class:`metalens.lens.DiameterMap`): those with row + column odd are empty,
+            or those with it even.
 
     Raises:
-        ProcessError: a range so short that nobody has neighbours, and a lone pillar
-            nothing to lack.
+        ProcessError: a range so short that no site has neighbours.
     """
     from scipy.ndimage import correlate1d
 
-    across, up = (isolation_halo(step, range_um) for step in steps_um)
+    halo_x, halo_y = (isolation_halo(step, range_um) for step in steps_um)
     along_x, along_y = (
         np.exp(-((np.arange(-n, n + 1) * step / range_um) ** 2)).astype(np.float32)
-        for n, step in zip((across, up), steps_um, strict=True)
+        for n, step in zip((halo_x, halo_y), steps_um, strict=True)
     )
     total = _full(along_x, along_y, centred)
     if total < _LEAST:
@@ -52,20 +49,23 @@ def isolation_map(
             f"bias.range_um = {range_um:g}: neighbours on steps of {steps_um[0]:.4g} and {steps_um[1]:.4g} um do not "
             "count at that distance; need a third of the pitch or more, or isolated_nm = 0"
         )
-    padded = np.pad(np.asarray(present, bool), ((up, up), (across, across)))
-    alone = np.zeros(present.shape, np.float32)
+    padded = np.pad(np.asarray(present, bool), ((halo_y, halo_y), (halo_x, halo_x)))
+    isolation = np.zeros(present.shape, np.float32)
     for rows, columns in _tiles(present.shape):
-        around = padded[
-            rows.start : rows.stop + 2 * up, columns.start : columns.stop + 2 * across
+        extended = padded[
+            rows.start : rows.stop + 2 * halo_y,
+            columns.start : columns.stop + 2 * halo_x,
         ]
-        here = np.asarray(present[rows, columns], np.float32)
-        every = around[:, 1:] | around[:, :-1] if centred else around
-        if every.all() or not here.any():
+        own = np.asarray(present[rows, columns], np.float32)
+        places = extended[:, 1:] | extended[:, :-1] if centred else extended
+        if places.all() or not own.any():
             continue
-        near = correlate1d(around.astype(np.float32), along_y, axis=0)[up:-up]
-        near = correlate1d(near, along_x, axis=1)[:, across:-across]
-        alone[rows, columns] = np.clip(1 - (near - here) / total, 0, 1)
-    return alone
+        weight = correlate1d(extended.astype(np.float32), along_y, axis=0)[
+            halo_y:-halo_y
+        ]
+        weight = correlate1d(weight, along_x, axis=1)[:, halo_x:-halo_x]
+        isolation[rows, columns] = np.clip(1 - (weight - own) / total, 0, 1)
+    return isolation
 
 
 def isolation_halo(step_um: float, range_um: float) -> int:
@@ -79,20 +79,28 @@ def isolation_halo(step_um: float, range_um: float) -> int:
 
 
 def _full(along_x: Array, along_y: Array, centred: bool) -> float:
-    """Weight of all neighbours: of every place, or of those whose row and column are
-    odd or even together.
+    """Sum of the weights of all neighbours of a site.
+
+    On a centred lattice only places whose row and column are both odd or both even
+    count: (sum + alternating sum) / 2. The site itself is left out.
+
+    Args:
+        along_x: weights of the columns about the site.
+        along_y: weights of the rows about the site.
+        centred: whether every other place alone is a site.
     """
-    every = float(along_x.sum()) * float(along_y.sum())
+    all_places = float(along_x.sum()) * float(along_y.sum())
     if not centred:
-        return every - 1
+        return all_places - 1
     x, y = (
         float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2)
         for w in (along_x, along_y)
     )
-    return float((every + x * y) / 2 - 1)
+    return float((all_places + x * y) / 2 - 1)
 
 
 def _tiles(shape: tuple[int, ...], side: int = 96) -> Iterator[tuple[slice, slice]]:
+    """(rows, columns) of square tiles of an array, ``side`` sites each way."""
     for row in range(0, shape[0], side):
         for column in range(0, shape[1], side):
             yield (

@@ -17,8 +17,10 @@ _MOST_STEPS = 4000
 def printable_limits(
     path: Path, *, pitch_um: float, height_um: float
 ) -> tuple[float, float]:
-    """(thinnest pillar, least gap) in nm of designed pillars, so that what is drawn
-    keeps the rules.
+    """Thinnest pillar and least gap, nm, of designed pillars that a process can print.
+
+    All drawn sizes are tested for width, gap and gap at the foot. The limits are the
+    designed sizes of the thinnest and of the widest that keep the rules.
 
     Args:
         path: of PROCESS.toml.
@@ -30,42 +32,54 @@ def printable_limits(
             keeps both rules on this pitch.
     """
     process = load_process(path)
-    rules, pitch = process.rules, pitch_um / nm
-    least = max(4 * rules.grid_nm, rules.diameter_step_nm)
-    sizes = np.arange(
-        least, min(pitch, least + _MOST_STEPS * rules.diameter_step_nm), 1
+    rules = process.rules
+    pitch_nm = pitch_um / nm
+    smallest_nm = max(4 * rules.grid_nm, rules.diameter_step_nm)
+    sizes_nm = np.arange(
+        smallest_nm,
+        min(pitch_nm, smallest_nm + _MOST_STEPS * rules.diameter_step_nm),
+        1,
     )
-    drawn = np.unique(-(-sizes // rules.diameter_step_nm) * rules.diameter_step_nm)
-    drawn = drawn[(drawn >= 0.5 * rules.minimum_feature_nm) & (drawn < pitch)]
+    drawn_nm = np.unique(
+        -(-sizes_nm // rules.diameter_step_nm) * rules.diameter_step_nm
+    )
+    drawn_nm = drawn_nm[
+        (drawn_nm >= 0.5 * rules.minimum_feature_nm) & (drawn_nm < pitch_nm)
+    ]
     shapes = [
         polygon.pillar_polygon(
-            float(d) / rules.grid_nm, vertices=rules.vertices, shape=rules.shape
+            float(diameter) / rules.grid_nm, vertices=rules.vertices, shape=rules.shape
         ).points
-        for d in drawn
+        for diameter in drawn_nm
     ]
-    half = np.array([p[:, 0].max() for p in shapes]) * rules.grid_nm
-    width = np.array([convex.least_width(p) for p in shapes]) * rules.grid_nm
-    _, foot = process.top_foot_nm(
-        process.made_diameter_nm(drawn) + max(0.0, process.bias.isolated_nm),
+    half_width_nm = np.array([points[:, 0].max() for points in shapes]) * rules.grid_nm
+    width_nm = (
+        np.array([convex.least_width(points) for points in shapes]) * rules.grid_nm
+    )
+    _, foot_nm = process.top_foot_nm(
+        process.made_diameter_nm(drawn_nm) + max(0.0, process.bias.isolated_nm),
         height_um / nm,
     )
-    thick = np.logical_and.accumulate((width >= rules.minimum_feature_nm)[::-1])[
-        ::-1
-    ]  # and every wider one
-    apart = (pitch - 2 * half >= rules.minimum_gap_nm) & (
-        pitch - foot >= rules.minimum_foot_gap_nm
+    is_wide_enough = np.logical_and.accumulate(
+        (width_nm >= rules.minimum_feature_nm)[::-1]
+    )[::-1]  # and every wider one
+    has_gap = (pitch_nm - 2 * half_width_nm >= rules.minimum_gap_nm) & (
+        pitch_nm - foot_nm >= rules.minimum_foot_gap_nm
     )
-    fine = thick & np.logical_and.accumulate(apart)  # and every thinner one
-    if not fine.any():
+    is_printable = is_wide_enough & np.logical_and.accumulate(
+        has_gap
+    )  # and every thinner one
+    if not is_printable.any():
         raise ProcessError(
             f"{path}: no pillar keeps {rules.minimum_feature_nm:g} nm and leaves {rules.minimum_gap_nm:g} nm on a "
-            f"pitch of {pitch:.4g} nm; widen the pitch or change the process"
+            f"pitch of {pitch_nm:.4g} nm; widen the pitch or change the process"
         )
-    step, alone = rules.diameter_step_nm, process.bias.isolated_nm
-    low = float(process.made_diameter_nm(drawn[fine][0] - 0.45 * step)) + max(
-        0.0, alone
-    )
-    high = float(process.made_diameter_nm(drawn[fine][-1] + 0.45 * step)) + min(
-        0.0, alone
-    )
-    return low, pitch - high
+    step = rules.diameter_step_nm
+    isolated_nm = process.bias.isolated_nm
+    low = float(
+        process.made_diameter_nm(drawn_nm[is_printable][0] - 0.45 * step)
+    ) + max(0.0, isolated_nm)
+    high = float(
+        process.made_diameter_nm(drawn_nm[is_printable][-1] + 0.45 * step)
+    ) + min(0.0, isolated_nm)
+    return low, pitch_nm - high

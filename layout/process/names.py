@@ -37,8 +37,8 @@ def check_distinct_names(names: list[str]) -> None:
     Raises:
         ProcessError: two cells of one name.
     """
-    seen: set[str] = set()
+    used: set[str] = set()
     for name in names:
-        if check_cell_name(name) in seen:
+        if check_cell_name(name) in used:
             raise ProcessError(f"two cells are named {name!r}; give each its own name")
-        seen.add(name)
+        used.add(name)

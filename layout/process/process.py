@@ -69,6 +69,7 @@ class DesignRules:
     exclusion: tuple[KeepOutZone, ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse values out of range, and steps that do not divide each other."""
         _positive(
             self,
             "minimum_feature_nm",
@@ -115,18 +116,19 @@ class LayerTable:
     outline: LayerNumber = (10, 0)
 
     def __post_init__(self) -> None:
-        seen: dict[LayerNumber, str] = {}
+        """Refuse numbers beyond 16 bits, and numbers used twice."""
+        name_of_layer: dict[LayerNumber, str] = {}
         for entry in dataclasses.fields(self):
             number = getattr(self, entry.name)
             if not all(0 <= n <= 65535 for n in number):
                 raise ProcessError(
                     f"layer {entry.name} = {list(number)}: need numbers from 0 to 65535"
                 )
-            if number in seen:
+            if number in name_of_layer:
                 raise ProcessError(
-                    f"layers {seen[number]} and {entry.name} are both {list(number)}; give each its own"
+                    f"layers {name_of_layer[number]} and {entry.name} are both {list(number)}; give each its own"
                 )
-            seen[number] = entry.name
+            name_of_layer[number] = entry.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +189,7 @@ class ExposureSettings:
     correct: bool | None = None
 
     def __post_init__(self) -> None:
+        """Refuse values out of range, and settings that contradict each other."""
         _positive(self, "base_uC_cm2", "tolerance", "maximum_classes")
         _positive(
             self,
@@ -299,6 +302,7 @@ class DieSettings:
     label: str = ""
 
     def __post_init__(self) -> None:
+        """Refuse values out of range."""
         _positive(
             self,
             "margin_um",
@@ -364,30 +368,47 @@ class Process:
     def written_diameter_nm(
         self, design_nm: Array | float, isolation: Array | float = 0.0
     ) -> Array:
-        """Inverse of :meth:`made_diameter_nm`, to 1e-9 nm: draw this, and the designed
-        diameter is made.
+        """Drawn diameter that makes a designed diameter, to 1e-9 nm.
+
+        Inverse of :meth:`made_diameter_nm`, by fixed-point iteration over the rounding:
+        written = bias.drawn_nm(design) + rounding(written).
+
+        Args:
+            design_nm: diameter at half height.
+            isolation: of each pillar, see
+                :func:`layout.process.isolation.isolation_map`.
         """
-        goal = self.bias.drawn_nm(design_nm, isolation)
-        written = goal.copy()
+        without_rounding = self.bias.drawn_nm(design_nm, isolation)
+        written = without_rounding.copy()
         for _ in range(30):
-            before, written = written, goal + self._rounding_nm(written)
-            if np.abs(written - before).max(initial=0.0) < 1e-10:
+            previous, written = written, without_rounding + self._rounding_nm(written)
+            if np.abs(written - previous).max(initial=0.0) < 1e-10:
                 break
         return np.asarray(written)
 
     def top_foot_nm(
         self, diameter_nm: Array | float, height_nm: float
     ) -> tuple[Array, Array]:
-        """Diameters at the top and at the foot of a pillar whose half-height diameter
-        is given.
+        """Diameters at the top and at the foot of a pillar with tilted walls.
+
+        top, foot = diameter -+ height tan(sidewall angle).
+
+        Args:
+            diameter_nm: at half height.
+            height_nm: of the pillar.
         """
         lean = height_nm * math.tan(self.etch.sidewall_deg * deg)
         middle = np.asarray(diameter_nm, float)
         return middle - lean, middle + lean
 
     def _rounding_nm(self, written_nm: Array) -> Array:
-        """Equal-area diameter lost at n corners: the area n r^2 (tan(pi/n) - pi/n), r
-        within the pillar.
+        """Equal-area diameter lost where the corners of a polygon round off, nm.
+
+        n corners of radius r lose the area n r^2 (tan(pi/n) - pi/n), and r is at most
+        the radius of the pillar. The diameter lost is 2 area / (pi written).
+
+        Args:
+            written_nm: equal-area diameter of the drawn polygon.
         """
         n = self.rules.vertices
         radius = np.minimum(self.etch.corner_radius_nm, written_nm / 2)
@@ -412,22 +433,23 @@ def load_process(path: str | Path) -> Process:
 
 
 def resolve_process(process: Process, folder: str | Path) -> Process:
-    """``process`` with its CSV files found in ``folder`` and the bias table read in."""
+    """``process`` with its CSV files in ``folder``, and the bias table read."""
     folder = Path(folder)
     process = dataclasses.replace(process, bias=with_table(process.bias, folder))
     if process.exposure.csv is not None:
-        found = folder / process.exposure.csv
-        if not found.is_file():
+        table = folder / process.exposure.csv
+        if not table.is_file():
             raise ConfigError(
-                f"exposure.csv: {found}: no such file; need radius and energy density in two columns"
+                f"exposure.csv: {table}: no such file; need radius and energy density in two columns"
             )
         process = dataclasses.replace(
-            process, exposure=dataclasses.replace(process.exposure, csv=found)
+            process, exposure=dataclasses.replace(process.exposure, csv=table)
         )
     return process
 
 
 def _positive(record: Any, *names: str) -> None:
+    """Refuse fields of a record that are not finite and above 0."""
     for name in names:
         value = getattr(record, name)
         if not (value > 0 and math.isfinite(value)):

@@ -18,13 +18,25 @@ def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
     Args:
         contours: of one polygon.
     """
-    area, first, second = 0.0, np.zeros(2), 0.0
-    for a in contours:
-        b = np.roll(a, -1, axis=0)
-        cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    area = 0.0
+    first = np.zeros(2)
+    second = 0.0
+    for corner in contours:
+        following = np.roll(corner, -1, axis=0)
+        cross = corner[:, 0] * following[:, 1] - following[:, 0] * corner[:, 1]
         area += float(cross.sum()) / 2
-        first += ((a + b) * cross[:, None]).sum(0) / 6
-        second += float((cross * (a * a + a * b + b * b).sum(1)).sum()) / 12
+        first += ((corner + following) * cross[:, None]).sum(0) / 6
+        second += (
+            float(
+                (
+                    cross
+                    * (
+                        corner * corner + corner * following + following * following
+                    ).sum(1)
+                ).sum()
+            )
+            / 12
+        )
     return area, first, second
 
 
@@ -34,19 +46,29 @@ def perimeter(contours: Contours) -> float:
     Args:
         contours: of one polygon.
     """
-    return sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
+    return sum(
+        float(np.hypot(*(np.roll(contour, -1, axis=0) - contour).T).sum())
+        for contour in contours
+    )
 
 
 def points_along_edges(contours: Contours, count: int) -> Array:
-    """(count, 2) places evenly along all edges.
+    """(count, 2) points at equal distances along all edges.
 
     Args:
         contours: of one polygon.
+        count: of the points.
     """
     start = np.concatenate(list(contours))
-    edge = np.concatenate([np.roll(c, -1, axis=0) for c in contours]) - start
-    long = np.hypot(*edge.T)
-    ends = np.cumsum(long)
-    at = (np.arange(count) + 0.5) / count * ends[-1]
-    k = np.searchsorted(ends, at)
-    return np.asarray(start[k] + (1 - (ends[k] - at) / long[k])[:, None] * edge[k])
+    edge = (
+        np.concatenate([np.roll(contour, -1, axis=0) for contour in contours]) - start
+    )
+    length = np.hypot(*edge.T)
+    end_distance = np.cumsum(length)
+    distance = (np.arange(count) + 0.5) / count * end_distance[-1]
+    number = np.searchsorted(end_distance, distance)
+    return np.asarray(
+        start[number]
+        + (1 - (end_distance[number] - distance) / length[number])[:, None]
+        * edge[number]
+    )

@@ -88,15 +88,23 @@ def pillar_polygon(
 
 @functools.lru_cache(maxsize=70000)
 def _pillar(diameter: float, vertices: int) -> PillarShape:
-    """The most vertices whose area fits; where none does, the outline of the best area."""
-    wide = diameter / 2 * (_REGULAR if vertices == 8 else 1.0)
-    halves = sorted({round(wide - _EITHER), round(wide + _EITHER)})
+    """Polygon of the most vertices whose area fits, else of the smallest area error.
+
+    Args:
+        diameter: grid steps.
+        vertices: most vertices.
+
+    Raises:
+        ProcessError: the grid holds no polygon of this size.
+    """
+    half_width = diameter / 2 * (_REGULAR if vertices == 8 else 1.0)
+    halves = sorted({round(half_width - _EITHER), round(half_width + _EITHER)})
     best: tuple[tuple[float, float], Array] | None = None
-    for count in (vertices, *(n for n in _FEWER if n < vertices)):
+    for count in (vertices, *(fewer for fewer in _FEWER if fewer < vertices)):
         for half in halves:
-            found = _eighth(diameter, count, max(half, 2))
-            if found is not None and (best is None or found[0] < best[0]):
-                best = found
+            candidate = _eighth(diameter, count, max(half, 2))
+            if candidate is not None and (best is None or candidate[0] < best[0]):
+                best = candidate
         if best is not None and best[0][0] <= _FREE:
             break
     if best is None:
@@ -109,8 +117,19 @@ def _pillar(diameter: float, vertices: int) -> PillarShape:
 def _eighth(
     diameter: float, count: int, half: int
 ) -> tuple[tuple[float, float], Array] | None:
-    """The best first eighth of a convex polygon, 0 < angle <= 45 degrees, of this half
-    width: ((area error, edge error), (m, 2)); None where the grid holds none.
+    """Best first eighth of a convex polygon, at angles above 0 and up to 45 degrees.
+
+    Candidates are vertices on circles, rounded to the grid. The smallest area error
+    wins; errors below a threshold are equal, and then the smallest edge error wins.
+
+    Args:
+        diameter: of the circle of equal area, grid steps.
+        count: vertices of the whole polygon.
+        half: x of the first vertex.
+
+    Returns:
+        ((area error, edge error), (m, 2) vertices); None where the grid holds no
+        candidate.
     """
     step = 2 * math.pi / count
     angle = np.arange(0.5, count / 8 + 0.25) * step
@@ -125,13 +144,24 @@ def _eighth(
         return None
     area, spread = _measures(trials, diameter, radius)
     order = np.lexsort((spread, np.maximum(area, _FREE)))
-    n = int(order[0])
-    return (max(float(area[n]), _FREE), float(spread[n])), trials[..., n]
+    best = int(order[0])
+    return (max(float(area[best]), _FREE), float(spread[best])), trials[..., best]
 
 
 def _trials(angle: Array, radius: float, half: int, *, diagonal: bool) -> Array:
-    """(m, 2, t) vertices on circles about the equal-area one, rounded to the grid, and
-    single vertices of these moved by a step; the first one's x is ``half``.
+    """Candidate eighths: vertices on circles near the equal-area circle.
+
+    Vertices are rounded to the grid. Neighbours differ by one step of one vertex; a
+    vertex on the diagonal moves along it.
+
+    Args:
+        angle: (m,) of the vertices, rad.
+        radius: of the vertices of an equal-area polygon, grid steps.
+        half: x of the first vertex.
+        diagonal: whether the last vertex is on the diagonal.
+
+    Returns:
+        (m, 2, t) distinct candidates.
     """
     rings = radius + np.linspace(-0.9, 0.9, 19)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)[..., None] * rings
@@ -139,24 +169,28 @@ def _trials(angle: Array, radius: float, half: int, *, diagonal: bool) -> Array:
     if diagonal:
         start[-1] = np.round(rings / math.sqrt(2)).astype(np.int64)
     start[0, 1] = np.maximum(start[0, 1], 1)
-    made = [start]
+    candidates = [start]
     for vertex in range(len(angle)):
         for axis in (0, 1):
-            for way in (-1, 1):
+            for direction in (-1, 1):
                 moved = start.copy()
-                both = diagonal and vertex == len(angle) - 1
-                moved[vertex, slice(None) if both else axis] += way
-                made.append(moved)
-    every = np.concatenate(made, axis=-1)
-    every[0, 0] = half
-    return np.unique(every.reshape(-1, every.shape[-1]), axis=1).reshape(
-        len(angle), 2, -1
-    )
+                is_diagonal = diagonal and vertex == len(angle) - 1
+                moved[vertex, slice(None) if is_diagonal else axis] += direction
+                candidates.append(moved)
+    all_candidates = np.concatenate(candidates, axis=-1)
+    all_candidates[0, 0] = half
+    return np.unique(
+        all_candidates.reshape(-1, all_candidates.shape[-1]), axis=1
+    ).reshape(len(angle), 2, -1)
 
 
 def _measures(eighths: Array, diameter: float, radius: float) -> tuple[Array, Array]:
-    """(t,) relative area error of (m, 2, t) eighths, and mean square distance of their
-    vertices from the circle on which an equal-area polygon has them.
+    """(t,) relative area error, and (t,) mean square distance of vertices to a circle.
+
+    Args:
+        eighths: (m, 2, t) vertices.
+        diameter: of the circle of equal area.
+        radius: of the vertices of a regular polygon of that area.
     """
     x, y = eighths[:, 0].astype(float), eighths[:, 1].astype(float)
     middle = (x[-1] + y[-1]) / 2
@@ -168,31 +202,30 @@ def _measures(eighths: Array, diameter: float, radius: float) -> tuple[Array, Ar
 
 
 def _sound(eighths: Array, diagonal: bool) -> Array:
-    """(t,) whether (m, 2, t) trials are first eighths of convex polygons whose vertices
-    all differ.
-    """
+    """(t,) whether trials (m, 2, t) are eighths of strictly convex polygons."""
     x, y = eighths[:, 0], eighths[:, 1]
-    after = (
+    mirrored = (
         slice(-2, -1) if diagonal and len(x) > 1 else slice(-1, None)
     )  # whose mirror image comes next
-    dx = np.diff(np.concatenate([x[:1], x, y[after]]), axis=0)
-    dy = np.diff(np.concatenate([-y[:1], y, x[after]]), axis=0)
-    bent = (dx[:-1] * dy[1:] - dx[1:] * dy[:-1] < 0).any(0)
-    crossed = y[-1] > x[-1] if diagonal else y[-1] >= x[-1]
-    wrong = (
-        bent
-        | crossed
+    dx = np.diff(np.concatenate([x[:1], x, y[mirrored]]), axis=0)
+    dy = np.diff(np.concatenate([-y[:1], y, x[mirrored]]), axis=0)
+    is_concave = (dx[:-1] * dy[1:] - dx[1:] * dy[:-1] < 0).any(0)
+    crosses_diagonal = y[-1] > x[-1] if diagonal else y[-1] >= x[-1]
+    is_invalid = (
+        is_concave
+        | crosses_diagonal
         | ((dx == 0) & (dy == 0))[:-1].any(0)
         | (y[0] < 1)
         | (dx > 0).any(0)
         | (dy < 0).any(0)
     )
-    return np.asarray(~wrong)
+    return np.asarray(~is_invalid)
 
 
 def eightfold_images(eighth: Array) -> Array:
-    """All eight images of the vertices of one eighth: (n, 2), counter-clockwise;
-    doubles and flat corners go.
+    """(n, 2) vertices of a polygon from those of one eighth, counter-clockwise.
+
+    Repeated vertices and flat corners are removed.
     """
     quarter = np.concatenate([eighth, eighth[::-1, ::-1]])
     turns = [quarter]
@@ -226,9 +259,10 @@ def disc_polygon(
 
 
 def _turn(points: Array) -> Array:
-    before = points - np.roll(points, 1, axis=0)
-    after = np.roll(points, -1, axis=0) - points
-    return np.asarray(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])
+    """(n,) cross product of the edges at each corner; 0 where it is flat."""
+    step_in = points - np.roll(points, 1, axis=0)
+    step_out = np.roll(points, -1, axis=0) - points
+    return np.asarray(step_in[:, 0] * step_out[:, 1] - step_in[:, 1] * step_out[:, 0])
 
 
 def twice_area(points: Array) -> int:
@@ -253,9 +287,9 @@ def edge_error(points: Array, radius: float) -> float:
     p = points.astype(float)
     q = np.roll(points, -1, axis=0).astype(float)
     edge = q - p
-    along = np.clip(-(p * edge).sum(1) / (edge**2).sum(1), 0, 1)
-    foot = np.hypot(*(p + along[:, None] * edge).T)
-    vertex = np.hypot(*p.T)
+    fraction = np.clip(-(p * edge).sum(1) / (edge**2).sum(1), 0, 1)
+    foot_distance = np.hypot(*(p + fraction[:, None] * edge).T)
+    vertex_distance = np.hypot(*p.T)
     return float(
-        max(vertex.max() - radius, radius - foot.min())
+        max(vertex_distance.max() - radius, radius - foot_distance.min())
     )  # feet lie nearer to the origin than vertices

@@ -12,11 +12,12 @@ _SLICE = 5000  # units
 
 
 def split_rectilinear(points: Array) -> Array:
-    """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by
-    slab.
+    """(n, 4) left, bottom, right, top of rectangles that fill a rectilinear polygon.
+
+    The polygon is cut at the y of every corner.
 
     Args:
-        points: (m, 2) corners.
+        points: (m, 2) corners of a simple polygon.
 
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
@@ -27,24 +28,27 @@ def split_rectilinear(points: Array) -> Array:
         raise ProcessError(
             "a shape with slanted edges where horizontal and vertical ones are needed"
         )
-    upright = start[:, 0] == end[:, 0]
-    x = start[upright, 0]
-    low = np.minimum(start, end)[upright, 1]
-    high = np.maximum(start, end)[upright, 1]
+    is_vertical = start[:, 0] == end[:, 0]
+    x = start[is_vertical, 0]
+    low = np.minimum(start, end)[is_vertical, 1]
+    high = np.maximum(start, end)[is_vertical, 1]
     levels = np.unique(points[:, 1])
-    found = []
+    rectangles = []
     for bottom, top in zip(levels[:-1].tolist(), levels[1:].tolist(), strict=True):
-        cut = np.sort(x[(low <= bottom) & (high >= top)])
-        found += [
+        crossings = np.sort(x[(low <= bottom) & (high >= top)])
+        rectangles += [
             (left, bottom, right, top)
-            for left, right in zip(cut[::2].tolist(), cut[1::2].tolist(), strict=True)
+            for left, right in zip(
+                crossings[::2].tolist(), crossings[1::2].tolist(), strict=True
+            )
         ]
-    return np.array(found, np.int64).reshape(-1, 4)
+    return np.array(rectangles, np.int64).reshape(-1, 4)
 
 
 def covering_rectangles(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of
-    slices 5 um high or more.
+    """(n, 4) rectangles of a rectilinear polygon, or boxes around slices of any other.
+
+    Slices are 5 um high or more.
 
     Args:
         shape: (n, 2) corners.
@@ -56,17 +60,19 @@ def covering_rectangles(shape: Array) -> Array:
     ends = np.linspace(low, high, min(_SLICES, max(1, (high - low) // _SLICE)) + 1)
     start = shape.astype(float)
     y0, y1 = start[:, 1], start[:, 1] + step[:, 1]
-    steep = np.where(step[:, 1] == 0, 1, step[:, 1])
-    made = []
+    rise = np.where(step[:, 1] == 0, 1, step[:, 1])
+    boxes = []
     for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
         inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
-        along = [np.clip((y - y0) / steep, 0, 1) for y in (bottom, top)]
-        along = [
-            np.where(step[:, 1] == 0, whole, t)
-            for whole, t in zip((0.0, 1.0), along, strict=True)
+        fractions = [np.clip((y - y0) / rise, 0, 1) for y in (bottom, top)]
+        fractions = [
+            np.where(step[:, 1] == 0, whole, fraction)
+            for whole, fraction in zip((0.0, 1.0), fractions, strict=True)
         ]
-        x = np.concatenate([(start[:, 0] + t * step[:, 0])[inside] for t in along])
-        made.append(
+        x = np.concatenate(
+            [(start[:, 0] + fraction * step[:, 0])[inside] for fraction in fractions]
+        )
+        boxes.append(
             [
                 math.floor(x.min()),
                 math.floor(bottom),
@@ -74,7 +80,7 @@ def covering_rectangles(shape: Array) -> Array:
                 math.ceil(top),
             ]
         )
-    return np.array(made, np.int64)
+    return np.array(boxes, np.int64)
 
 
 def box_corners(box: Array) -> Array:

@@ -20,8 +20,11 @@ def union_contours(polygons: Iterable[Array]) -> list[Array]:
 
 
 def subtract_contours(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
-    """Contours of what is left of ``contours`` (outlines counter-clockwise, holes
-    clockwise) without ``taken``.
+    """Contours of the area of ``contours`` without ``taken``.
+
+    Args:
+        contours: outlines counter-clockwise, holes clockwise.
+        taken: polygons.
     """
     return _contours(_section(contours, filled=False) - _section(taken))
 
@@ -39,23 +42,26 @@ def overlap_area(contours: Iterable[Array], polygons: Iterable[Array]) -> float:
 
 
 def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
-    """The same area as polygons that any mask file holds: cut upright through the
-    middle of each hole, and again.
+    """The same area as polygons without holes, which any mask file holds.
 
-    A cut that slanted edges would end off whole units goes from corner to corner
-    instead, where there is one hole.
+    A part is cut upright through the middle of each hole, again and again. Where
+    slanted edges would end the cut off whole units, and there is one hole, the cut goes
+    from corner to corner.
 
     Args:
-        grid: step of the places of the cuts.
         contours: outlines counter-clockwise, holes clockwise.
+        grid: step of the places of the cuts.
     """
     return list(_cut(_section(contours, filled=False), grid))
 
 
 def triangulate(contours: Sequence[Array]) -> Array:
-    """(n, 3) corners, numbered on through all contours, of triangles that fill outlines
-    (counter-clockwise) but for
-    their holes (clockwise); they run counter-clockwise.
+    """(n, 3) corners of triangles that fill outlines but for their holes.
+
+    Corners are numbered through all contours; triangles run counter-clockwise.
+
+    Args:
+        contours: outlines counter-clockwise, holes clockwise.
     """
     from manifold3d import triangulate
 
@@ -66,19 +72,27 @@ def triangulate(contours: Sequence[Array]) -> Array:
 
 
 def _section(polygons: Iterable[Array], *, filled: bool = True) -> Any:
+    """Cross section of manifold3d; ``filled``: contours of any direction add area."""
     from manifold3d import CrossSection, FillRule
 
     rule = FillRule.NonZero if filled else FillRule.Positive
-    return CrossSection([np.asarray(p, float) for p in polygons], rule)
+    return CrossSection([np.asarray(polygon, float) for polygon in polygons], rule)
 
 
 def _contours(section: Any) -> list[Array]:
-    made = (np.rint(p).astype(np.int64) for p in section.to_polygons())
-    kept = (p[(p != np.roll(p, 1, axis=0)).any(1)] for p in made)
-    return [p for p in kept if len(p) > 2]
+    """Contours of a section on whole units, repeated corners removed."""
+    rounded = (np.rint(points).astype(np.int64) for points in section.to_polygons())
+    distinct = (
+        points[(points != np.roll(points, 1, axis=0)).any(1)] for points in rounded
+    )
+    return [points for points in distinct if len(points) > 2]
 
 
 def _cut(section: Any, grid: int) -> Iterable[Array]:
+    """Polygons of a section without holes, cut along x through the middle of each hole.
+
+    With one hole, a cut that would leave the grid goes from corner to corner instead.
+    """
     from manifold3d import CrossSection
 
     for part in section.decompose():
@@ -87,14 +101,14 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
             yield from contours
             continue
         hole = contours[1]
-        x = round(float(hole[:, 0].min() + hole[:, 0].max()) / 2 / grid) * grid
+        cut_x = round(float(hole[:, 0].min() + hole[:, 0].max()) / 2 / grid) * grid
         if len(contours) == 2 and not all(
-            _ends_exactly(x, contour, grid) for contour in contours
+            _ends_exactly(cut_x, contour, grid) for contour in contours
         ):
             yield from _bridged(*contours)
             continue
         left, bottom, right, top = part.bounds()
-        for low, high in ((left - 1, x), (x, right + 1)):
+        for low, high in ((left - 1, cut_x), (cut_x, right + 1)):
             box = np.array(
                 [
                     [low, bottom - 1],
@@ -110,32 +124,41 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
 def _ends_exactly(x: int, contour: Array, grid: int) -> bool:
     """Whether an upright line meets an outline on the grid alone."""
     step = np.roll(contour, -1, axis=0) - contour
-    to = x - contour[:, 0]
-    met = (to * (to - step[:, 0]) <= 0) & (step[:, 0] != 0)
-    rise, run = to[met] * step[met, 1], step[met, 0]
-    exact = rise % run == 0
-    return bool(exact.all() and ((contour[met, 1] + rise // run) % grid == 0).all())
+    distance = x - contour[:, 0]
+    is_met = (distance * (distance - step[:, 0]) <= 0) & (step[:, 0] != 0)
+    rise, run = distance[is_met] * step[is_met, 1], step[is_met, 0]
+    is_whole = rise % run == 0
+    return bool(
+        is_whole.all() and ((contour[is_met, 1] + rise // run) % grid == 0).all()
+    )
 
 
 def _bridged(outer: Array, hole: Array) -> tuple[Array, Array]:
-    """The area between an outline (counter-clockwise) and its hole (clockwise) in two,
-    without further corners.
+    """Two polygons that share the area between an outline and its hole.
 
-    Cut from the hole's corners to those of the outline: the shortest way that meets no
-    edge, and one as far from it
-    along the hole as there is (of those, the shortest).
+    Both cuts lead from a corner of the outline to a corner of the hole. The first is
+    the shortest that meets no edge. The second ends as far from it along the hole as
+    possible, and is the shortest of those.
+
+    Args:
+        outer: (n, 2) corners, counter-clockwise.
+        hole: (m, 2) corners, clockwise.
     """
     i, j = (v.ravel() for v in np.indices((len(outer), len(hole))))
-    seen = _free(outer[i], hole[j], (outer, hole))
-    i, j = i[seen], j[seen]
-    long = ((outer[i] - hole[j]) ** 2).sum(1)
-    first = int(long.argmin())
-    away = np.abs(j - j[first])
-    away = np.minimum(away, len(hole) - away)
-    others = (i != i[first]) & (away > 0)
+    is_visible = _free(outer[i], hole[j], (outer, hole))
+    i, j = i[is_visible], j[is_visible]
+    length = ((outer[i] - hole[j]) ** 2).sum(1)
+    first = int(length.argmin())
+    separation = np.abs(j - j[first])
+    separation = np.minimum(separation, len(hole) - separation)
+    is_candidate = (i != i[first]) & (separation > 0)
     ends = np.stack([outer[i[first]], hole[j[first]]])
-    others[others] = _free(outer[i[others]], hole[j[others]], (ends,))
-    last = min(np.flatnonzero(others).tolist(), key=lambda n: (-away[n], long[n]))
+    is_candidate[is_candidate] = _free(
+        outer[i[is_candidate]], hole[j[is_candidate]], (ends,)
+    )
+    last = min(
+        np.flatnonzero(is_candidate).tolist(), key=lambda n: (-separation[n], length[n])
+    )
     return (
         np.concatenate(
             [_between(outer, i[first], i[last]), _between(hole, j[last], j[first])]
@@ -152,21 +175,30 @@ def _between(contour: Array, first: int, last: int) -> Array:
 
 
 def _free(start: Array, end: Array, contours: Sequence[Array]) -> Array:
-    """(n,) whether lines between whole points touch no edge, but for edges that end
-    where they do.
+    """(n,) whether segments meet no edge of some contours.
+
+    Edges that share an end with the segment do not count.
+
+    Args:
+        start: (n, 2) whole points.
+        end: (n, 2) whole points.
+        contours: (m, 2) corners each.
     """
     free = np.ones(len(start), bool)
     for contour in contours:
         for p, q in zip(contour, np.roll(contour, -1, axis=0), strict=True):
-            near = [(start == one).all(1) | (end == one).all(1) for one in (p, q)]
-            sides = [np.sign(_cross(end - start, one - start)) for one in (p, q)]
-            own = [np.sign(_cross(q - p, one - p)) for one in (start, end)]
-            meets = (sides[0] * sides[1] <= 0) & (own[0] * own[1] <= 0)
+            shares_end = [
+                (start == point).all(1) | (end == point).all(1) for point in (p, q)
+            ]
+            sides = [np.sign(_cross(end - start, point - start)) for point in (p, q)]
+            edge_sides = [np.sign(_cross(q - p, point - p)) for point in (start, end)]
+            meets = (sides[0] * sides[1] <= 0) & (edge_sides[0] * edge_sides[1] <= 0)
             low, high = np.minimum(start, end), np.maximum(start, end)
             meets &= ((low <= np.maximum(p, q)) & (high >= np.minimum(p, q))).all(1)
-            free &= ~(meets & ~(near[0] | near[1]))
+            free &= ~(meets & ~(shares_end[0] | shares_end[1]))
     return free
 
 
 def _cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors (..., 2)."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -16,9 +16,9 @@ _ON_AXIS = (0.0, 0.0)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FocusWindow:
-    """Where the light is looked at.
+    """Where on the sensor the light is evaluated.
 
-    x_um, y_um: (x,), (y,) positions on the sensor; distance_um: lens to sensor.
+    x_um, y_um: (x,), (y,) positions on the sensor. distance_um: lens to sensor.
     depths_um: (depths,) distances of the source on the axis; inf for a collimated beam.
     """
 
@@ -39,8 +39,7 @@ class FocusSums:
     """Sums over the pillars of a lens, prepared for one window.
 
     case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um,
-    nodes_y_um: of the nodes.
-    onto_x, onto_y: (nodes, sites) polynomial basis, float32.
+    nodes_y_um: of the nodes. onto_x, onto_y: (nodes, sites) polynomial basis, float32.
     curvature: 1 / depth of the reference source whose phase is taken off.
     """
 
@@ -61,38 +60,44 @@ class FocusSums:
         sites against the basis.
         """
         x, y = self.x_um[columns], self.y_um[rows, None]
-        carried = amplitudes * np.exp(1j * self._carrier_rad(x, y)).astype(np.complex64)
-        along = carried @ self.onto_x[:, columns].T.astype(np.complex64)
+        flattened = amplitudes * np.exp(1j * self._carrier_rad(x, y)).astype(
+            np.complex64
+        )
+        along = flattened @ self.onto_x[:, columns].T.astype(np.complex64)
         return np.asarray(self.onto_y[:, rows].astype(np.complex64) @ along)
 
     def light(
         self, moments: Array, shift_um: tuple[float, float] = (0.0, 0.0)
     ) -> Array:
-        """(maps, depths, y, x) complex amplitude on the window.
+        """Complex amplitude on the window, (maps, depths, y, x).
+
+        sum over the nodes of moments * exp(i (source phase - carrier)) * kernel, with
+        the kernel area * factor * exp(i k path) from node to sample.
 
         Args:
             moments: (maps, nodes y, nodes x) from :meth:`project`.
             shift_um: (x, y) by which the pillars stand off their sites.
         """
-        window, k = self.window, self.case.wavenumber
+        window = self.window
+        k = self.case.wavenumber
         nodes_x = self.nodes_x_um + shift_um[0]
         nodes_y = self.nodes_y_um[:, None] + shift_um[1]
-        slow = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])
-        inverse = np.array(self.case.inverse_depths_per_um)[:, None, None]
+        carrier = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])
+        inverse_depths = np.array(self.case.inverse_depths_per_um)[:, None, None]
         sources = np.exp(
-            1j * (self._phase_rad(nodes_x, nodes_y, inverse) - slow)
-        ).reshape(len(inverse), -1)
+            1j * (self._phase_rad(nodes_x, nodes_y, inverse_depths) - carrier)
+        ).reshape(len(inverse_depths), -1)
         weights = moments.reshape(len(moments), 1, -1) * sources
         weights = weights.reshape(-1, weights.shape[-1]).T.astype(np.complex64)
         rows = []
         for y in window.y_um:
-            level, away = paths.ray_to_offset(
+            factor, path = paths.ray_to_offset(
                 self.case, nodes_x, nodes_y, window.x_um[:, None, None], y
             )
             kernel = (
                 self.case.area_um2
-                * level
-                * np.exp(1j * np.remainder(k * away, 2 * np.pi))
+                * factor
+                * np.exp(1j * np.remainder(k * path, 2 * np.pi))
             )
             rows.append(
                 kernel.reshape(len(window.x_um), -1).astype(np.complex64) @ weights
@@ -111,6 +116,7 @@ class FocusSums:
     def _phase_rad(
         self, x_um: Array, y_um: Array, inverse_depth: Array | float
     ) -> Array:
+        """Phase from a source on the axis, over (x, y) on the lens, to the sensor."""
         path = paths.to_sensor(self.case, x_um, y_um) + paths.from_source(
             self.case, x_um, y_um, _ON_AXIS, inverse_depth
         )
@@ -144,7 +150,7 @@ def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> Focus
         raise PropagationError(
             "the window and the lens need 2 samples and sites a side or more"
         )
-    seen = make_case(
+    case = make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
         wavelength_um=window.wavelength_um,
@@ -154,26 +160,29 @@ def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> Focus
         samples=1,
         layers=lens.layers,
     )
-    middle = paths.reference_depth(seen)
+    curvature = paths.reference_depth(case)
     x, y = lens.diameters.x_um, lens.diameters.y_um
-    count_x = _count(seen, float(x[-1]), float(abs(window.x_um).max()), middle) + margin
-    count_y = _count(seen, float(y[-1]), float(abs(window.y_um).max()), middle) + margin
+    count_x = (
+        _count(case, float(x[-1]), float(abs(window.x_um).max()), curvature) + margin
+    )
+    count_y = (
+        _count(case, float(y[-1]), float(abs(window.y_um).max()), curvature) + margin
+    )
     (nodes_x, onto_x), (nodes_y, onto_y) = _basis(x, count_x), _basis(y, count_y)
-    return FocusSums(window, seen, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
+    return FocusSums(window, case, x, y, nodes_x, nodes_y, onto_x, onto_y, curvature)
 
 
 def focus_window(
     lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0
 ) -> FocusWindow:
-    """A window around the axis that holds the blur at all depths and ``rings``
-    diffraction widths around it.
+    """A window around the axis that holds the blur at all depths.
 
     Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
 
-    depths_um: left out: the source distance of the design.
-
     Args:
         lens: as designed.
+        depths_um: of the source; None: the source distance of the design.
+        rings: diffraction widths around the blur.
     """
     depths = np.array(
         [lens.source_distance_um] if depths_um is None else depths_um, float
@@ -186,21 +195,29 @@ def focus_window(
 
 
 def _count(
-    seen: PropagationCase, edge_um: float, reach_um: float, middle: float
+    case: PropagationCase, edge_um: float, reach_um: float, curvature: float
 ) -> int:
-    """Half the turns of phase across the lens that are left, plus what Chebyshev series
-    need beyond (Bessel decay).
+    """Number of Chebyshev nodes along an axis, before any margin.
+
+    With the phase amplitude a = k * max|d path / dx| * edge, over the depths and less
+    the carrier, the series needs a + 4 a^(1/3) terms (decay of Bessel functions).
+
+    Args:
+        case: the lens with its films.
+        edge_um: half width of the lens.
+        reach_um: half width of the window.
+        curvature: 1 / depth of the reference source.
     """
     x = np.linspace(-edge_um, edge_um, 1001)
-    away = paths.ray_to_offset(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(
-        seen, x, 0.0, _ON_AXIS, middle
-    )
+    reference_path = paths.ray_to_offset(case, x, 0.0, reach_um, 0.0)[
+        1
+    ] - paths.from_source(case, x, 0.0, _ON_AXIS, curvature)
     differences = [
-        away + paths.from_source(seen, x, 0.0, _ON_AXIS, c)
-        for c in seen.inverse_depths_per_um
+        reference_path + paths.from_source(case, x, 0.0, _ON_AXIS, inverse_depth)
+        for inverse_depth in case.inverse_depths_per_um
     ]
     slope = max(float(abs(np.gradient(path, x)).max()) for path in differences)
-    turns = seen.wavenumber * slope * edge_um
+    turns = case.wavenumber * slope * edge_um
     return int(np.ceil(turns + 4 * turns ** (1 / 3)))
 
 

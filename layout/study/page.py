@@ -26,7 +26,7 @@ Answers = Mapping[
 
 
 def answers_of(lens: Lens) -> Answers:
-    """How the pillars answer to height, wall, index and their kin, from the solver.
+    """Sensitivities of the pillars to height, wall, index and the like, by the solver.
 
     Args:
         lens: as designed.
@@ -44,16 +44,17 @@ def answers_of(lens: Lens) -> Answers:
 def study_sections(
     lens: Lens, process: Process, plan: FieldPlan, answers: Answers
 ) -> list[Section]:
-    """Stitching and tolerance; half a minute for a 1 mm lens, most of it for the solver
-    and the Monte Carlo.
+    """Sections on stitching and tolerance.
 
-    Of pillars of two sizes two sections for light along x and two for light along y.
-
-    answers: :func:`answers_of` the lens.
+    Pillars of two sizes have two sections for light along x and two for light along y.
+    It takes half a minute for a 1 mm lens, most of it for the solver and the Monte
+    Carlo.
 
     Args:
+        lens: as designed.
         process: spread and write field.
         plan: write fields.
+        answers: :func:`answers_of` the lens.
     """
     if lens.pairs is None:
         return _of_light(lens, process, plan, answers[""])
@@ -72,31 +73,33 @@ def _of_light(
     plan: FieldPlan,
     answers: LogSensitivities | PairSensitivities,
 ) -> list[Section]:
+    """Sections on stitching and tolerance for one polarisation."""
     return [_stitching(lens, plan, process), tolerance_section(lens, process, answers)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
-    found = stitching.simulate_stitching(lens, plan, process)
+    """Section on the effect of misplaced write fields."""
+    study = stitching.simulate_stitching(lens, plan, process)
     rows = [
-        ["peak of the PSF", float(found.strehl.mean()), float(found.strehl.min())],
+        ["peak of the PSF", float(study.strehl.mean()), float(study.strehl.min())],
         [
             "change of the PSF, relative L2",
-            float(found.change.mean()),
-            float(found.change.max()),
+            float(study.change.mean()),
+            float(study.change.max()),
         ],
         [
             "move of its centroid / nm",
-            float(found.moved_nm.mean()),
-            float(found.moved_nm.max()),
+            float(study.moved_nm.mean()),
+            float(study.moved_nm.max()),
         ],
     ]
     text = (
-        f"Each of {found.fields} fields misplaced by up to ±{found.stitching_nm:g} nm along x and y, evenly spread, "
-        f"{len(found.strehl)} draws; the common shift, which only moves the image, is taken out."
+        f"Each of {study.fields} fields misplaced by up to ±{study.stitching_nm:g} nm along x and y, evenly spread, "
+        f"{len(study.strehl)} draws; the common shift, which only moves the image, is taken out."
     )
     items: list[Figure | Table] = [
         Figure(
-            _stitched(found),
+            _stitched(study),
             "The focus, and what the worst draw changes in it.",
             wide=True,
         ),
@@ -105,31 +108,34 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
     return Section("Stitching", text, items)
 
 
-def _stitched(found: StitchReport) -> bytes:
+def _stitched(study: StitchReport) -> bytes:
+    """PNG of the focus in dB, and of its change in the worst draw."""
     from scipy.signal import resample
 
     perfect, worst = (
         resample(
             resample(image, 6 * image.shape[0], axis=0), 6 * image.shape[1], axis=1
         )
-        for image in (found.psf, found.worst_psf)
+        for image in (study.psf, study.worst_psf)
     )
     figure, axes = report.make_figure(1, 2, size=(7.8, 3.2))
-    edge = float(found.window.x_um[-1])
+    edge = float(study.window.x_um[-1])
     extent = (-edge, edge, edge, -edge)
     level = 10 * np.log10(np.maximum(perfect / perfect.max(), 1e-5))
     change = 100 * (worst - perfect) / perfect.max()
-    most = float(abs(change).max())
+    largest = float(abs(change).max())
     pictures = [
         axes[0].imshow(level, extent=extent, vmin=-40, vmax=0),
-        axes[1].imshow(change, extent=extent, vmin=-most, vmax=most, cmap="RdBu_r"),
+        axes[1].imshow(
+            change, extent=extent, vmin=-largest, vmax=largest, cmap="RdBu_r"
+        ),
     ]
-    for ax, shown, title, unit in zip(
+    for ax, picture, title, unit in zip(
         axes, pictures, ("perfect fields", "change"), ("dB", "% of peak"), strict=True
     ):
         ax.set(title=title, xlabel="x / µm", ylabel="y / µm")
         ax.grid(visible=False)
-        figure.colorbar(shown, ax=ax, label=unit)
+        figure.colorbar(picture, ax=ax, label=unit)
     return report.figure_png(figure)
 
 
@@ -146,12 +152,20 @@ def tolerance_section(
     study = tolerance.analyse_tolerance(lens, process, sens=answers)
     rows = [
         [
-            e.cause,
-            e.deviation,
-            e.phase_rad,
-            *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information)),
+            effect.cause,
+            effect.deviation,
+            effect.phase_rad,
+            *(
+                100 * value
+                for value in (
+                    effect.strehl,
+                    effect.efficiency,
+                    effect.psf,
+                    effect.information,
+                )
+            ),
         ]
-        for e in study.effects
+        for effect in study.effects
     ]
     head = (
         "cause",
@@ -165,12 +179,12 @@ def tolerance_section(
     bands = [
         [
             name,
-            *(float(v) for v in study.band(name)),
+            *(float(value) for value in study.band(name)),
             float(getattr(study.nominal, name)[0]),
         ]
         for name in ("strehl", "efficiency", "psf_change")
     ]
-    through = (
+    route = (
         "the diameter through the proxy"
         if lens.pairs is None
         else "both sizes through the table of the library"
@@ -178,7 +192,7 @@ def tolerance_section(
     text = (
         "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
-        f"derivatives of the solver (known to {100 * answers.error:.0f} %), {through}; the "
+        f"derivatives of the solver (known to {100 * answers.error:.0f} %), {route}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     ) + _beside(lens, process)
     items: list[Figure | Table] = [
@@ -199,27 +213,30 @@ def tolerance_section(
 
 
 def _beside(lens: Lens, process: Process) -> str:
-    """What the numbers are not of: light that keeps its hand, and walls that the
-    process leans otherwise.
+    """Text on what the tolerances leave out.
+
+    That is light that keeps its handedness, and sidewalls of the process that differ
+    from those of the cell by more than the spread.
     """
     text = ""
     wall = lens.cell.sidewall_rad / deg
-    made = process.etch.sidewall_deg
+    etched = process.etch.sidewall_deg
     if lens.hand:
         text += (
             " All of it for the light that changes hand: what keeps its hand has no focus, and lies under the image "
             "as a haze of no more than what the converted light lacks."
         )
-    if abs(made - wall) > process.spread.sidewall_deg:
+    if abs(etched - wall) > process.spread.sidewall_deg:
         text += (
             f" The pillars are studied with the walls of their cell, {wall:.3g} deg from upright; the process makes "
-            f"{made:.3g} deg, which is beyond its spread: sweep and design with sidewall_rad = {made * deg:.3g} "
+            f"{etched:.3g} deg, which is beyond its spread: sweep and design with sidewall_rad = {etched * deg:.3g} "
             "in [cell]."
         )
     return text
 
 
 def _bands(study: ToleranceReport) -> bytes:
+    """PNG of the bands of the PSF along x and of the information over depth."""
     from scipy.signal import resample
 
     figure, axes = report.make_figure(1, 2, size=(7.8, 3.0))

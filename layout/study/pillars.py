@@ -73,24 +73,27 @@ class TwoSizes:
 def classify_pillars(
     lens: Lens, sens: LogSensitivities | PairSensitivities
 ) -> tuple[Array, Array, PillarKindsOfLens]:
-    """((y, x) kind of each site from 1 on, 0 none; (kinds,) how many of each; what
-    their t follows from).
+    """Distinct kinds of the pillars of a lens.
 
     Args:
         lens: as designed.
         sens: sensitivities of its pillars.
+
+    Returns:
+        (y, x) kind of each site, from 1 on, 0 for none; (kinds,) number of pillars of
+        each; and the kinds, which give their transmission.
     """
-    own = Kinds.of(lens.diameters)
-    index = (own.index(lens.diameters) + 1) % (len(own.count) + 1)
+    kinds = Kinds.of(lens.diameters)
+    index = (kinds.index(lens.diameters) + 1) % (len(kinds.count) + 1)
     if isinstance(sens, LogSensitivities):
         return (
             index,
-            own.count,
-            OneSize(lens.proxy, lens.wavelength_um, sens, own.width_um),
+            kinds.count,
+            OneSize(lens.proxy, lens.wavelength_um, sens, kinds.width_um),
         )
-    rates = sens.at(own.width_um, own.length_um)
+    rates = sens.at(kinds.width_um, kinds.length_um)
     return (
         index,
-        own.count,
-        TwoSizes(PairTable.of(lens), own.width_um, own.length_um, rates),
+        kinds.count,
+        TwoSizes(PairTable.of(lens), kinds.width_um, kinds.length_um, rates),
     )

@@ -62,5 +62,5 @@ def compute_sensitivities(lens: Lens, *, count: int = 15) -> LogSensitivities:
     """
     diameters = np.linspace(*lens.proxy.domain_um, count)
     diameters = diameters[:: 2 if lens.cell.sidewall_rad else 1]
-    found = own_rates(lens, diameters)
-    return LogSensitivities(diameters, found.rates, found.error, found.edges)
+    rates = own_rates(lens, diameters)
+    return LogSensitivities(diameters, rates.rates, rates.error, rates.edges)

@@ -17,15 +17,13 @@ _BAND = 64
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StitchReport:
-    """Change of the point-spread function over random field offsets, uniform within +-
-    ``stitching_nm`` along x and y.
+    """Change of the PSF over random field offsets, uniform within +- ``stitching_nm``.
 
-    strehl: (draws,) peak intensity relative to perfect fields.
-    change: (draws,) relative L2 change of the PSF on the window.
-    moved_nm: (draws,) move of its centroid.
-    psf, worst_psf: (y, x) intensity of perfect fields and of the draw that changes
-    most; window: where.
-    fields: that hold pillars. seed: of the draws.
+    strehl: (draws,) peak intensity relative to perfect fields. change: (draws,)
+    relative L2 change of the PSF on the window. moved_nm: (draws,) move of its
+    centroid. psf, worst_psf: (y, x) intensity of perfect fields, and of the draw that
+    changes most. window: positions of both. fields: number that hold pillars. seed: of
+    the draws.
     """
 
     stitching_nm: float
@@ -42,10 +40,10 @@ class StitchReport:
 def simulate_stitching(
     lens: Lens, plan: FieldPlan, process: Process, *, draws: int = 500, seed: int = 0
 ) -> StitchReport:
-    """Draw field offsets and see the focus of the design source change.
+    """Change of the focus over random offsets of the write fields.
 
-    The mean offset of the fields, which only moves the image, is taken out of each
-    draw.
+    The light is a second-order series in the offset of each field. The mean offset of
+    the fields, which only moves the image, is taken out of each draw.
 
     Args:
         lens: as designed.
@@ -59,12 +57,12 @@ def simulate_stitching(
         20 nm and NA 0.25.
     """
     focus = prepare_focus(lens, focus_window(lens))
-    held, moments = field_moments(lens, plan, focus)
+    fields, moments = field_moments(lens, plan, focus)
     step = max(process.write_field.stitching_nm, 1.0) * 1e-3
-    still, terms = _expansion(focus, moments, step)
+    unmoved, derivatives = _expansion(focus, moments, step)
     rng = np.random.default_rng(seed)
     offsets = (
-        rng.uniform(-1, 1, (draws, held, 2))
+        rng.uniform(-1, 1, (draws, fields, 2))
         * process.write_field.stitching_nm
         * 1e-3
         / step
@@ -72,8 +70,11 @@ def simulate_stitching(
     offsets -= offsets.mean(axis=1, keepdims=True)
     x, y = offsets[..., 0], offsets[..., 1]
     factors = np.stack([x, y, x**2 / 2, y**2 / 2, x * y], axis=1).reshape(draws, -1)
-    light = still + np.tensordot(factors, terms.reshape(-1, *still.shape), axes=1)
-    perfect, psf = abs(still) ** 2, abs(light) ** 2
+    amplitude = unmoved + np.tensordot(
+        factors, derivatives.reshape(-1, *unmoved.shape), axes=1
+    )
+    perfect = abs(unmoved) ** 2
+    psf = abs(amplitude) ** 2
     change = np.sqrt(((psf - perfect) ** 2).sum((1, 2)) / (perfect**2).sum())
     moved = (
         np.hypot(
@@ -91,7 +92,7 @@ def simulate_stitching(
         perfect,
         psf[worst],
         focus.window,
-        held,
+        fields,
         seed,
     )
 
@@ -104,61 +105,76 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, A
         plan: write fields.
         focus: sums of a window.
     """
-    found = []
+    moments = []
     for rows, columns in plan.blocks():
         if not lens.diameters.diameter_um[rows, columns].any():
             continue
-        total = np.zeros((len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
+        field_sum = np.zeros((len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
         for start in range(rows.start, rows.stop, _BAND):
             band = slice(start, min(start + _BAND, rows.stop))
-            total += focus.project(
+            field_sum += focus.project(
                 _amplitude(lens, band, columns)[None], band, columns
             )[0]
-        found.append(total)
-    return len(found), np.stack(found)
+        moments.append(field_sum)
+    return len(moments), np.stack(moments)
 
 
 def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    d = lens.diameters.diameter_um[rows].astype(float)
-    long = lens.diameters.length_um
-    if lens.pairs is not None and long is not None:
-        return lens.pairs.amplitude(d, long[rows], lens.wavelength_um, lens.light)[
-            :, columns
-        ].astype(np.complex64)
-    inside = np.where(d > 0, d, lens.proxy.domain_um[0])
-    t = designed_transmission(lens.proxy, inside, lens.wavelength_um) * np.exp(
+    """(rows, columns) complex64 transmissions of the pillars of a block; 0 for none."""
+    diameters = lens.diameters.diameter_um[rows].astype(float)
+    lengths = lens.diameters.length_um
+    if lens.pairs is not None and lengths is not None:
+        return lens.pairs.amplitude(
+            diameters, lengths[rows], lens.wavelength_um, lens.light
+        )[:, columns].astype(np.complex64)
+    sizes = np.where(diameters > 0, diameters, lens.proxy.domain_um[0])
+    t = designed_transmission(lens.proxy, sizes, lens.wavelength_um) * np.exp(
         1j * lens.geometric_rad(rows)
     )
-    return np.where(d > 0, t, 0)[:, columns].astype(np.complex64)
+    return np.where(diameters > 0, t, 0)[:, columns].astype(np.complex64)
 
 
 def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array, Array]:
-    """((y, x) light of all fields, (5, fields, y, x) derivatives by x, y, xx, yy, xy,
-    in units of the step).
+    """Light of all fields, and its derivatives by the offset of each field.
+
+    Central differences of step h; the mixed derivative is (f(h, h) + f(-h, -h) - f(h,
+    0) - f(-h, 0) - f(0, h) - f(0, -h)) / 2 + f(0, 0).
+
+    Args:
+        focus: sums of the window.
+        moments: (fields, nodes y, nodes x).
+        step_um: h.
+
+    Returns:
+        (y, x) amplitude, and (5, fields, y, x) derivatives by x, y, xx, yy and xy in
+        units of the step.
     """
     h = step_um
 
-    def at(x: float, y: float) -> Array:
+    def light_at(x: float, y: float) -> Array:
         return np.asarray(focus.light(moments, (x, y))[:, 0])
 
-    still = at(0, 0)
-    right = at(h, 0)
-    left = at(-h, 0)
-    down = at(0, h)
-    up = at(0, -h)
-    cross = (at(h, h) + at(-h, -h) - right - left - down - up) / 2 + still
+    unmoved = light_at(0, 0)
+    plus_x = light_at(h, 0)
+    minus_x = light_at(-h, 0)
+    plus_y = light_at(0, h)
+    minus_y = light_at(0, -h)
+    mixed = (
+        light_at(h, h) + light_at(-h, -h) - plus_x - minus_x - plus_y - minus_y
+    ) / 2 + unmoved
     terms = [
-        (right - left) / 2,
-        (down - up) / 2,
-        right + left - 2 * still,
-        down + up - 2 * still,
-        cross,
+        (plus_x - minus_x) / 2,
+        (plus_y - minus_y) / 2,
+        plus_x + minus_x - 2 * unmoved,
+        plus_y + minus_y - 2 * unmoved,
+        mixed,
     ]
-    return still.sum(0), np.stack(terms)
+    return unmoved.sum(0), np.stack(terms)
 
 
-def _centroid(psf: Array, where: FocusWindow) -> Array:
+def _centroid(psf: Array, window: FocusWindow) -> Array:
+    """(2, draws) x and y of the centroids of PSFs (draws, y, x), um."""
     total = psf.sum((1, 2))
     return np.stack(
-        [(psf.sum(1) @ where.x_um) / total, (psf.sum(2) @ where.y_um) / total]
+        [(psf.sum(1) @ window.x_um) / total, (psf.sum(2) @ window.y_um) / total]
     )

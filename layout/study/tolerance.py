@@ -31,17 +31,14 @@ _BATCH = 25
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ToleranceOutcome:
-    """What is looked at, for draws of the process; the first axis counts them.
+    """Quantities of the study for draws of the process; the first axis counts them.
 
-    strehl: (draws,) peak at the design depth relative to the nominal lens.
-    efficiency: (draws,) focusing efficiency: power within a circle of three FWHM over
-        power on the aperture.
-    psf_change: (draws,) relative L2 change of the PSF at the design depth from the
-    nominal one.
-    information: (draws, depths) axial Fisher information of the normalised PSF (paper
-    Eq. 11), 1 / um^2.
-    psf: (draws, x) intensity along x through the middle at the design depth, 1 at the
-    nominal peak.
+    strehl: (draws,) peak at the design depth relative to the nominal lens. efficiency:
+    (draws,) focusing efficiency: power within a circle of three FWHM over power on the
+    aperture. psf_change: (draws,) relative L2 change of the PSF at the design depth
+    from the nominal PSF. information: (draws, depths) axial Fisher information of the
+    normalised PSF (paper Eq. 11), 1 / um^2. psf: (draws, x) intensity along x through
+    the middle at the design depth, 1 at the nominal peak.
     """
 
     strehl: Array
@@ -53,13 +50,11 @@ class ToleranceOutcome:
 
 @dataclass(frozen=True, slots=True)
 class CauseEffect:
-    """One cause at its standard deviation, both signs; the worse of the two for each
-    number.
+    """One cause at its standard deviation; for each number the worse of both signs.
 
     phase_rad: rms change of the pillars' phases about their mean. transmission: rms
-    change of |T|.
-    strehl, efficiency, information (summed over the depths): relative change; psf:
-    relative L2 change.
+    change of |T|. strehl, efficiency, information (summed over the depths): relative
+    change. psf: relative L2 change.
     """
 
     cause: str
@@ -77,11 +72,9 @@ class ToleranceReport:
     """Result of :func:`analyse_tolerance`.
 
     effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte
-    Carlo.
-    depths_um: of the information, by differences over step_um; window: where the light
-    was looked at.
-    rank: dimensions of the space of t(D). error: largest rms relative error of t over
-    the pillars in any draw.
+    Carlo. depths_um: of the information, by differences over step_um. window: of the
+    sensor where the PSFs are evaluated. rank: dimensions of the space of t(D). error:
+    largest rms relative error of t over the pillars in any draw.
     """
 
     effects: tuple[CauseEffect, ...]
@@ -110,15 +103,18 @@ def analyse_tolerance(
     draws: int = 100,
     seed: int = 0,
 ) -> ToleranceReport:
-    """Effects of each cause at its standard deviation (``process.spread``), and Monte
-    Carlo over all of them.
+    """Effect of each cause at its standard deviation, and Monte Carlo over all of them.
+
+    The causes are those of ``process.spread``.
 
     Args:
-        sens: answers to height, wall and index; left out: from the RCWA solver.
-        depths_um: where the axial information is wanted; left out: both ends and the
-            middle of the depths at which
-            the lens blurs (:mod:`metalens.lens.reach`). The design source is always
-            looked at as well.
+        lens: as designed.
+        process: spread.
+        sens: sensitivities to height, wall and index; None: from the RCWA solver.
+        depths_um: of the axial information; left out: both ends and the middle of the
+            depths at which the lens blurs (:mod:`metalens.lens.reach`). The design
+            source is always studied too.
+        draws: of the Monte Carlo.
         seed: of the draws.
 
     Accuracy: see ``error`` of the report (measured); bands of percentiles carry the
@@ -137,22 +133,29 @@ def analyse_tolerance(
             if lens.pairs is None
             else pair_sensitivities(lens)[lens.light]
         )
-    near, far = reach.depth_range_um(lens)
-    depths_um = depths_um or (near, (near + far) / 2, far)
-    step_um = (far - near) / STEPS
-    every = np.array(
-        [lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))]
+    nearest_um, farthest_um = reach.depth_range_um(lens)
+    depths_um = depths_um or (nearest_um, (nearest_um + farthest_um) / 2, farthest_um)
+    step_um = (farthest_um - nearest_um) / STEPS
+    all_depths_um = np.array(
+        [
+            lens.source_distance_um,
+            *(
+                evaluated
+                for depth in depths_um
+                for evaluated in (depth, depth + step_um)
+            ),
+        ]
     )
-    focus = prepare_focus(lens, focus_window(lens, depths_um=every))
+    focus = prepare_focus(lens, focus_window(lens, depths_um=all_depths_um))
     model = reduce_spread(lens, sens, focus, process.spread, seed=seed)
     single = [
-        Draw({name: sign * s})
-        for name, s in process.spread.stated.items()
+        Draw({name: sign * deviation})
+        for name, deviation in process.spread.stated.items()
         for sign in (-1, 1)
     ]
-    everything = [Draw({}), *single, *draw_lenses(process.spread, draws, seed=seed + 1)]
-    outcome = _outcome(model, [draw.state() for draw in everything], step_um)
-    nominal, alone, many = (
+    all_draws = [Draw({}), *single, *draw_lenses(process.spread, draws, seed=seed + 1)]
+    outcome = _outcome(model, [draw.state() for draw in all_draws], step_um)
+    nominal, single_outcomes, monte_carlo = (
         _part(outcome, part)
         for part in (
             slice(0, 1),
@@ -164,16 +167,16 @@ def analyse_tolerance(
         _effect(
             model,
             tuple(single[2 * n : 2 * n + 2]),
-            _part(alone, slice(2 * n, 2 * n + 2)),
+            _part(single_outcomes, slice(2 * n, 2 * n + 2)),
             nominal,
         )
         for n in range(len(single) // 2)
     )
-    error = reduction_error(model, everything)
+    error = reduction_error(model, all_draws)
     return ToleranceReport(
         effects,
         nominal,
-        many,
+        monte_carlo,
         np.array(depths_um),
         step_um,
         focus.window,
@@ -186,7 +189,13 @@ def analyse_tolerance(
 def _outcome(
     model: SpreadModel, lenses: list[State], step_um: float
 ) -> ToleranceOutcome:
-    """Everything that is looked at, lens by lens; the first is the nominal one."""
+    """Outcome of all lenses, in parallel batches; the first is the reference.
+
+    Args:
+        model: sums over the pillars.
+        lenses: states of the process, the nominal state first.
+        step_um: of the finite difference along depth.
+    """
     with threads.one_blas_thread():  # as workers have
         reference = np.asarray(
             abs(model.focus.light(model.drawn(lenses[:1]))[0, 0]) ** 2
@@ -205,24 +214,29 @@ def _outcome_of(
 ) -> tuple[Array, ...]:
     """Fields of :class:`ToleranceOutcome` of some lenses.
 
-    about: model, (y, x) intensity of the nominal lens at the design depth, step of the
-    depths in um.
+    The information is sum |d p / d z|^2 over the window, p the PSF of sum 1, by forward
+    differences.
+
+    Args:
+        about: model, (y, x) intensity of the nominal lens at the design depth, and step
+            of the depths in um.
+        lenses: states of the process.
     """
     model, reference, step_um = about
-    view = model.focus.window
+    window = model.focus.window
     incident = model.count.sum() * model.focus.case.area_um2
     psf = abs(model.focus.light(model.drawn(lenses))) ** 2
-    design = psf[:, 0]
-    unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
-    steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
-    peaks = [find_peak(image) for image in design]
-    power = [_focused_power(*pair) for pair in zip(design, peaks, strict=True)]
+    at_design = psf[:, 0]
+    normalised = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
+    steps = (normalised[:, 1::2] - normalised[:, ::2]) / step_um
+    peaks = [find_peak(image) for image in at_design]
+    powers = [_focused_power(*pair) for pair in zip(at_design, peaks, strict=True)]
     return (
-        np.array([top for *_, top in peaks]) / find_peak(reference)[2],
-        np.array(power) * view.cell_um2 / incident,
-        np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
+        np.array([peak for *_, peak in peaks]) / find_peak(reference)[2],
+        np.array(powers) * window.cell_um2 / incident,
+        np.sqrt(((at_design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
         (steps**2).sum((2, 3)),
-        design[:, len(view.y_um) // 2] / reference.max(),
+        at_design[:, len(window.y_um) // 2] / reference.max(),
     )
 
 
@@ -232,24 +246,30 @@ def _focused_power(light: Array, peak: tuple[float, float, float]) -> float:
 
 
 def _part(outcome: ToleranceOutcome, rows: slice) -> ToleranceOutcome:
-    every = (
+    """The outcome of some draws."""
+    fields = (
         outcome.strehl,
         outcome.efficiency,
         outcome.psf_change,
         outcome.information,
         outcome.psf,
     )
-    return ToleranceOutcome(*(values[rows] for values in every))
+    return ToleranceOutcome(*(values[rows] for values in fields))
 
 
 def _effect(
     model: SpreadModel,
     signs: tuple[Draw, ...],
-    found: ToleranceOutcome,
+    outcome: ToleranceOutcome,
     nominal: ToleranceOutcome,
 ) -> CauseEffect:
-    """The worse of both signs of one cause; pillar statistics at the bias that the
-    cause has at the edge.
+    """Effect of one cause: for each number the worse of both signs.
+
+    Args:
+        model: sums over the pillars.
+        signs: draws of minus and plus one standard deviation.
+        outcome: of both draws.
+        nominal: outcome of the designed lens.
     """
     ((cause, deviation),) = signs[1].amounts.items()
     changes = [_pillar_change(model, draw.state()) for draw in signs]
@@ -261,28 +281,33 @@ def _effect(
         cause=cause,
         deviation=deviation,
         phase_rad=max(phase for phase, _ in changes),
-        transmission=max(level for _, level in changes),
-        strehl=worst(found.strehl, nominal.strehl),
-        efficiency=worst(found.efficiency, nominal.efficiency),
-        psf=float(found.psf_change.max()),
-        information=worst(found.information.sum(1), nominal.information.sum(1)),
+        transmission=max(transmission for _, transmission in changes),
+        strehl=worst(outcome.strehl, nominal.strehl),
+        efficiency=worst(outcome.efficiency, nominal.efficiency),
+        psf=float(outcome.psf_change.max()),
+        information=worst(outcome.information.sum(1), nominal.information.sum(1)),
     )
 
 
 def _pillar_change(model: SpreadModel, state: State) -> tuple[float, float]:
-    """(rms phase change about the mean, rms change of |T|) over pillars spread evenly
-    over the aperture.
+    """Rms change of phase about its mean, rad, and rms change of |t|, over the pillars.
+
+    Pillars are evaluated at 64 places spread evenly over the aperture (golden angle).
+
+    Args:
+        model: kinds of pillars and their numbers.
+        state: of the process.
     """
     radius = np.sqrt((np.arange(64) + 0.5) / 64)
     angle = np.arange(64) * np.pi * (3 - np.sqrt(5))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    before = model.pillars.curve(np.zeros(1), State.of())
-    after = model.pillars.curve(state.bias_um(u, v), state)
-    weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
-    turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
-    turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))
-    phase = np.angle(turn)
-    level = abs(after) - abs(before)
+    designed = model.pillars.curve(np.zeros(1), State.of())
+    changed = model.pillars.curve(state.bias_um(u, v), state)
+    weight = np.broadcast_to(model.count, changed.shape) / (model.count.sum() * len(u))
+    ratio = changed / designed * np.exp(1j * state.phase_rad(u, v))[:, None]
+    ratio = ratio * np.exp(-1j * np.angle((ratio * weight).sum()))
+    phase = np.angle(ratio)
+    change = abs(changed) - abs(designed)
     return float(np.sqrt((phase**2 * weight).sum())), float(
-        np.sqrt((level**2 * weight).sum())
+        np.sqrt((change**2 * weight).sum())
     )

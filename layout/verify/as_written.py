@@ -27,21 +27,27 @@ class LensRows:
             self._size_um[first:end] = rows.made_nm[::-1] * nm
 
     def lens(self, designed: Lens) -> Lens:
-        """``designed`` with these sizes; profile ``as-written``.
+        """The designed lens with the predicted sizes, profile ``as-written``.
+
+        The length of pillars of two sizes changes by as much as the width.
+
+        Args:
+            designed: lens of the plan.
 
         Raises:
             ProcessError: a predicted pillar as wide as the pitch.
         """
-        made, was = self._size_um, designed.diameters
-        if was.plain and made.max() >= was.pitch_um:
+        size_um = self._size_um
+        sizes = designed.diameters
+        if sizes.plain and size_um.max() >= sizes.pitch_um:
             raise ProcessError(
-                f"a pillar is predicted {made.max():.3f} um wide, as wide as the "
+                f"a pillar is predicted {size_um.max():.3f} um wide, as wide as the "
                 "pitch; check the doses"
             )
-        long = was.length_um
-        if long is not None:  # all edges move alike
-            long = np.where(made > 0, long + (made - was.diameter_um), 0).astype(
-                np.float32
-            )
-        found = dataclasses.replace(was, diameter_um=made, length_um=long)
-        return dataclasses.replace(designed, diameters=found, profile="as-written")
+        length_um = sizes.length_um
+        if length_um is not None:  # all edges move equally
+            length_um = np.where(
+                size_um > 0, length_um + (size_um - sizes.diameter_um), 0
+            ).astype(np.float32)
+        written = dataclasses.replace(sizes, diameter_um=size_um, length_um=length_um)
+        return dataclasses.replace(designed, diameters=written, profile="as-written")

@@ -31,8 +31,8 @@ class WrittenMask:
     """What a written mask exposes with the pillars.
 
     bodies: lattices of class numbers. kinds: what each class draws. dose, layer,
-    size_um: (classes + 1,) of each class, dose 0 where its layer has none.
-    others: all other shapes. undosed: layers with shapes and no dose.
+    size_um: (classes + 1,) of each class; dose 0 where its layer has none. others: all
+    other shapes. undosed: layers with shapes and no dose.
     """
 
     bodies: Sequence[PillarArray]
@@ -46,7 +46,7 @@ class WrittenMask:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExposedRows:
-    """What comes out in some rows of a lattice, (rows, columns) each.
+    """Predicted sizes in some rows of a lattice, (rows, columns) each.
 
     number: of the lattice. first: row. classes: 0 for no pillar. exposure: of the drawn
     edge, relative to dose to size. resist_nm, made_nm: sizes in the resist and after
@@ -70,47 +70,49 @@ def verify_exposure(
     height_um: float = 0.0,
     keep: Callable[[ExposedRows], None] | None = None,
 ) -> ExposureReport:
-    """Expose and etch a mask that was read back, whose pillars stand where ``plan`` has
-    them.
+    """Expose and etch a mask that was read back, in simulation.
 
     Args:
         content: read back; sums over its placements are enough.
-        doses: its dose table. height_um: of the pillars, for their feet.
-        keep: is given the rows of all lattices, in turn; memory is bounded.
+        plan: mask with the places of the pillars.
+        doses: its dose table.
         process: point exposure, bias, etch and layers.
+        height_um: of the pillars, for their feet.
+        keep: called with the rows of all lattices, in turn; memory is bounded.
 
     Accuracy: the field on nodes to some 1e-4 (the result states the difference from
     direct sums); widths by the slope at the drawn edge, 3 % of a shift of 4 nm.
 
     Raises:
-        ProcessError: no point exposure is given, no pillar has a dose, or a class is
-            not one outline.
+        ProcessError: the process has no point exposure, no pillar has a dose, or a
+            class is not one outline.
     """
     point = point_exposure(process.exposure)
     scene = read_scene(content, plan, doses, process)
     field = _Field.of(scene, point)
-    total, box = VerificationTally.empty(), _box(scene.bodies, ())
+    tally = VerificationTally.empty()
+    box = _box(scene.bodies, ())
     judged = (scene.dose > 0) & (scene.layer != process.layers.dose[0])
-    count = 0
+    pillars = 0
     for rows in _develop(scene, field, plan, process):
         body = scene.bodies[rows.number]
         row, column = np.nonzero(scene.dose[rows.classes] > 0)
-        kind = rows.classes[row, column]
-        count += len(kind)
+        pillar_class = rows.classes[row, column]
+        pillars += len(pillar_class)
         values = (
             rows.exposure[row, column],
-            scene.size_um[kind] / nm,
+            scene.size_um[pillar_class] / nm,
             rows.resist_nm[row, column],
             rows.made_nm[row, column],
         )
         y = body.rows_um(rows.first, len(rows.classes))
-        total.take((body.columns_um[column], y[row]), judged[kind], values, box)
+        tally.take((body.columns_um[column], y[row]), judged[pillar_class], values, box)
         if keep is not None:
             keep(rows)
     top, foot = process.top_foot_nm(0.0, height_um / nm)
     return ExposureReport(
-        count,
-        total,
+        pillars,
+        tally,
         box,
         _edges(scene, field, point),
         float(foot - top) / 2,
@@ -130,12 +132,15 @@ def read_scene(
 
     Args:
         content: read back.
+        plan: mask with classes and lattices.
+        doses: relative dose of each layer.
         process: layers.
 
     Raises:
         ProcessError: a class that is not one outline, or no pillar with a dose.
     """
-    layers, unit = process.layers, content.unit_nm * nm
+    layers = process.layers
+    unit = content.unit_nm * nm
     skipped = {layers.aperture[0], layers.outline[0], layers.fields[0]}
     undosed: set[LayerNumber] = set()
 
@@ -149,75 +154,83 @@ def read_scene(
 
     used = np.flatnonzero(plan.counts()[1:] > 0) + 1
     contours: list[Sequence[Array]] = [()] * (len(plan.classes) + 1)
-    dose, layer, size = np.zeros((3, len(plan.classes) + 1))
-    for k in used.tolist():
-        made = plan.classes[k - 1]
-        stacks = list(exposed(plan.classes[k - 1].name))
+    dose, layer, size_um = np.zeros((3, len(plan.classes) + 1))
+    for number in used.tolist():
+        pillar = plan.classes[number - 1]
+        stacks = list(exposed(plan.classes[number - 1].name))
         if not stacks:
             continue
-        contours[k] = [c * unit for c in _one_outline(made.name, stacks)]
-        dose[k], layer[k] = doses[stacks[0].layer], stacks[0].layer[0]
-        size[k] = made.diameter_nm * nm
+        contours[number] = [
+            contour * unit for contour in _one_outline(pillar.name, stacks)
+        ]
+        dose[number], layer[number] = doses[stacks[0].layer], stacks[0].layer[0]
+        size_um[number] = pillar.diameter_nm * nm
     if not dose.any():
         raise ProcessError(
             "the mask holds no pillar with a dose; nothing can be verified"
         )
     kinds: DrawnKinds = DrawnOutlines(contours)
-    if all(made.round for made in plan.classes):
-        size = kinds.diameter_um
-        kinds = DrawnDiscs(size)
-    empty = {
-        l.name: dataclasses.replace(
-            content.cells[l.name], placed=NOTHING, sums=None, pillars=None
+    if all(pillar.round for pillar in plan.classes):
+        size_um = kinds.diameter_um
+        kinds = DrawnDiscs(size_um)
+    emptied = {
+        lattice.name: dataclasses.replace(
+            content.cells[lattice.name], placed=NOTHING, sums=None, pillars=None
         )
-        for l in plan.lattices
+        for lattice in plan.lattices
     }
-    content = dataclasses.replace(content, cells={**content.cells, **empty})
+    content = dataclasses.replace(content, cells={**content.cells, **emptied})
     corners: list[Array] = []
-    others: list[tuple[float, int]] = []
+    dose_and_layer: list[tuple[float, int]] = []
     for stack in exposed(plan.name):
         places = np.stack([stack.x, stack.y], -1)[:, None, None]
-        shapes = (stack.outlines[None] + places).reshape(-1, *stack.outlines.shape[1:])
-        corners += list(shapes * unit)
-        others += [(doses[stack.layer], stack.layer[0])] * len(shapes)
-    table = np.array(others, float).reshape(-1, 2)
+        outlines = (stack.outlines[None] + places).reshape(
+            -1, *stack.outlines.shape[1:]
+        )
+        corners += list(outlines * unit)
+        dose_and_layer += [(doses[stack.layer], stack.layer[0])] * len(outlines)
+    table = np.array(dose_and_layer, float).reshape(-1, 2)
     return WrittenMask(
-        [dataclasses.replace(l, unit_um=unit) for l in plan.lattices],
+        [dataclasses.replace(lattice, unit_um=unit) for lattice in plan.lattices],
         kinds,
         dose,
         layer.astype(np.int64),
-        size,
+        size_um,
         ExposedPolygons(corners, table[:, 0], table[:, 1].astype(np.int64)),
         tuple(sorted(undosed)),
     )
 
 
 def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
-    """Contours of what a class of pillars draws, in database units."""
+    """Contours of what a class of pillars draws, in database units.
+
+    Raises:
+        ProcessError: several outer contours, or shapes on several layers.
+    """
     drawn = [
         outline + np.array(place)
         for stack in stacks
         for outline in stack.outlines
         for place in zip(stack.x, stack.y, strict=True)
     ]
-    found = drawn if len(drawn) == 1 else region.union_contours(drawn)
-    outer = sum(polygon.twice_area(c) > 0 for c in found)
+    contours = drawn if len(drawn) == 1 else region.union_contours(drawn)
+    outer = sum(polygon.twice_area(contour) > 0 for contour in contours)
     if outer != 1 or len({stack.layer for stack in stacks}) > 1:
         raise ProcessError(
             f"class {name} of pillars draws {outer} outlines; it is not verified as one"
         )
-    return [np.asarray(c, float) for c in found]
+    return [np.asarray(contour, float) for contour in contours]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Field:
-    """Background of all that is exposed: on nodes by wide Gaussians, on the sites by
-    those that reach neighbours only.
+    """Background exposure: on nodes by wide Gaussians, on the sites by middle ones.
 
-    own, slope: (classes + 1,) exposure of a pillar's edge by itself at unit dose, less
-    what the node field counts for it, and its fall per um.
-    close: (range, weight) of the Gaussians that nodes do not hold. spots: points and
-    masses that stand for other shapes.
+    far: (y, x) on the nodes. near: (rows, columns) of each lattice; empty without
+    middle range. own, slope: (classes + 1,) exposure of a pillar's edge by itself at
+    unit dose, less what the node field counts for it, and its fall per um. close:
+    (range, weight) of the Gaussians that nodes do not hold. spots: points and masses
+    that represent other shapes.
     """
 
     ranges: bodies.ScatterRanges
@@ -231,142 +244,196 @@ class _Field:
 
     @classmethod
     def of(cls, scene: WrittenMask, point: PointExposure) -> "_Field":
-        """The field of the doses of a scene."""
-        number = bodies.count_pillars(scene.bodies, len(scene.dose)) * (scene.dose > 0)
+        """Sum the exposure of all shapes at the doses of a scene.
+
+        Masses (dose times area) go to the nodes, for the far range, and to the sites,
+        for the middle range; both are convolved with their Gaussians by FFT.
+
+        Args:
+            scene: what a written mask exposes.
+            point: exposure of a beam.
+        """
+        counts = bodies.count_pillars(scene.bodies, len(scene.dose)) * (scene.dose > 0)
         densest = min(scene.bodies, key=lambda body: body.nearest_um)
-        ranges = bodies.split_ranges(point, scene.kinds, number, densest)
-        own, slope = _of_themselves(scene, number > 0, point)
+        ranges = bodies.split_ranges(point, scene.kinds, counts, densest)
+        own, slope = _of_themselves(scene, counts > 0, point)
         far = ranges.far
         own = own - scene.kinds.area_um2 * float(far.density(np.array(0.0)))
-        width = float(far.widths_um.min()) if len(far.widths_um) else 1e3
-        grid = nodes.NodeGrid.over(_box(scene.bodies, scene.others.corners), width)
-        x, y, spots = polygon_edges.equivalent_spots(scene.others, width / _SPOTS)
-        mass = grid.deposit(x, y, spots)[None]
-        carried = scene.dose * scene.kinds.area_um2
+        narrowest_um = float(far.widths_um.min()) if len(far.widths_um) else 1e3
+        grid = nodes.NodeGrid.over(
+            _box(scene.bodies, scene.others.corners), narrowest_um
+        )
+        x, y, masses = polygon_edges.equivalent_spots(
+            scene.others, narrowest_um / _SPOTS
+        )
+        mass = grid.deposit(x, y, masses)[None]
+        mass_of_class = scene.dose * scene.kinds.area_um2
         for body in scene.bodies:
             across = grid.x.at(body.columns_um)
             for first, block in body.blocks():
                 down = grid.y.at(body.rows_um(first, len(block)))
-                nodes.gather_to_nodes(block, carried[None], *down, *across, mass)
+                nodes.gather_to_nodes(block, mass_of_class[None], *down, *across, mass)
         spacing = grid.y.spacing_um, grid.x.spacing_um
-        reach = nodes.gaussian_convolution(grid.shape, spacing, point=far, hollow=False)
+        far_convolution = nodes.gaussian_convolution(
+            grid.shape, spacing, point=far, hollow=False
+        )
         near = []
         if len(ranges.middle.widths_um):
             for body in scene.bodies:
-                sites = np.concatenate([carried[b] for _, b in body.blocks()])
+                sites = np.concatenate(
+                    [mass_of_class[classes] for _, classes in body.blocks()]
+                )
                 middle = correct.middle_convolution(body, ranges)
                 near.append(middle(sites).astype(np.float32))
         close = [
-            (float(a), float(w))
-            for a, w in zip(point.widths_um, point.weights, strict=True)
-            if a < bodies.COARSE * densest.nearest_um
+            (float(width_um), float(weight))
+            for width_um, weight in zip(point.widths_um, point.weights, strict=True)
+            if width_um < bodies.COARSE * densest.nearest_um
         ]
         points = np.column_stack([x, y])
         return cls(
-            ranges, grid, reach(mass[0]), near, own, slope, close, (points, spots)
+            ranges,
+            grid,
+            far_convolution(mass[0]),
+            near,
+            own,
+            slope,
+            close,
+            (points, masses),
         )
 
     def rows(self, scene: WrittenMask, number: int, first: int, block: Array) -> Array:
-        """(rows, columns) exposure of the drawn edges of a block."""
+        """(rows, columns) exposure of the drawn edges of a block, float.
+
+        far field + middle field + dose * own.
+
+        Args:
+            scene: what a written mask exposes.
+            number: of the lattice.
+            first: row of the block.
+            block: (rows, columns) classes.
+        """
         body = scene.bodies[number]
-        out = np.empty(block.shape, np.float32)
+        exposure = np.empty(block.shape, np.float32)
         nodes.interpolate_from_nodes(
             self.far,
             *self.grid.y.at(body.rows_um(first, len(block))),
             *self.grid.x.at(body.columns_um),
-            out,
+            exposure,
         )
         if self.near:
-            out += self.near[number][first : first + len(block)]
-        return np.asarray(out + (scene.dose * self.own)[block])
+            exposure += self.near[number][first : first + len(block)]
+        return np.asarray(exposure + (scene.dose * self.own)[block])
 
 
 def _of_themselves(
     scene: WrittenMask, used: Array, point: PointExposure
 ) -> tuple[Array, Array]:
-    """(classes + 1,) exposure of edges by the pillar itself and its slope; classes of
-    one outline and several doses are worked out once.
+    """(classes + 1,) exposure of an edge by its own pillar at unit dose, and its slope.
+
+    Classes of equal contours and different doses are computed once.
+
+    Args:
+        scene: what a written mask exposes.
+        used: (classes + 1,) which classes occur.
+        point: exposure of a beam.
+
+    Returns:
+        Exposure, and its fall per um that the edges move out.
     """
     if isinstance(scene.kinds, DrawnDiscs):
         return scene.kinds.edge_exposure(used, point)
     contours = scene.kinds.contours if isinstance(scene.kinds, DrawnOutlines) else ()
     first: dict[bytes, int] = {}
-    same = np.arange(len(contours))
-    for k in np.flatnonzero(used).tolist():
-        key = b"|".join(np.ascontiguousarray(c).tobytes() for c in contours[k])
-        same[k] = first.setdefault(key, k)
-    once = np.zeros(len(contours), bool)
-    once[list(first.values())] = True
-    own, slope = scene.kinds.edge_exposure(once, point)
-    return own[same], slope[same]
+    representative = np.arange(len(contours))
+    for number in np.flatnonzero(used).tolist():
+        key = b"|".join(
+            np.ascontiguousarray(contour).tobytes() for contour in contours[number]
+        )
+        representative[number] = first.setdefault(key, number)
+    is_representative = np.zeros(len(contours), bool)
+    is_representative[list(first.values())] = True
+    own, slope = scene.kinds.edge_exposure(is_representative, point)
+    return own[representative], slope[representative]
 
 
 def _box(
     parts: Sequence[PillarArray], corners: Sequence[Array]
 ) -> tuple[float, float, float, float]:
-    """Left, bottom, right, top of sites and shapes."""
-    ends = [np.array(body.box_um).reshape(2, 2) for body in parts]
-    every = np.concatenate([*ends, *corners])
-    return *every.min(0).tolist(), *every.max(0).tolist()
+    """Left, bottom, right, top of sites and shapes, um."""
+    site_boxes = [np.array(body.box_um).reshape(2, 2) for body in parts]
+    points = np.concatenate([*site_boxes, *corners])
+    return *points.min(0).tolist(), *points.max(0).tolist()
 
 
 def _develop(
     scene: WrittenMask, field: _Field, plan: MaskPlan, process: Process
 ) -> Iterator[ExposedRows]:
-    """Threshold model: an edge comes out where the exposure is half of what a wide area
-    receives; then the bias of the etch, for how alone each pillar stands.
+    """Size of each pillar in the resist and after the etch, by the threshold model.
+
+    An edge comes out where the exposure is half of that of a wide area. A surplus of
+    exposure moves both edges: resist = drawn + 2 (exposure - THRESHOLD) / slope. The
+    bias of the etch depends on how isolated each pillar is.
+
+    Yields:
+        Blocks of rows of all lattices, in turn.
     """
-    steep = np.maximum(scene.dose * field.slope, 1e-9)
+    slope = np.maximum(scene.dose * field.slope, 1e-9)
     is_round = isinstance(scene.kinds, DrawnDiscs)
     for number, body in enumerate(scene.bodies):
-        reach = 0
+        halo = 0
         if process.bias.isolated_nm:
-            reach = isolation.isolation_halo(body.down_um, process.bias.range_um)
+            halo = isolation.isolation_halo(body.down_um, process.bias.range_um)
         for first, block in body.blocks():
             exposure = field.rows(scene, number, first, block)
-            shift = 2 * (exposure - THRESHOLD) / steep[block]
+            shift = 2 * (exposure - THRESHOLD) / slope[block]
             resist = (scene.size_um[block] + shift) / nm
-            alone: Array | float = 0.0
-            if reach:
-                low = max(0, first - reach)
-                end = min(body.rows, first + len(block) + reach)
-                alone = isolation.isolation_map(
-                    body.source(low, end) > 0,
+            isolated: Array | float = 0.0
+            if halo:
+                low = max(0, first - halo)
+                stop = min(body.rows, first + len(block) + halo)
+                isolated = isolation.isolation_map(
+                    body.source(low, stop) > 0,
                     (body.pitch_um, body.down_um),
                     process.bias.range_um,
                     centred=body.centred,
                 )[first - low : first - low + len(block)]
             etch = process.made_diameter_nm if is_round else process.bias.made_nm
-            made = np.where(block > 0, etch(np.maximum(resist, 0), alone), 0)
+            made = np.where(block > 0, etch(np.maximum(resist, 0), isolated), 0)
             yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
 
 
 def _edges(scene: WrittenMask, field: _Field, point: PointExposure) -> EdgeErrors:
-    """Exposure at samples along the edges of marks and labels, and where across each
-    edge it is the threshold; closed form for close Gaussians.
+    """Exposure and position error at samples along the edges of marks and labels.
+
+    The error is (exposure - THRESHOLD) / slope, in nm; the slope is a difference across
+    the edge. Close Gaussians are summed in closed form over the polygons.
     """
-    core = max((a for a, _ in field.close), default=0.0)
-    points = polygon_edges.sample_edges(scene.others, core)
-    every = np.concatenate([points.at_um, *polygon_edges.points_across(points)])
-    close = polygon_edges.exposure_at_edges(every, scene.others, field.close)
-    here, outside, inside = np.split(close, 3)
+    widest_close_um = max((a for a, _ in field.close), default=0.0)
+    points = polygon_edges.sample_edges(scene.others, widest_close_um)
+    positions = np.concatenate([points.at_um, *polygon_edges.points_across(points)])
+    close = polygon_edges.exposure_at_edges(positions, scene.others, field.close)
+    exposure, outside, inside = np.split(close, 3)
     x, y = points.at_um.T
-    here = here + field.grid.sample(field.far, x, y)
+    exposure = exposure + field.grid.sample(field.far, x, y)
     slope = np.maximum(inside - outside, 1e-12) / polygon_edges.ACROSS_UM
     return EdgeErrors(
-        x, y, here / THRESHOLD, (here - THRESHOLD) / slope / nm, points.layer
+        x, y, exposure / THRESHOLD, (exposure - THRESHOLD) / slope / nm, points.layer
     )
 
 
 def _sampled(
     scene: WrittenMask, field: _Field, point: PointExposure
 ) -> tuple[float, float]:
-    """Of direct sums over the exact shapes, at sample pillars of the first lattice: the
-    largest |exposure - 1|, and the largest difference of the field from them.
+    """Compare the field with direct sums at sample pillars of the first lattice.
+
+    Returns:
+        Largest |exposure - 1| by direct sums over the exact shapes, relative to dose to
+        size, and the largest difference of the field from these sums.
     """
     sites = sum(body.rows * body.columns for body in scene.bodies)
     samples = int(np.clip(_PRODUCTS / sites, 16, _SAMPLES))
-    exposed = sampled.ExposedLattices(
+    lattices = sampled.ExposedLattices(
         scene.bodies,
         scene.kinds,
         field.own
@@ -376,15 +443,18 @@ def _sampled(
         field.spots,
         lambda number, first, block: scene.dose[block],
     )
-    rows, columns, exact = sampled.exact_edges(exposed, samples)
-    worst, judged = 0.0, scene.dose[_entries(scene, rows, columns)] > 0
-    off = float(np.abs(exact / THRESHOLD - 1)[judged].max(initial=0.0))
+    rows, columns, exact = sampled.exact_edges(lattices, samples)
+    worst_field = 0.0
+    judged = scene.dose[_entries(scene, rows, columns)] > 0
+    worst_exposure = float(np.abs(exact / THRESHOLD - 1)[judged].max(initial=0.0))
     for row in np.unique(rows).tolist():
-        mine = rows == row
+        in_row = rows == row
         block = np.ascontiguousarray(scene.bodies[0].source(row, row + 1))
-        fast = field.rows(scene, 0, row, block)[0, columns[mine]]
-        worst = max(worst, float(np.abs(fast - exact[mine]).max()) / THRESHOLD)
-    return off, worst
+        by_field = field.rows(scene, 0, row, block)[0, columns[in_row]]
+        worst_field = max(
+            worst_field, float(np.abs(by_field - exact[in_row]).max()) / THRESHOLD
+        )
+    return worst_exposure, worst_field
 
 
 def _entries(scene: WrittenMask, rows: Array, columns: Array) -> Array:

@@ -39,78 +39,93 @@ class EdgeSamples:
 
 
 def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
-    """Every few um along the outline of what each layer number draws, two ranges and
-    more away from corners.
+    """Samples about every um along the outline of what each layer number draws.
+
+    Samples keep two ranges from corners, which are round.
 
     Args:
         polygons: with their layers.
         range_um: of the core of the point exposure.
     """
-    places = [np.empty((0, 2))]
+    positions = [np.empty((0, 2))]
     normals = [np.empty((0, 2))]
     layers = [np.empty(0, np.int64)]
     for layer in np.unique(polygons.layer).tolist():
         drawn = zip(polygons.corners, polygons.layer.tolist(), strict=True)
-        units = [np.rint(corners / nm) for corners, other in drawn if other == layer]
-        for contour in region.union_contours(units):
+        outlines = [np.rint(corners / nm) for corners, other in drawn if other == layer]
+        for contour in region.union_contours(outlines):
             corners = contour[_turns(contour)]
             start, end = corners * nm, np.roll(corners, -1, axis=0) * nm
-            for a, b in zip(start, end, strict=True):
-                long = float(np.hypot(*(b - a)))
-                free = long - 4 * range_um  # corners round off within two ranges
-                if free <= 0:
+            for corner, next_corner in zip(start, end, strict=True):
+                length = float(np.hypot(*(next_corner - corner)))
+                straight = length - 4 * range_um  # corners round off within two ranges
+                if straight <= 0:
                     continue
-                count = max(1, int(free / _STEP_UM))
-                share = (2 * range_um + (np.arange(count) + 0.5) / count * free) / long
-                places.append(a + share[:, None] * (b - a))
+                count = max(1, int(straight / _STEP_UM))
+                fraction = (
+                    2 * range_um + (np.arange(count) + 0.5) / count * straight
+                ) / length
+                positions.append(corner + fraction[:, None] * (next_corner - corner))
                 normals.append(
-                    np.tile([(b - a)[1] / long, -(b - a)[0] / long], (count, 1))
+                    np.tile(
+                        [
+                            (next_corner - corner)[1] / length,
+                            -(next_corner - corner)[0] / length,
+                        ],
+                        (count, 1),
+                    )
                 )
                 layers.append(np.full(count, layer))
     return EdgeSamples(
-        np.concatenate(places), np.concatenate(normals), np.concatenate(layers)
+        np.concatenate(positions), np.concatenate(normals), np.concatenate(layers)
     )
 
 
 def _turns(contour: Array) -> Array:
     """(n,) which points are corners, not on the way between two others."""
-    before = contour - np.roll(contour, 1, axis=0)
-    after = np.roll(contour, -1, axis=0) - contour
-    return np.asarray(before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0])
+    step_in = contour - np.roll(contour, 1, axis=0)
+    step_out = np.roll(contour, -1, axis=0) - contour
+    return np.asarray(step_in[:, 0] * step_out[:, 1] != step_in[:, 1] * step_out[:, 0])
 
 
 def exposure_at_edges(
     at_um: Array, polygons: ExposedPolygons, terms: Sequence[tuple[float, float]]
 ) -> Array:
-    """(n,) exposure at points by the polygons with their doses, for (range, weight) of
-    each Gaussian.
+    """(n,) exposure at points by polygons with their doses.
 
     Args:
         at_um: (n, 2) points.
+        polygons: corners and doses.
         terms: range and weight of each Gaussian.
     """
     total = np.zeros(len(at_um))
     if not (len(at_um) and terms):
         return total
-    reach = _FAR * max(a for a, _ in terms)
-    one, two = _near(at_um, polygons, reach)
-    count = np.array([len(c) for c in polygons.corners])
-    first = np.r_[0, np.cumsum(count)]
+    reach = _FAR * max(width for width, _ in terms)
+    point_of_pair, polygon_of_pair = _near(at_um, polygons, reach)
+    edge_count = np.array([len(corners) for corners in polygons.corners])
+    first_edge = np.r_[0, np.cumsum(edge_count)]
     start = np.concatenate(list(polygons.corners))
-    after = np.arange(1, len(start) + 1)
-    after[first[1:] - 1] = first[:-1]  # the last corner leads back to the first
-    end = start[after]
-    point = np.repeat(one, count[two])
-    within = np.arange(len(point)) - np.repeat(
-        np.cumsum(count[two]) - count[two], count[two]
+    next_corner = np.arange(1, len(start) + 1)
+    next_corner[first_edge[1:] - 1] = first_edge[
+        :-1
+    ]  # the last corner leads back to the first
+    end = start[next_corner]
+    point = np.repeat(point_of_pair, edge_count[polygon_of_pair])
+    edge_in_polygon = np.arange(len(point)) - np.repeat(
+        np.cumsum(edge_count[polygon_of_pair]) - edge_count[polygon_of_pair],
+        edge_count[polygon_of_pair],
     )
-    edge = np.repeat(first[two], count[two]) + within
-    given = np.repeat(polygons.dose[two], count[two])
+    edge = (
+        np.repeat(first_edge[polygon_of_pair], edge_count[polygon_of_pair])
+        + edge_in_polygon
+    )
+    dose = np.repeat(polygons.dose[polygon_of_pair], edge_count[polygon_of_pair])
     for part in np.array_split(np.arange(len(point)), max(1, len(point) // 1_000_000)):
         p = start[edge[part]] - at_um[point[part]]
         q = end[edge[part]] - at_um[point[part]]
         value = sum(weight * _edge(p, q, range_um) for range_um, weight in terms)
-        total += np.bincount(point[part], given[part] * value, minlength=len(total))
+        total += np.bincount(point[part], dose[part] * value, minlength=len(total))
     return total
 
 
@@ -120,41 +135,60 @@ def points_across(found: EdgeSamples) -> tuple[Array, Array]:
     Args:
         found: samples on edges.
     """
-    away = ACROSS_UM / 2 * found.normal
-    return found.at_um + away, found.at_um - away
+    step = ACROSS_UM / 2 * found.normal
+    return found.at_um + step, found.at_um - step
 
 
 def _near(at_um: Array, polygons: ExposedPolygons, reach: float) -> tuple[Array, Array]:
-    """Pairs (point, polygon) that can matter to each other; small polygons through a
-    tree of their middles.
+    """Pairs of points and polygons closer than a distance, by a tree of the points.
+
+    Args:
+        at_um: (n, 2) points.
+        polygons: with their corners.
+        reach: um; a polygon is taken as the circle around its corners.
+
+    Returns:
+        (pairs,) number of the point, and (pairs,) number of the polygon.
     """
     from scipy.spatial import cKDTree
 
-    middle = np.array([(c.min(0) + c.max(0)) / 2 for c in polygons.corners])
+    centres = np.array(
+        [(corners.min(0) + corners.max(0)) / 2 for corners in polygons.corners]
+    )
     radius = np.array(
         [
-            np.hypot(*(c - m).T).max()
-            for c, m in zip(polygons.corners, middle, strict=True)
+            np.hypot(*(corners - centre).T).max()
+            for corners, centre in zip(polygons.corners, centres, strict=True)
         ]
     )
-    tree, ones, twos = cKDTree(at_um), [], []
-    for n, found in enumerate(tree.query_ball_point(middle, radius + reach)):
-        ones.append(np.asarray(found, np.int64))
-        twos.append(np.full(len(found), n))
-    return np.concatenate(ones), np.concatenate(twos)
+    tree = cKDTree(at_um)
+    points = []
+    numbers = []
+    for number, members in enumerate(tree.query_ball_point(centres, radius + reach)):
+        points.append(np.asarray(members, np.int64))
+        numbers.append(np.full(len(members), number))
+    return np.concatenate(points), np.concatenate(numbers)
 
 
 def _edge(p: Array, q: Array, range_um: float) -> Array:
-    """Contribution of edges from p to q (n, 2), seen from the origin, counter-clockwise
-    around it positive.
+    """Exposure at the origin by the triangle of the origin and an edge, signed.
+
+    With the height of the triangle and low, high the ends of the edge over the height:
+    sign [(atan high - atan low) / 2 pi - T(h, high) + T(h, low)], h = sqrt 2 height /
+    range, T Owen's function. Counter-clockwise is positive.
+
+    Args:
+        p: (n, 2) first corner, um.
+        q: (n, 2) second corner, um.
+        range_um: 1/e radius of the Gaussian.
     """
     from scipy.special import owens_t
 
-    along = q - p
-    long = np.hypot(*along.T)
+    edge = q - p
+    length = np.hypot(*edge.T)
     cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    height = np.maximum(np.abs(cross) / long, 1e-15)
-    low, high = ((v * along).sum(1) / (long * height) for v in (p, q))
+    height = np.maximum(np.abs(cross) / length, 1e-15)
+    low, high = ((end * edge).sum(1) / (length * height) for end in (p, q))
     h = height * np.sqrt(2) / range_um
     value = (
         (np.arctan(high) - np.arctan(low)) / (2 * np.pi)
@@ -167,45 +201,58 @@ def _edge(p: Array, q: Array, range_um: float) -> Array:
 def equivalent_spots(
     polygons: ExposedPolygons, step_um: float
 ) -> tuple[Array, Array, Array]:
-    """(x, y, area times dose) of points that stand for the polygons in a Gaussian much
-    wider than ``step_um``.
+    """Points that represent polygons in a Gaussian much wider than ``step_um``.
+
+    Args:
+        polygons: corners and doses.
+        step_um: distance of the points.
+
+    Returns:
+        (n,) x, (n,) y, um, and (n,) area times dose.
     """
-    places: list[Array] = [np.empty((0, 3))]
+    parts: list[Array] = [np.empty((0, 3))]
     for corners, dose in zip(polygons.corners, polygons.dose.tolist(), strict=True):
-        after = np.roll(corners, -1, axis=0)
+        next_corners = np.roll(corners, -1, axis=0)
         mass = (
             dose
-            * float((corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]).sum())
+            * float(
+                (
+                    corners[:, 0] * next_corners[:, 1]
+                    - next_corners[:, 0] * corners[:, 1]
+                ).sum()
+            )
             / 2
         )
         low, high = corners.min(0), corners.max(0)
-        small = bool((high - low).max() <= step_um)
-        inside = (
+        is_small = bool((high - low).max() <= step_um)
+        points = (
             corners.mean(0)[None]
-            if small
-            else _inside(corners, after, low, high, step_um)
+            if is_small
+            else _inside(corners, next_corners, low, high, step_um)
         )
-        places.append(
-            np.column_stack([inside, np.full(len(inside), mass / len(inside))])
+        parts.append(
+            np.column_stack([points, np.full(len(points), mass / len(points))])
         )
-    found = np.concatenate(places)
-    return found[:, 0], found[:, 1], found[:, 2]
+    spots = np.concatenate(parts)
+    return spots[:, 0], spots[:, 1], spots[:, 2]
 
 
 def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -> Array:
-    """(n, 2) points of a raster within a polygon (crossings to the right are odd), on
-    each side at least four.
+    """(n, 2) points of a raster within a polygon, four or more along each axis.
+
+    A point is inside where a ray to the right crosses the outline an odd number of
+    times.
     """
     counts = np.maximum(np.ceil((high - low) / step_um).astype(int), 4)
     x, y = (
         low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k]
         for k in (0, 1)
     )
-    px, py = (v.ravel() for v in np.meshgrid(x, y))
-    odd = np.zeros(len(px), bool)
+    px, py = (grid.ravel() for grid in np.meshgrid(x, y))
+    is_inside = np.zeros(len(px), bool)
     for (x0, y0), (x1, y1) in zip(start.tolist(), end.tolist(), strict=True):
         if y0 != y1:
             straddles = (py >= min(y0, y1)) & (py < max(y0, y1))
-            odd ^= straddles & (x0 + (py - y0) * (x1 - x0) / (y1 - y0) > px)
-    found = np.column_stack([px, py])[odd]
-    return found if len(found) else start.mean(0)[None]
+            is_inside ^= straddles & (x0 + (py - y0) * (x1 - x0) / (y1 - y0) > px)
+    points = np.column_stack([px, py])[is_inside]
+    return points if len(points) else start.mean(0)[None]

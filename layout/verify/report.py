@@ -27,9 +27,9 @@ _WIDEST_NM, _BIN_NM = (
 class EdgeErrors:
     """Edges of marks, labels and other shapes that are no pillars.
 
-    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,)
-    how far outside the drawn edge it
-    comes out in the resist. layer: (n,) layer numbers.
+    x_um, y_um: (n,) samples. exposure: (n,) relative to dose to size. shift_nm: (n,)
+    distance of the edge in the resist outside the drawn edge. layer: (n,) layer
+    numbers.
     """
 
     x_um: Array
@@ -41,10 +41,11 @@ class EdgeErrors:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationTally:
-    """Sums over judged pillars (the dose test is not) of a part of the mask.
+    """Sums over judged pillars (the dose test is not judged) of a part of the mask.
 
-    ends: largest |exposure - 1|, largest |resist - drawn| and least and largest made diameter, nm. total, count:
-    (y, x) of the map, of resist less drawn. bins: (n,) pillars by that difference.
+    ends: largest |exposure - 1|, largest |resist - drawn|, least and largest made
+    diameter, nm. total, count: (y, x) map: sum of resist less drawn, and number of
+    pillars. bins: (n,) pillars by that difference.
     """
 
     ends: Array
@@ -83,14 +84,11 @@ class VerificationTally:
 class ExposureReport:
     """The verdict over everything that is written.
 
-    pillars: the dose test too. tally: sums over those that are judged. box_um: left,
-    bottom, right, top of
-    the map. edges: of the other shapes. lean_nm: foot less half-height diameter.
-    tolerance: of the
-    exposure, relative.
-    undosed: layers with shapes and no dose.
-    sampled: largest |exposure - 1| by direct sums at sample pillars. error: largest
-    difference of the exposure of all pillars from these.
+    pillars: number, with the dose test. tally: sums over those that are judged. box_um:
+    left, bottom, right, top of the map. edges: of the other shapes. lean_nm: diameter
+    at the foot less that at half height. tolerance: of the exposure, relative. undosed:
+    layers with shapes and no dose. sampled: largest |exposure - 1| by direct sums at
+    sample pillars. error: largest difference of the exposure of all pillars from these.
     """
 
     pillars: int
@@ -131,15 +129,15 @@ class ExposureReport:
         Along the edges of marks and labels 99 of 100 points keep the tolerance, and all
         of them twice that.
         """
-        off = np.abs(self.edges.exposure - 1)
-        edges = not len(off) or (
-            float((off <= self.tolerance).mean()) >= EDGE_SHARE
-            and float(off.max()) <= EDGE_TIMES * self.tolerance
+        deviation = np.abs(self.edges.exposure - 1)
+        edges_ok = not len(deviation) or (
+            float((deviation <= self.tolerance).mean()) >= EDGE_SHARE
+            and float(deviation.max()) <= EDGE_TIMES * self.tolerance
         )
         return (
             not self.undosed
             and max(float(self.tally.ends[0]), self.sampled) <= self.tolerance
-            and edges
+            and edges_ok
             and self.worst_nm <= MOST_NM
         )
 
@@ -158,9 +156,12 @@ class ExposureReport:
         """(y, x) mean of resist less drawn diameter, the first row lowest; NaN where no
         pillar is judged.
         """
-        t = self.tally
+        tally = self.tally
         return np.divide(
-            t.total, t.count, out=np.full_like(t.total, np.nan), where=t.count > 0
+            tally.total,
+            tally.count,
+            out=np.full_like(tally.total, np.nan),
+            where=tally.count > 0,
         )
 
     @property
@@ -168,8 +169,8 @@ class ExposureReport:
         """(edges / nm, pillars) of resist less drawn diameter, from the first used bin
         to the last.
         """
-        held = np.flatnonzero(self.tally.bins)
-        first, end = (int(held[0]), int(held[-1]) + 1) if len(held) else (0, 1)
+        used = np.flatnonzero(self.tally.bins)
+        first, end = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 1)
         return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[
             first:end
         ]
@@ -186,28 +187,42 @@ def _tally(
     made: Array,
     left: float,
     bottom: float,
-    across: float,
-    up: float,
+    columns_per_um: float,
+    rows_per_um: float,
     bin_nm: float,
     ends: Array,
     total: Array,
     count: Array,
     bins: Array,
 ) -> None:
+    """Add judged pillars to the extremes, the map and the histogram, in place.
+
+    Args:
+        x, y: (n,) places, um.
+        judged: (n,) whether a pillar counts.
+        exposure: (n,) of the drawn edge, relative to dose to size.
+        drawn, resist, made: (n,) diameters, nm.
+        left, bottom: corner of the map, um.
+        columns_per_um, rows_per_um: of the map.
+        bin_nm: width of a bin of the histogram.
+        ends: (4,) largest |exposure - 1| and |resist - drawn|, least and largest made.
+        total, count: (rows, columns) sum of resist - drawn, and number of pillars.
+        bins: (bins,) pillars by resist - drawn, 0 in the middle.
+    """
     rows = total.shape[0]
     columns = total.shape[1]
     last = bins.shape[0] - 1
-    for n in range(x.shape[0]):
-        if not judged[n]:
+    for pillar in range(x.shape[0]):
+        if not judged[pillar]:
             continue
-        off = resist[n] - drawn[n]
-        ends[0] = max(ends[0], abs(exposure[n] - 1))
-        ends[1] = max(ends[1], abs(off))
-        ends[2] = min(ends[2], made[n])
-        ends[3] = max(ends[3], made[n])
-        i = min(max(int((y[n] - bottom) * up), 0), rows - 1)
-        j = min(max(int((x[n] - left) * across), 0), columns - 1)
-        total[i, j] += off
-        count[i, j] += 1
-        k = int(np.floor(off / bin_nm)) + bins.shape[0] // 2
-        bins[min(max(k, 0), last)] += 1
+        difference = resist[pillar] - drawn[pillar]
+        ends[0] = max(ends[0], abs(exposure[pillar] - 1))
+        ends[1] = max(ends[1], abs(difference))
+        ends[2] = min(ends[2], made[pillar])
+        ends[3] = max(ends[3], made[pillar])
+        row = min(max(int((y[pillar] - bottom) * rows_per_um), 0), rows - 1)
+        column = min(max(int((x[pillar] - left) * columns_per_um), 0), columns - 1)
+        total[row, column] += difference
+        count[row, column] += 1
+        bin_number = int(np.floor(difference / bin_nm)) + bins.shape[0] // 2
+        bins[min(max(bin_number, 0), last)] += 1
