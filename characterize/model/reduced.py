@@ -46,14 +46,12 @@ _BESIDE = 0.1
 class CompressedLens:
     """A lens on nodes for one field angle.
 
-    nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same
-    over the lens radius.
-    known: (q, p) phase there that was taken off, that of :meth:`path`.
-    gathered: (r, q, p) one field for each function of :class:`Pillars`. kind: of the
-    complex numbers.
-
-    Tables and sums are in single precision where ``tolerance`` lets them be, else in
-    double: see :func:`precision`.
+    p, q: (q, p) direction cosines of the nodes from the window's centre. x_um, y_um:
+    (q, p) their places on the lens; u, v: the same over the lens radius.
+    known: (q, p) phase that was removed at the nodes, rad: k times :meth:`path`.
+    gathered: (r, q, p) one field for each basis function of the pillars.
+    kind: complex number type, single precision where ``tolerance`` allows it, else
+    double; see :func:`complex_precision`.
     """
 
     def __init__(
@@ -108,9 +106,9 @@ class CompressedLens:
         """A fast copy whose rest of the kernel is that of the nominal place.
 
         The rest hardly changes with wavelength and distance, once the factors of the
-        actual ones are applied. The copy has fewer nodes, and fewer still for a narrower
-        window with no light outside: light s nodes' turns off a place is separated from
-        it by s / 2 nodes or more.
+        actual ones are applied. The copy has fewer nodes, and fewer still for a
+        narrower window with no light outside. Light at s half turns from a place has
+        a phase of slope s on the nodes; n nodes confuse both only at s = 2 n.
 
         Args:
             window_um: half width of the window; its own without it.
@@ -140,13 +138,13 @@ class CompressedLens:
         return part
 
     def seen_by(self, other: "CompressedLens", values: Array) -> Array:
-        """(..., q, p) smooth function on these nodes, interpolated to those of ``other``."""
+        """(..., q, p) smooth ``values`` interpolated to the nodes of ``other``."""
         to_q, to_p = self._between(self, other)
         return np.asarray(to_q @ values @ to_p.T)
 
     @staticmethod
     def _between(source: "CompressedLens", target: "CompressedLens") -> list[Array]:
-        """Interpolation matrices along q and p from the nodes of one lens to another's."""
+        """Interpolation matrices along q and p from the nodes of one to another."""
         axes = (source._q, target.q[:, 0]), (source._p, target.p[0])
         return [
             gather.even_interpolation(source.nodes, source._pull, span, places)
@@ -228,7 +226,7 @@ class CompressedLens:
         interpolation; then follows :meth:`_to_directions`.
 
         Args:
-            depth_um: of the source whose light the stop shades; None: the stop is left out.
+            depth_um: of the source whose light the stop shades; None: without stop.
         """
         d, (hy, hx) = lens.diameters, self.half_um
         x, y = d.x_um, d.y_um
@@ -249,7 +247,7 @@ class CompressedLens:
         parts = [slice(start, start + block) for start in range(y0, len(y), block)]
         sums = np.zeros((len(parts), n, n, 2 * r), real_kind)
 
-        def some(first: int, last: int) -> None:
+        def sum_blocks(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
                 filled = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
@@ -325,9 +323,9 @@ class CompressedLens:
     def path(
         self, x: Array, y: Array, distance_um: float, bench: BenchGeometry
     ) -> Array:
-        """Path from the reference source by (x, y) on the lens to the window's centre, um.
+        """Path from the reference source by (x, y) to the window's centre, um.
 
-        Less that along the axis.
+        (x, y) lie on the lens. Less the path along the axis.
         """
         centre = self.films.chief_um(distance_um, bench.tangents)
         before = media.source_path(
@@ -343,14 +341,14 @@ class CompressedLens:
         axes_um: tuple[Array, Array],
         edge_um: float = 0.0,
     ) -> WindowOperators:
-        """Operators from lens nodes to the window, cached: an image and its derivatives.
+        """Operators from lens nodes to the window, cached.
 
         Wavelength and distance are exact, not expanded.
 
         Args:
             axes_um: (y, x) samples of the window.
-            edge_um: width of a rim of the window in which ten times the error is allowed,
-                since only its blur enters the image.
+            edge_um: width of a rim of the window in which ten times the error is
+                allowed, since only its blur enters the image.
         """
         key = wavelength_um, distance_um, *_named(axes_um)
         operators = self._operators.get(key)
@@ -433,7 +431,7 @@ class CompressedLens:
         axes_um: tuple[Array, Array],
         inner_um: tuple[float, float],
     ) -> CouplingTerms:
-        """As :meth:`_terms` of ``kernel`` alone, but from the terms of the nominal kernel.
+        """As :meth:`_terms` of ``kernel`` alone, from the terms of the nominal one.
 
         The window functions take the ratio of both window factors and of k / distance.
         """
@@ -477,7 +475,7 @@ class CompressedLens:
         X = legendre.mapped_nodes(w, -wx, wx)
         P = legendre.mapped_nodes(m, *self._p)
         Q = legendre.mapped_nodes(m, *self._q)[:, None]
-        # weights of directions and of window places where the low-rank error counts less
+        # weights of directions and of window places: the low-rank error counts less there
         weight = np.where(
             np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE
         )
@@ -530,7 +528,7 @@ class CompressedLens:
         )
 
     def _to_nodes(self, count: int) -> Array:
-        """(nodes, count) interpolation from Legendre nodes to the direction nodes; cached."""
+        """(nodes, count) interpolation from Legendre to direction nodes, cached."""
         if count not in self._from_few:
             self._from_few[count] = legendre.interpolation_matrix(
                 count, gather.even_nodes(self.nodes, self._pull, -1.0, 1.0)
