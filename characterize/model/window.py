@@ -145,7 +145,7 @@ class WindowOperators:
     def _sum(
         self, light: Array, ways: tuple[tuple[Array, Array, CouplingTerms, float], ...]
     ) -> Array:
-        """(..., Y, X) sum over ``ways`` (Fy, Fx, terms, tolerance) applied to ``light``.
+        """(..., Y, X) sum over ``ways`` (Fy, Fx, terms, tolerance) of ``light``.
 
         Each is the sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p)
         Fx(p, X), with L = ``light`` (..., q, p).
@@ -204,7 +204,7 @@ def axis_operators(
     step_um: float,
     rim_um: float = 0.0,
 ) -> tuple[Array, AxisOperators]:
-    """Coarse samples along one axis, and operators from nodes to them and to the window.
+    """Coarse samples along one axis, and operators from nodes to them and on.
 
     Fields on the coarse samples are exp(i k (F - F_middle)), less their carrier.
 
