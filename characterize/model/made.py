@@ -165,7 +165,7 @@ def psf_stack(
     offset_um: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-4,
 ) -> "PsfStack":
-    """PSFs (angle, depth, y, x) of the lens as built, by :func:`metalens.psf.psf_stack`.
+    """PSFs (angle, depth, y, x) of the as-built lens: :func:`metalens.psf.psf_stack`.
 
     Pillars, process, aberrations and distance enter. What belongs to one bench does
     not: stage, decentre, source size, crosstalk, gain, background. Accuracy: ``error``

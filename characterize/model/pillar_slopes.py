@@ -228,7 +228,8 @@ def _degree(unit: Array, rows: Array, tolerance: float) -> tuple[int, float]:
     """(degree, error) of the polynomial fit of ``rows`` (causes, n) over ``unit`` (n,).
 
     The least degree whose error at held-out nodes, every third, is below the
-    tolerance; else that of the least error. Relative to the largest deviation from the mean.
+    tolerance; else that of the least error. Errors are relative to the largest
+    deviation from the mean.
     """
     held_out = np.arange(len(unit)) % 3 == 1
     size = np.maximum(
