@@ -341,8 +341,8 @@ def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
         if name in capture.about
     ]
     if "pixel_sigma_um" in capture.about:
-        pitch_um = capture.fill * capture.pixel_um
-        percent = 100 * _number(capture, "pixel_sigma_um") / pitch_um
+        width_um = capture.fill * capture.pixel_um
+        percent = 100 * _number(capture, "pixel_sigma_um") / width_um
         priors.append(KnownValue("pixel_percent", 0.0, percent))
     return priors
 
