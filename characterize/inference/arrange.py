@@ -108,10 +108,10 @@ def find_arrangement(
     """Stage zero, order and orientation of the frames, by comparison with the design.
 
     Every frame is correlated with every depth in all eight orientations, over a scan of
-    the stage zero. Where the frames then seem out of order or different from the design, the
-    lens-sensor distance is scanned too: it shifts the whole stack through focus, as no
-    stage zero does. A stack shifted by a depth or two resembles one in another order. Of
-    both results the simpler is returned, if it is as similar.
+    the stage zero. Where the frames then seem out of order or different from the
+    design, the lens-sensor distance is scanned too: it shifts the whole stack through
+    focus, as no stage zero does. A stack shifted by a depth or two resembles one in
+    another order. Of both results the simpler is returned, if it is as similar.
 
     Args:
         model: the forward model.
@@ -193,7 +193,7 @@ class _Frames:
     def scanned(
         self, start: Array, zeros: Array, distances_um: Array | None = None
     ) -> tuple[Array, float]:
-        """Best parameters of a scan of stage zero (and distance), and the likeness there.
+        """Best parameters of a scan of stage zero (and distance), and their likeness.
 
         The best way of all, order and orientation, counts at its own best place: images
         that twist with depth equal mirrored ones at another depth. A reversed order is

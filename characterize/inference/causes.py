@@ -60,16 +60,14 @@ _OF_MASK = {*names_of_kind(CDError), *names_of_kind(ResponseError)}
 class ImageChange:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
-    amount, amount_text: of the first, in words with a place for the number; empty where no
-    amount is said.
-    sigma: of every change, one for all or each its own, how much of it is assumed
-    where nobody states it: a
-    standard deviation, 0 for none.
-    frees: parameters that describe it. stated: whether one of these is stated without
-    an error. sought: whether it is looked for alone.
-    roughly: the change is of the right kind but of an unknown pattern, so that the
-    frames cannot bound it by what they
-    show of it. of_mask: of the lens itself.
+    amount: of the cause in the first change. amount_text: sentence part with a place
+    for that number; empty where none is reported.
+    sigma: standard deviation of the factor of each change, assumed where nobody states
+    it; one for all or one for each, 0 for none.
+    frees: parameters that describe the cause. stated: whether one of these is stated
+    without an error. sought: whether it has a score test of its own.
+    roughly: the pattern of the change is not known well enough for the frames to bound
+    it. of_mask: the cause belongs to the lens itself.
     """
 
     cause: str

@@ -527,7 +527,7 @@ def _psf_verdict(
 
     Args:
         at_depths: errors at the captured depths and between them.
-        at_angles: errors between the captured angles and half a step beyond; None for one.
+        at_angles: errors between the captured angles and half a step beyond; or None.
         unseen: reduced chi-square of frames left out; nan without such.
         angles: number of captured angles.
     """

@@ -171,8 +171,8 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     """Score tests of every cause that is not fitted, at the end of a fit.
 
     Each cause changes the images by G; tested is whether the residuals lean along the
-    part of G that the fit does not take up. Image and slopes are those of the fit. Where
-    chi-square exceeds 1, noise is scaled by its root.
+    part of G that the fit does not take up. Image and slopes are those of the fit.
+    Where chi-square exceeds 1, noise is scaled by its root.
 
     Args:
         task: model, frames, priors and arrangement of the search.
@@ -281,7 +281,7 @@ def to_fit(
 
     Args:
         found: score tests.
-        stuck: a parameter ran to its bound, so that any unstated cause may be behind it.
+        stuck: a parameter ran to its bound: any unstated cause may be behind it.
         most: causes that are fitted in turn to see which explains most.
     """
     free = [test for test in found if test.frees]
@@ -376,8 +376,8 @@ class FitAtMode:
     def lean(self, cause: str, changes: Array) -> ScoreTest:
         """Score test of a cause by its changes G (k, pixels).
 
-        Score s = G'ᵀr of the part G' that the fit does not take up; chi-square sᵀS⁻¹s with
-        S its scatter. Directions taken up to all but a thousandth are left out.
+        Score s = G'ᵀr of the part G' that the fit does not take up; chi-square sᵀS⁻¹s
+        with S its scatter. Directions taken up to all but a thousandth are left out.
         """
         size = np.sqrt((changes**2).sum(1))
         changes = changes[size > 0] / size[size > 0, None]
@@ -394,10 +394,10 @@ class FitAtMode:
         return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
     def left(self, changes: Array) -> tuple[Array, Array]:
-        """Part of changes G (k, pixels) that the fit does not take up, and (k,) its score.
+        """(k, pixels) changes less what the fit takes up, and their (k,) scores.
 
-        G' = G - M J for shifts M and slopes J. The score is G'ᵀr + Mᵀ pull, which equals
-        Gᵀr at the mode and does not change to first order off it.
+        G' = G - M J of changes G, with shifts M and slopes J. The score is G'ᵀr + Mᵀ
+        pull, which equals Gᵀr at the mode and does not change to first order off it.
         """
         moved = self.moved_by(changes).T
         left = changes - moved @ self.slopes
@@ -410,8 +410,8 @@ class FitAtMode:
     def odds(self, changes: Array) -> float:
         """Bayes factor of a cause against its absence, at most exp(100).
 
-        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹, integration over its factors c, N(0, 1),
-        gives exp(tᵀC t / 2) (det C)^½.
+        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹, integration over its factors c,
+        N(0, 1), gives exp(tᵀC t / 2) (det C)^½.
 
         Args:
             changes: (k, pixels) of one standard deviation each.

@@ -131,8 +131,8 @@ def correct_surrogate(task: SearchTask, at: FitSolution) -> SearchTask:
     The difference of images and slopes to the full model at the fit is added
     (:class:`LeftOut`). The fast model omits a percent or two of the light and of its
     changes. Among lenses that explain the frames, whose images differ by a few sigma,
-    that omission varies by about 0.1 sigma. (A test checks this on a small lens; on 1 mm
-    it was 0.2 where images differ by 20 sigma.)
+    that omission varies by about 0.1 sigma. (A test checks this on a small lens; on
+    1 mm it was 0.2 where images differ by 20 sigma.)
 
     Args:
         task: model, frames and priors.
@@ -155,8 +155,8 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     """The likeliest of tasks that differ by the arrangement of the frames.
 
     By short fits to a few frames. The first is chosen unless another is better by
-    ``_PROMISING``, and still is after longer fits. Orientations within that are marked as
-    indistinguishable.
+    ``_PROMISING``, and still is after longer fits. Orientations within that are marked
+    as indistinguishable.
     """
     if len(tasks) == 1:
         return tasks[0]

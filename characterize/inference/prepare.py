@@ -173,8 +173,8 @@ def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
 def correct_quantization(data: FitImages, image: Array) -> FitImages:
     """Rounded counts as means and variances of equal information about ``image``.
 
-    Fisher scoring in each pixel: mean I + score / information, variance 1 / information.
-    A fit to them ends at the greatest likelihood of the counts
+    Fisher scoring in each pixel: mean I + score / information, variance 1 over the
+    information. A fit to them ends at the greatest likelihood of the counts
     (:mod:`characterize.captures.rounding`), once ``image`` is that of the fit.
 
     Args:

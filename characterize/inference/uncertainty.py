@@ -89,8 +89,9 @@ class FitPosterior:
 def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPosterior:
     """Intervals, profiles, covariance and draws about the modes of a fit.
 
-    Where a profile falls below the best mode, its lowest place is fitted and the profiles
-    are repeated. Errors of dark and flat, which all frames share, are included.
+    Where a profile falls below the best mode, its lowest place is fitted and the
+    profiles are repeated. Errors of dark and flat, which all frames share, are
+    included.
 
     Args:
         task: model, frames and priors.

@@ -179,8 +179,8 @@ def detector_transfers(
     """Transfer functions of pixel, crosstalk and round source, and derivatives by name.
 
     For a point source the blur is separable, as weights along each axis; else it is
-    (frames, fy, fx). ``pinhole_um``: by the source's diameter; ``growth``: by a relative
-    change of the magnification, over the diameter.
+    (frames, fy, fx). ``pinhole_um``: by the source's diameter. ``growth``: by a
+    relative change of the magnification, over the source's diameter.
 
     Args:
         grid: fine samples under the pixels.
@@ -223,7 +223,7 @@ def _half_step(grid: DetectorGrid) -> Array:
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:
-    """Least oversampling that samples ``highest`` cycles/um at the Nyquist rate or above.
+    """Least oversampling that samples ``highest`` cycles/um at the Nyquist rate.
 
     Args:
         pixel_um: pitch of the pixels, um.

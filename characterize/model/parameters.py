@@ -35,7 +35,8 @@ class FitParameter:
 
     scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without
     any metrology (inf: none).
-    low, high: bounds. free: fitted unless stated otherwise. plausible: standard deviation
+    low, high: bounds. free: fitted unless stated otherwise.
+    plausible: standard deviation
     that is assumed where
     it is neither fitted nor stated; sigma where 0. effect: as a cause in words, where
     it

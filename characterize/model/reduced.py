@@ -475,7 +475,7 @@ class CompressedLens:
         X = legendre.mapped_nodes(w, -wx, wx)
         P = legendre.mapped_nodes(m, *self._p)
         Q = legendre.mapped_nodes(m, *self._q)[:, None]
-        # weights of directions and of window places: the low-rank error counts less there
+        # weights of directions and window places in the low-rank error
         weight = np.where(
             np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE
         )

@@ -240,7 +240,7 @@ class AngleGroup:
         return dataclasses.replace(self, residual=residual, apart=apart)
 
     def quick(self, window_um: float | None) -> "AngleGroup":
-        """See :meth:`Reduced.quick`."""
+        """The group on the fast lens; see :meth:`CompressedLens.quick`."""
         reduced = self.reduced.quick(window_um)
         residual = self.reduced.seen_by(reduced, self.residual)
         apart = tuple(group.quick(window_um) for group in self.apart)
@@ -287,8 +287,8 @@ class SpectralLine:
     ) -> "SpectralLine":
         """The line's largest path difference through a lens.
 
-        Paths from the sources by axis and rim to the chief rays' places, through films as
-        through equivalent air. One wavelength is added for the pillars.
+        Paths from the sources by axis and rim to the chief rays' places, through films
+        as through equivalent air. One wavelength is added for the pillars.
 
         Args:
             depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
@@ -315,8 +315,8 @@ class SpectralLine:
     ) -> list[tuple[float, float]]:
         """(offset in nm, weight) of the samples of a line; one for no width.
 
-        Gauss-Hermite nodes, or even ones of Gaussian weight, which are fewer where the phase
-        in one standard deviation is above 2 rad.
+        Gauss-Hermite nodes, or even ones of Gaussian weight, which are fewer where the
+        phase in one standard deviation is above 2 rad.
 
         Args:
             bandwidth_nm: standard deviation of the line.
@@ -338,8 +338,8 @@ class SpectralLine:
 def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
     """(n,) offsets in standard deviations, and weights of sum 1, of the fewest samples.
 
-    Their mean of cos(s x) is exp(-s²/2), that of the Gaussian line, to ``tolerance`` for
-    every s up to ``turn``, rad.
+    Their mean of cos(s x) is exp(-s²/2), that of the Gaussian line, to ``tolerance``
+    for every s up to ``turn``, rad.
 
     Raises:
         FitError: more than ``_MOST_COLOURS`` would be needed.

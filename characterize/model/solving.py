@@ -29,7 +29,7 @@ from metalens.library import curve, engines
 # waves
 REACH_UM = 0.031
 TOLERANCE = 3e-3  # of t
-# largest relative deviation of the cell's own proxy, and how many diameters are compared
+# largest relative deviation of a cell's own proxy; number of diameters compared
 _SAME, _JUDGED = 0.05, 7
 _FINE_UM = 5e-4  # step of the sampled diameters, for 0.85 um and shorter waves
 _FIT_SHARE = 0.4  # share of the tolerance for the rational functions

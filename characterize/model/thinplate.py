@@ -75,8 +75,8 @@ def _modes() -> tuple[Array, Array, Array]:
     Splines less their least-squares fit by the shapes of :func:`_known`, on a grid.
 
     Returns:
-        ((MODES, splines) weights, (MODES, shapes) weights, (MODES,) energy): a mode is the
-        first @ splines - the second @ shapes.
+        ((MODES, splines) weights, (MODES, shapes) weights, (MODES,) energy): a mode is
+        the first @ splines - the second @ shapes.
     """
     t = np.linspace(-1, 1, _GRID)
     u, v = np.meshgrid(t, t)
