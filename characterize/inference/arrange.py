@@ -243,7 +243,8 @@ def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
     """(orientation, whether the order is reversed): the simplest way that fits.
 
     Args:
-        stated: (8,) likeness of the stated order. reverse: (8,) of the reversed one.
+        stated: (8,) likeness of the stated order.
+        reverse: (8,) likeness of the reversed one.
     """
     orientation, clearly = _plainest_turn(stated)
     orientation = orientation if clearly else 0

@@ -465,7 +465,9 @@ def pixel_weights(
     """Noise, residual over the noise, and robust weight of every pixel, (n, y, x) each.
 
     Args:
-        data: what is fitted. image: (n, y, x) model. huber: sigma of an outlier.
+        data: what is fitted.
+        image: (n, y, x) model.
+        huber: sigma of an outlier.
 
     Returns:
         (noise in electrons, (data - model) / noise with saturated pixels only as far as

@@ -267,7 +267,9 @@ def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
     root of its variance 2 tr AKAK, with K the covariance of the frames in each pixel.
 
     Args:
-        r: (n, y, x) residuals. dark, flat: (n, y, x) shared errors over the noise.
+        r: (n, y, x) residuals.
+        dark: (n, y, x) shared error of the dark over the noise.
+        flat: (n, y, x) the same of the flat.
     """
     expected, variance = 0.0, 0.0
     for row in range(r.shape[1]):

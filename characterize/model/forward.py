@@ -217,8 +217,9 @@ class ForwardModel:
         """A fast model for differences to its own images: few terms, fewer samples.
 
         Args:
-            rows, columns: part of the window that is bright enough to differ. Outside
-                it the images are background alone.
+            rows: of the part of the window that is bright enough to differ. Outside it
+                the images are background alone.
+            columns: of the same part.
         """
         part = self.rough(_FEW)
         part.grid = self._sparser()
@@ -403,7 +404,8 @@ class ForwardModel:
         pixels see |E|² blurred by the transfer; its derivative is 2 Re(E* dE) blurred.
 
         Args:
-            x: all parameters. group: lens and frames of the field angle.
+            x: all parameters.
+            group: lens and frames of the field angle.
             offset_nm: of the wavelength from that in ``x``.
 
         Returns:

@@ -186,7 +186,8 @@ class CompressedKernel:
         and at p² + q² = 1: there terms fall as exp(-n / branch).
 
         Args:
-            wy, wx: half sides of the window, um.
+            wy: half side of the window along y, um.
+            wx: the same along x.
         """
         digits = extra_digits(tolerance)
         t = np.linspace(-1, 1, _COARSE)

@@ -203,7 +203,8 @@ class CompressedLens:
         The coefficient of field r is the sum over b of weight[b] series[b, r].
 
         Args:
-            weight: (b, q, p) real functions. series: (b, r) complex.
+            weight: (b, q, p) real functions.
+            series: (b, r) complex.
         """
         flat, (real, imaginary) = weight.reshape(len(weight), -1), self._parts
         c, s = (part.T.astype(weight.dtype) @ flat for part in _pair(series))
@@ -274,7 +275,8 @@ class CompressedLens:
         ``depth_um``.
 
         Args:
-            rows, built: rows and columns of the block.
+            rows: of the block.
+            built: columns of the block.
         """
         d = lens.diameters
         places = d.x_um[None, built], d.y_um[rows, None]
@@ -464,7 +466,8 @@ class CompressedLens:
 
         Args:
             kernel: whose window factor is applied.
-            rests: kernels (k,) whose rests are summed. shares: their factors (k,).
+            rests: kernels (k,) whose rests are summed.
+            shares: their factors (k,).
             axes_um: coarse samples (y, x) of the window.
             inner_um: (y, x) half sides without the rim, which counts ``_BESIDE``.
         """

@@ -291,7 +291,8 @@ class SpectralLine:
         as through equivalent air. One wavelength is added for the pillars.
 
         Args:
-            depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
+            depth_um: (n,) of the sources.
+            angle_rad: (n, 2) their field angles.
             tolerance: of the mean of phasors over the line.
         """
         turn = np.linspace(0, 2 * math.pi, _RIM, endpoint=False)

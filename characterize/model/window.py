@@ -269,7 +269,9 @@ def _resampled(
     Cached; treat as read-only.
 
     Args:
-        first, last, count: the window's even samples, um.
+        first: first of the window's even samples, um.
+        last: last of them, um.
+        count: their number.
         tolerance: relative error of the field.
         rim_um: at either end, where ten times the error is allowed.
     """
