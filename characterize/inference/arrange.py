@@ -154,8 +154,11 @@ def find_arrangement(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Frames:
-    """What is compared: light (n, y, x) less its rim, noise and share of clipped pixels
-    (n,), frames end to end.
+    """Frames to compare with the design.
+
+    light: (n, y, x) less the plane of its rim. noise: (n,) of a frame.
+    clipped: (n,) share of saturated pixels. back: (n,) order from the other end of the
+    stage.
     """
 
     model: ForwardModel

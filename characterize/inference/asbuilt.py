@@ -140,7 +140,7 @@ class AsBuilt:
         """Total (marginal) 95 % interval of a parameter.
 
         Profile interval and the spread of shifts by unstated effects, in quadrature,
-        about the value less their expected shift. No less than the statistical interval.
+        about the value less their expected shift. It contains the statistical interval.
         """
         return _ends(
             self.names.index(name), self.value, self.covariance, self.low, self.high

@@ -25,17 +25,16 @@ Model = Callable[[Array, bool], tuple[Array, Array | None]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FitImages:
-    """What is fitted, in electrons: images, masks, variance at zero light, shot-noise
-    scale.
+    """Frames to fit, in electrons, with masks and noise.
 
-    model_error: standard deviation of the model itself, as a share of the light in a
-    pixel; added to the noise.
+    variance_e2: at zero light. scale: light over its shot-noise variance.
+    model_error: standard deviation of the model, as a share of the light in a pixel;
+    added to the noise.
     common_floor: share of ``variance_e2`` that is one error in all frames.
-    common_light: relative error of the light of
-        a pixel that is one in all frames, not in the variance. Neither weighs; both
-        widen intervals.
-    count_e: electrons of a count, over ``scale`` apart, where pixels are rounded
-    counts; 0 where they are means.
+    common_light: relative error of a pixel's light that is one in all frames, not in
+    the variance. Both widen intervals and do not change the weights.
+    count_e: electrons of a count, ``count_e / scale`` in a pixel, where pixels are
+    rounded counts; 0 where they are means.
     """
 
     electrons: Array
@@ -54,8 +53,7 @@ class FitImages:
         return self.variance_e2 + light / self.scale + (self.model_error * light) ** 2
 
     def shared(self, image: Array) -> Array:
-        """(2, n, y, x) electrons of one standard deviation of what is one error in all
-        frames: by dark, by flat.
+        """(2, n, y, x) standard deviations of errors that all frames share: dark, flat.
 
         The first is part of the noise of every frame, the second is not.
         """
@@ -118,15 +116,15 @@ class GaussianPrior:
 
 @dataclass(frozen=True, slots=True)
 class SolverSettings:
-    """When to stop, and how far an outlier is (sigma).
+    """When a fit stops, how it treats outliers, and when it renews the Jacobian.
 
-    secant: between exact Jacobians the last one is brought up to date by the images
-    that each step gave (Broyden 1965);
-        steps that look final, and those that fail, are checked with an exact one.
-    near: sigma that an exact Jacobian still holds for: shorter steps go on with it.
+    huber: sigma beyond which a residual counts linearly.
+    secant: update the Jacobian by the images of each step (Broyden 1965); steps that
+    look final, and those that fail, are checked with an exact one.
+    near: length of steps, sigma, over which an exact Jacobian is reused.
+    miss: relative error of the predicted change of the images above which the Jacobian
+    is computed anew.
     finish: the Jacobian at the end is exact, or was so within ``near``.
-    miss: share of what a step changes by which images may miss their prediction before
-    the Jacobian is made anew.
     """
 
     iterations: int = 40

@@ -190,7 +190,7 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
         1 / np.sqrt(task.data.variance(image)),
         0.0,
     )
-    rest = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
+    residual = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
     fitted = (slopes * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
@@ -200,7 +200,7 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
         task.names,
         fitted,
         known,
-        rest / over,
+        residual / over,
         task.data.shared(image) * root,
         pull / over,
     )

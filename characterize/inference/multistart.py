@@ -247,9 +247,9 @@ def scan_parameter(
         task: model, frames, priors and arrangement of the search.
         modes: fits so far, best first.
     """
-    found = list(modes)
+    modes_so_far = list(modes)
     for _ in range(_AGAIN):
-        best, few = found[0], few_frames(task.model.setting)
+        best, few = modes_so_far[0], few_frames(task.model.setting)
         problem = task.posed(few)
         here = dataclasses.replace(
             best,
@@ -260,14 +260,16 @@ def scan_parameter(
         scan = functools.partial(_scan_side, problem, here, i)
         sides = threads.run_each(scan, (-1, 1))
         stops = [*sides[0][::-1], here, *sides[1]]
-        wall = np.array([math.inf, *(one.merit for one in stops), math.inf])
+        wall = np.array([math.inf, *(stop.merit for stop in stops), math.inf])
         low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
         begins = [stops[k].value for k in low[np.argsort(wall[1:-1][low])]]
         begins = [x for x in begins if x[i] != best.value[i]][:_MINIMA]
-        found = distinct_modes([*found, *follow_starts(task, best, begins)])
-        if found[0].merit > best.merit - 1:
+        modes_so_far = distinct_modes(
+            [*modes_so_far, *follow_starts(task, best, begins)]
+        )
+        if modes_so_far[0].merit > best.merit - 1:
             break
-    return found
+    return modes_so_far
 
 
 def _scan_side(
@@ -287,9 +289,9 @@ def _scan_side(
     count = max(math.ceil(sign * (end - float(mode.value[i])) / (_STEP * sigma)), 0)
     out = list[FitSolution]()
     here = mode
-    for held_at in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
-        way = here.covariance[:, i] / here.covariance[i, i] * (held_at - here.value[i])
-        here = problem.held(i, held_at).fit(here.value + way, _SCANNED, here.slopes)
+    for target in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
+        way = here.covariance[:, i] / here.covariance[i, i] * (target - here.value[i])
+        here = problem.held(i, target).fit(here.value + way, _SCANNED, here.slopes)
         out.append(here)
     return out
 
@@ -388,9 +390,7 @@ def hold_windows(task: SearchTask, value: Array) -> SearchTask:
 def place_windows(
     task: SearchTask, ends: list[FitSolution]
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The task with its windows held where the best end has them, and the ends followed
-    there.
-    """
+    """The task with windows fixed at the best mode, and the modes fitted again there."""
     moved = hold_windows(task, ends[0].value)
     if moved is task:
         return task, ends
@@ -509,9 +509,12 @@ def _opened(task: SearchTask, x: Array) -> dict[str, float]:
 
 
 def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ...]:
-    """What is fitted: the usual, what is asked for, what is known with an error.
+    """Names of the fitted parameters: usual, freed, or stated with an error.
+
+    Without those stated exactly that are not freed.
 
     Args:
+        known: stated values by name.
         free: names of further parameters.
     """
     for name in free:
@@ -525,12 +528,12 @@ def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ..
 def prior_of(
     names: Sequence[str], known: dict[str, KnownValue], lens: Lens
 ) -> GaussianPrior:
-    """Priors of the fitted parameters: metrology where there is, else what is usual for
-    such a lens.
+    """Priors of the fitted parameters: as stated, else usual for such a lens.
 
     Args:
         names: (p,) names of the fitted parameters.
         known: stated values by name.
+        lens: the design.
     """
     table = usual_parameters(names, lens)
     entries = [known.get(name) for name in names]
@@ -561,8 +564,7 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
 
 
 def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, float]:
-    """(x, y) of the window's middle from the chief ray, as the light lies in the
-    frames.
+    """(x, y) of the window's middle from the chief ray, um, by the light in the frames.
 
     Args:
         found: how the frames lie.

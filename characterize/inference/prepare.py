@@ -63,7 +63,7 @@ def merge_exposures(
         )
     merged, first = merge_brackets(frames, exposure, group)
     longest = np.array([exposure[group == group[i]].max() for i in first])
-    one_each = dataclasses.replace(
+    single = dataclasses.replace(
         capture,
         frames=capture.frames[first],
         position_um=capture.position_um[first],
@@ -71,7 +71,7 @@ def merge_exposures(
         exposure_s=longest,
         names=tuple(capture.names[i] for i in first),
     )
-    return one_each, merged
+    return single, merged
 
 
 def setting_of(
@@ -223,11 +223,11 @@ def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LeftOut:
-    """What a quick model leaves out at (p,) ``value``: (n, y, x) of the images, (p, n,
-    y, x) of the slopes.
+    """Difference of the full to a fast model, at (p,) ``value``.
 
-    beside: (y, x) pixels that it knows nothing of; there images go straight on from
-    ``value``.
+    image: (n, y, x). slopes: (p, n, y, x).
+    beside: (y, x) pixels outside the fast model's region; there images are extrapolated
+    linearly from ``value``.
     """
 
     value: Array
@@ -236,7 +236,7 @@ class LeftOut:
     beside: Array
 
     def added(self, plain: Model, frames: Array | None) -> Model:
-        """The model with what it leaves out, of all frames or some."""
+        """The fast model ``plain`` with the difference added, of all frames or some."""
         chosen = slice(None) if frames is None else frames
         image = self.image[chosen]
         slopes = self.slopes[:, chosen]
@@ -273,15 +273,15 @@ def lit_part(
 
 
 def check_enough(data: FitImages, names: Sequence[str]) -> None:
-    """Refuse what cannot fix its parameters however good the frames are.
+    """Refuse frames that cannot determine the parameters, whatever their quality.
 
     Args:
         data: frames, masks and noise that are fitted.
         names: (p,) names of the fitted parameters.
 
     Raises:
-        CaptureError: one frame for more parameters than one image can tell apart, or
-            fewer pixels than parameters.
+        CaptureError: one frame for more parameters than one image can distinguish, or
+            fewer than three pixels a parameter.
     """
     lens = [
         name

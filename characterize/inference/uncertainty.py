@@ -45,10 +45,10 @@ _HELD = SolverSettings(
 class ProfileLikelihood:
     """Profile likelihood of one parameter about a mode.
 
-    low, high: 95 % interval. value, rise: (k,) the parameter, and by how much -2 ln
-    posterior has risen with all others fitted. parabolic: whether the ends are those of
-    the parabola. found: whether the low and the high end were reached. stops: fits with
-    the parameter held.
+    low, high: 95 % interval. value, rise: (k,) the parameter, and the rise of -2 ln
+    posterior there with all others fitted. parabolic: whether the ends are those of the
+    parabola. found: whether the low and the high end were reached. stops: the fits with
+    the parameter fixed.
     """
 
     low: float

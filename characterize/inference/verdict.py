@@ -285,9 +285,9 @@ def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
     return (float((r[1:] * r[:-1]).sum()) - expected) / math.sqrt(max(variance, 1.0))
 
 
-def _together(one: Array, other: Array) -> Array:
+def _together(first: Array, second: Array) -> Array:
     """(n,) mean product of neighbours over its standard deviation."""
-    product = one * other
+    product = first * second
     return np.asarray(
         product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1))
     )

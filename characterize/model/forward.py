@@ -87,6 +87,14 @@ class ForwardModel:
         *,
         span: ChangeRange | None = None,
     ) -> None:
+        """Gather the lens for every field angle of the frames.
+
+        Args:
+            lens: the design.
+            setting: depths, angles and window of the frames.
+            response: slopes of the pillars.
+            span: largest changes of the pillars; the usual ones without it.
+        """
         self.lens = lens
         self.setting = s = setting
         self.reference_um = float(

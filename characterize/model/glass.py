@@ -1,6 +1,6 @@
-"""From the source to the lens and on to the sensor: in air, through the films of the
-lens, through a plate of glass,
-tilted or not, that stands before it."""
+"""Optical paths from the source to the lens and on to the sensor: in air, through films
+of the lens, and through a plate of glass, tilted or not, in front of it.
+"""
 
 import functools
 import math
@@ -18,19 +18,17 @@ from metalens.optics.paths import sensor_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
-_TERMS, _ROUNDING = (
-    24,
-    1e-14,
-)  # of a series: reaches as long as the distance leave 1e-15 of it, shorter ones less
+# terms of a series, and its rounding: at reaches up to the distance the error is 1e-15
+_TERMS, _ROUNDING = 24, 1e-14
 Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
 @dataclass(frozen=True, slots=True)
 class BenchGeometry:
-    """Where source, lens and sensor stand for one field angle.
+    """Source, lens and sensor for one field angle.
 
-    tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
-    reference_um: source depth whose phase is taken off before gathering.
+    tangents: (x, y) of the chief ray in air; the window is where it meets the sensor.
+    reference_um: source depth whose phase is removed before gathering.
     """
 
     distance_um: float
@@ -43,9 +41,9 @@ class BenchGeometry:
 class FilmStack:
     """Plane-parallel films of a lens at one wavelength.
 
-    front: between source and lens, air apart. behind: between lens and sensor in the
-    light's order, the gap apart,
-    which is of index ``filling`` and takes all that the distance gains.
+    front: (index, thickness in um) between source and lens, without the air.
+    behind: from lens to sensor in the light's order, without the gap.
+    filling: index of the gap, whose thickness is what the distance leaves.
     """
 
     front: Pairs = ()
@@ -54,7 +52,7 @@ class FilmStack:
 
     @classmethod
     def of(cls, layers: Layers, wavelength_um: float) -> "FilmStack":
-        """Those of a lens file; films of no thickness are left out.
+        """The films of a lens file at a wavelength, without those of no thickness.
 
         Raises:
             PropagationError: one of them is metal.

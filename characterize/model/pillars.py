@@ -70,9 +70,7 @@ class ChangeRange:
 
     @classmethod
     def of(cls, wavelength_um: float) -> "ChangeRange":
-        """Of lenses for a wavelength: lengths are larger where it is longer
-        (``made.coarser``).
-        """
+        """The range for a wavelength: lengths grow with it (:func:`wavelength_scale`)."""
         more = wavelength_scale(wavelength_um)
         rows = zip(_ROWS, cls().answers, strict=True)
         answers = tuple(
@@ -91,12 +89,11 @@ class ChangeRange:
 
 
 class PillarResponse:
-    """Transmission of pillars under change, exact and in its low-rank basis.
+    """Transmission of pillars under change, exact and in a low-rank basis.
 
     basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,)
-    biases where t is
-    formed. error: largest |t - low-rank| met on random changes inside the range, that
-    the basis was not made from.
+    biases at which t is computed. error: largest |t - low-rank t| over random changes
+    within the range, which the basis was not computed from.
     """
 
     _laid: tuple[int, ...] = (
@@ -114,6 +111,15 @@ class PillarResponse:
         tolerance: float = 3e-5,
         angle_rad: float = 0.0,
     ) -> None:
+        """Compute the basis, with more bias nodes until the error is below ``_MISSED``.
+
+        Args:
+            lens: its cell, proxy and diameters.
+            response: slopes of ln t by the answering causes.
+            span: largest changes; the usual ones without it.
+            tolerance: rms error of t in the basis.
+            angle_rad: of incidence.
+        """
         span = (span or ChangeRange.of(lens.wavelength_um)).within(lens.cell)
         self.lens = lens
         self.response = response
@@ -294,8 +300,11 @@ class PillarResponse:
         return value
 
     def rates(self, bias_um: Array, weights: Array) -> Array:
-        """(b, *shape) derivatives of :meth:`weights` by the bias, from their values
-        there.
+        """(b, *shape) derivatives of :meth:`weights` by the bias, 1/um.
+
+        Args:
+            bias_um: (*shape).
+            weights: (b, *shape) polynomials at these biases.
         """
         x = np.asarray(bias_um) / self.span.bias_um
         reach = self.span.bias_um
@@ -336,15 +345,12 @@ class PillarResponse:
 
 
 class PairedPillars(PillarResponse):
-    """As :class:`PillarResponse`, of two sizes: functions of the kinds of pillars that
-    the
-    lens has, one after the other.
+    """As :class:`PillarResponse`, for pillars of two sizes: one column for each pair.
 
-    A bias moves all edges, so both sizes alike, along the table of the lens; the
-    answers are those of the designed
-    sizes. t is taken to be that of the design's wavelength: the table knows single
-    ones. ``diameter_um``: width of
-    every kind.
+    A bias moves all edges, so it adds to both sizes, along the table of the lens. The
+    slopes by the answering causes are those of the designed sizes. t is that of the
+    design's wavelength, as the table has single ones.
+    ``diameter_um``: width of each pair.
     """
 
     _laid = 3, 6  # rectangles have more resonances than rounds

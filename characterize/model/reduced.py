@@ -64,6 +64,16 @@ class CompressedLens:
         depths_um: Array,
         tolerance: float,
     ) -> None:
+        """Choose the nodes and gather the pillars on them.
+
+        Args:
+            lens: the design.
+            pillars: basis functions of its pillars.
+            bench: geometry of one field angle.
+            window_um: side of a square about the chief ray that contains the window.
+            depths_um: range of source depths, whose defocus the nodes resolve.
+            tolerance: relative error of the field.
+        """
         self.bench = bench
         self.tolerance = tolerance
         self.window_um = window_um

@@ -165,12 +165,12 @@ def light_maps(u: Array, v: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AngleGroup:
-    """Frames of one field angle, by their ``index``, and the lens as they see it.
+    """Frames of one field angle, and the lens on nodes for it.
 
-    bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the
-    diameters, of a residual phase.
-    apart: the same frames behind a stop, depth by depth where it stands before the
-    pillars: others of them are lit.
+    index: of the frames. bending, widening, residual: (m, q, p) on the nodes: phase by
+    wave-front parameters, diameter by CD parameters, residual phase modes.
+    apart: behind a stop the same frames in parts of equal shadow; where the stop is not
+    at the pillars, one part for each depth.
     """
 
     index: Array
