@@ -29,18 +29,17 @@ Way = tuple[bool, int]  # reordered, orientation
 Shift = tuple[float, float]
 Both = tuple[Array, Array]
 """Images as they are, and those of a camera on its side: the same where frames are square."""
-# of the likeness by which reversed frames must do better: defocus looks much alike on
-# both sides
+# likeness by which reversed frames must be better: defocus is similar on both sides
 _TWIN = 0.05
-# of the likeness: by ten times less errors of a made lens were seen to exchange two
-# orientations
+# likeness within which orientations remain candidates: ten times what errors of an
+# as-built lens were observed to exchange
 _NEAR = 0.02
-_TWINS = 5e-3  # of the likeness of a twin, within which the plainest is taken
-_TOLD = 40.0  # chi-square between orientations from which on fits may tell them apart
-_SURE = 0.9  # likeness from which on the nominal lens explains the frames
-_ZEROS = 17
-# of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at
-# NA 0.25
+_TWINS = 5e-3  # likeness within which the simplest of reversed twins is chosen
+_TOLD = 40.0  # chi-square between two orientations that a fit can distinguish
+_SURE = 0.9  # likeness above which the nominal lens explains the frames
+_ZEROS = 17  # stage zeros of a scan
+# distances of a scan: steps of 25 um over two prior sigma, a tenth of a wave of defocus
+# at NA 0.25
 _DISTANCES = 17
 
 
@@ -106,20 +105,20 @@ def find_arrangement(
     start: Array | None = None,
     reach_um: float = 0.0,
 ) -> FrameArrangement:
-    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth,
-    in all eight orientations.
+    """Stage zero, order and orientation of the frames, by comparison with the design.
 
-    Where the frames then seem out of order or hardly alike, the lens-sensor distance is
-    scanned over +-``reach_um``
-    too: it shifts the whole stack through focus, as no stage zero does, and a stack
-    shifted by a depth or two looks
-    like one in another order. What needs less putting right and is as much alike is
-    taken.
+    Every frame is correlated with every depth in all eight orientations, over a scan of
+    the stage zero. Where the frames then seem out of order or different from the
+    design, the lens-sensor distance is scanned too: it shifts the whole stack through
+    focus, as no stage zero does. A stack shifted by a depth or two resembles one in
+    another order. Of both results the simpler is returned, if it is as similar.
 
     Args:
         model: the forward model.
         data: frames, masks and noise that are fitted.
-        start: (p,) where it begins.
+        scan_um: half range of the stage zero, um.
+        start: (p,) parameters to start from; the nominal ones without it.
+        reach_um: half range of the distance, um; 0 for no scan.
     """
     frames = _Frames.of(model, data)
     start = parameter_vector() if start is None else start.copy()
@@ -131,28 +130,35 @@ def find_arrangement(
     )
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     plain, score = frames.scanned(start, zeros)
-    found = _laid(frames, plain, score)
-    if reach_um > 0 and (found.reordered or found.clearly or score < _SURE):
+    arrangement = _laid(frames, plain, score)
+    doubtful = arrangement.reordered or arrangement.clearly or score < _SURE
+    if reach_um > 0 and doubtful:
         distances = start[PLACE["distance_um"]] + reach_um * np.linspace(
             -1, 1, _DISTANCES
         )
-        moved, _ = frames.some(few_frames(model.setting)).scanned(
+        place, _ = frames.some(few_frames(model.setting)).scanned(
             start, zeros[:: _ZEROS // 4], distances
         )
-        moved, better = frames.scanned(moved, zeros)
-        other = _laid(frames, moved, better)
-        simpler = (other.reordered, other.clearly) < (found.reordered, found.clearly)
+        place, better = frames.scanned(place, zeros)
+        refocused = _laid(frames, place, better)
+        simpler = (refocused.reordered, refocused.clearly) < (
+            arrangement.reordered,
+            arrangement.clearly,
+        )
         if better >= score and (
-            simpler or (better > score + _TWIN and not other.reordered)
+            simpler or (better > score + _TWIN and not refocused.reordered)
         ):
-            return other
-    return found
+            return refocused
+    return arrangement
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Frames:
-    """What is compared: light (n, y, x) less its rim, noise and share of clipped pixels
-    (n,), frames end to end.
+    """Frames to compare with the design.
+
+    light: (n, y, x) less the plane of its rim. noise: (n,) of a frame.
+    clipped: (n,) share of saturated pixels. back: (n,) order from the other end of the
+    stage.
     """
 
     model: ForwardModel
@@ -190,42 +196,43 @@ class _Frames:
     def scanned(
         self, start: Array, zeros: Array, distances_um: Array | None = None
     ) -> tuple[Array, float]:
-        """Parameters at the best stage zero (and distance) of the way that the frames
-        lie; likeness there.
+        """Best parameters of a scan of stage zero (and distance), and their likeness.
 
-        Each way has its own best: images that twist with depth are mirrored ones at
-        another depth.
+        The best way of all, order and orientation, counts at its own best place: images
+        that twist with depth equal mirrored ones at another depth. A reversed order is
+        charged ``_TWIN``.
         """
         distances = (
             start[PLACE["distance_um"], None] if distances_um is None else distances_um
         )
         places = np.repeat(start[None], len(distances) * len(zeros), 0)
-        places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
-            part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
-        )
+        grid = np.meshgrid(distances, zeros, indexing="ij")
+        places[:, PLACE["distance_um"]] = grid[0].ravel()
+        places[:, PLACE["stage_zero_um"]] = grid[1].ravel()
         turned = [
             FrameSpectra.of(orient_frames(self.light, k), self.noise) for k in _EVERY
         ]
         scores = np.nan_to_num(
             threads.run_each(lambda x: self._scores(x, turned), places), nan=-math.inf
         )
-        stated, back = scores.max(0)
-        orientation, back_first = _way(stated, back)
-        place = int(np.argmax(scores[:, int(back_first), orientation]))
-        return places[place], float(
-            scores[place, int(back_first), orientation]
-        ) - _TWIN * back_first
+        stated, reverse = scores.max(0)
+        orientation, is_reversed = _way(stated, reverse)
+        of_way = scores[:, int(is_reversed), orientation]
+        best = int(np.argmax(of_way))
+        return places[best], float(of_way[best]) - _TWIN * is_reversed
 
     def _scores(self, x: Array, turned: list[FrameSpectra]) -> Array:
-        """(2, orientations) likeness at some parameters: of frames as stated, and end
-        to end.
+        """(2, orientations) likeness at parameters ``x``: stated order, then reversed.
+
+        Args:
+            turned: spectra of the frames in every orientation.
         """
-        upright, aside = _expected(self.rough, x, self.clipped)
+        upright, sideways = _expected(self.rough, x, self.clipped)
         first = FrameSpectra.of(upright, 0 * self.noise)
-        expected = (
-            first,
-            first if aside is upright else FrameSpectra.of(aside, 0 * self.noise),
-        )
+        second = first
+        if sideways is not upright:
+            second = FrameSpectra.of(sideways, 0 * self.noise)
+        expected = first, second
         orders = np.arange(len(self.light)), self.back
         return np.array(
             [
@@ -235,115 +242,129 @@ class _Frames:
         )
 
 
-def _way(stated: Array, back: Array) -> tuple[int, bool]:
-    """Place of the orientation, and whether frames lie end to end, by their likeness:
-    the least that explains them.
+def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
+    """(orientation, whether the order is reversed): the simplest way that fits.
+
+    Args:
+        stated: (8,) likeness of the stated order.
+        reverse: (8,) likeness of the reversed one.
     """
     orientation, clearly = _plainest_turn(stated)
     orientation = orientation if clearly else 0
-    if back[0] <= stated[0] + _TWIN or back.max() < stated[orientation]:
+    if reverse[0] <= stated[0] + _TWIN or reverse.max() < stated[orientation]:
         return orientation, False
-    return (int(back.argmax()) if back.max() > back[0] + _TWIN else 0), True
+    if reverse.max() > reverse[0] + _TWIN:
+        return int(reverse.argmax()), True
+    return 0, True
 
 
 def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
-    """Order and orientation of the frames, judged against the images at some
-    parameters.
+    """Arrangement of the frames: their order and orientation at parameters ``x``.
+
+    Every order and orientation is compared with the nominal images. Where frames seem
+    both reordered and turned, the simplest of the near-equal reversed twins is chosen.
+
+    Args:
+        likeness: mean correlation at ``x``.
     """
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
-    order, reordered, seen = _order(light, expected[0], noise, frames.model)
+    order, reordered, order_seen = _order(light, expected[0], noise, frames.model)
     orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
-    alike, shifts = _ways(frames, expected, orders)
-    stated = np.array([alike[False, k] for k in _EVERY])
+    likeness_of, shifts = _ways(frames, expected, orders)
+    stated = np.array([likeness_of[False, k] for k in _EVERY])
     orientation, clearly = _plainest_turn(stated)
     if reordered and clearly:
         # a twin: images that twist with depth look mirrored when reversed
         twins = (True, 0), (False, orientation), (True, orientation)
-        best = max(alike[way] for way in twins)
-        way = next(way for way in twins if alike[way] > best - _TWINS)
+        best = max(likeness_of[way] for way in twins)
+        way = next(way for way in twins if likeness_of[way] > best - _TWINS)
         reordered, clearly = way[0], way[1] > 0
     chosen = reordered, orientation if clearly else 0
-    apart = {k: _apart(k, expected, light, noise) for k in _EVERY}
-    found = FrameArrangement(
+    chi2 = {k: _apart(k, expected, light, noise) for k in _EVERY}
+    arrangement = FrameArrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
         shift_px=shifts[chosen],
         likeness=likeness,
         order=order,
         reordered=reordered,
-        order_seen=seen,
+        order_seen=order_seen,
         orientation=chosen[1],
         clearly=clearly,
-        alike=tuple(k for k in apart if k and apart[k] < _TOLD),
+        alike=tuple(k for k in chi2 if k and chi2[k] < _TOLD),
     )
     distinct = [
         way
-        for way in alike
+        for way in likeness_of
         if way[0] == reordered
-        and apart[relative_orientation(chosen[1], way[1])] >= _TOLD
+        and chi2[relative_orientation(chosen[1], way[1])] >= _TOLD
     ]
+    # the likeliest of the other order
     twin = sorted(
-        (way for way in alike if way[0] != reordered), key=lambda way: -alike[way]
+        (way for way in likeness_of if way[0] != reordered),
+        key=lambda way: -likeness_of[way],
     )[:1]
     others = [
         replace(
-            found,
+            arrangement,
             reordered=way[0],
             orientation=way[1],
             clearly=way[1] > 0,
             shift_px=shifts[way],
         )
         for way in [*distinct, *twin]
-        if alike[way] > alike[chosen] - _NEAR
+        if likeness_of[way] > likeness_of[chosen] - _NEAR
     ]
-    return replace(found, others=tuple(others))
+    return replace(arrangement, others=tuple(others))
 
 
 def _ways(
     frames: _Frames, expected: Both, orders: dict[bool, Array]
 ) -> tuple[dict[Way, float], dict[Way, Shift]]:
-    """Mean likeness and shift (y, x) of the frames, by whether they are reordered and
-    by orientation.
+    """Mean likeness and median shift (y, x) of the frames in every arrangement.
+
+    By (reordered, orientation).
     """
-    alike, shifts = {}, {}
+    likeness, shifts = {}, {}
     for way in itertools.product(orders, _EVERY):
         index = orders[way[0]]
-        found = _compare(
+        peaks = _compare(
             orient_frames(frames.light[index], way[1]),
             expected[way[1] % 2],
             frames.noise[index],
         )
-        alike[way] = float(np.mean([score for score, _ in found]))
-        y, x = np.median([shift for _, shift in found], axis=0).tolist()
+        likeness[way] = float(np.mean([score for score, _ in peaks]))
+        y, x = np.median([shift for _, shift in peaks], axis=0).tolist()
         shifts[way] = y, x
-    return alike, shifts
+    return likeness, shifts
 
 
 def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
-    """Chi-square between the nominal images, as bright as the light, and these turned
-    about the chief ray.
+    """Chi-square between the nominal images and the same in orientation ``k``.
+
+    At the brightness of the measured frames: how well fits can distinguish the two.
     """
-    unlike = ((orient_frames(expected[0], k) - expected[k % 2]) ** 2).sum(
-        (1, 2)
-    ) * _brightness(light, expected[0], noise) ** 2
-    return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
+    change = ((orient_frames(expected[0], k) - expected[k % 2]) ** 2).sum((1, 2))
+    power = change * _brightness(light, expected[0], noise) ** 2
+    return float((power * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
 def _reversed(model: ForwardModel) -> Array:
     """(n,) frames from the other end of the stage, at each field angle."""
-    back = np.arange(len(model.setting.depth_um))
+    order = np.arange(len(model.setting.depth_um))
     for group in model.groups:
         by_depth = group.index[
             np.argsort(model.setting.depth_um[group.index], kind="stable")
         ]
-        back[by_depth] = by_depth[::-1]
-    return back
+        order[by_depth] = by_depth[::-1]
+    return order
 
 
 def _expected(model: ForwardModel, x: Array, clipped: Array) -> Both:
-    """Nominal frames without background, clipped in as large a share of their pixels as
-    the measured ones.
+    """Nominal frames (upright, sideways) without background, clipped as the measured.
+
+    The same share of pixels is clipped in each. For square windows both are one array.
     """
     upright = _clipped(model, x, clipped)
     square = model.setting.rows == model.setting.columns
@@ -371,38 +392,41 @@ def _compare(
 def _order(
     light: Array, expected: Array, noise: Array, model: ForwardModel
 ) -> tuple[Array, bool, bool]:
-    """Assignment of frames to depths by shape and brightness: (order, clearly
-    different, observable at all).
+    """Optimal assignment of frames to depths, by shape and brightness.
+
+    The sum of squared differences over the noise is minimised (Hungarian method).
+
+    Returns:
+        ((n,) order, whether it clearly differs from the stated one, whether the nominal
+        images differ enough between depths to judge).
     """
     n = len(light)
     bright = expected * _brightness(light, expected, noise)
-    apart = np.full((n, n), np.inf)
-    unlike = np.full((n, n), np.inf)
+    distances = np.full((n, n), np.inf)
+    between_nominal = np.full((n, n), np.inf)
     for group in model.groups:
         for i in group.index:
             for j in group.index:
-                apart[i, j] = _distance(light[j], bright[i]) / noise[j] ** 2
-                unlike[i, j] = _distance(bright[j], bright[i]) / noise[j] ** 2
-    finite = np.where(np.isfinite(apart), apart, 1e12)
+                distances[i, j] = _distance(light[j], bright[i]) / noise[j] ** 2
+                between_nominal[i, j] = _distance(bright[j], bright[i]) / noise[j] ** 2
+    finite = np.where(np.isfinite(distances), distances, 1e12)
     rows, columns = optimize.linear_sum_assignment(finite)
-    stated = float(np.trace(apart))
+    stated = float(np.trace(distances))
     best = float(finite[rows, columns].sum())
-    neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
+    neighbours = np.where(np.eye(n, dtype=bool), np.inf, between_nominal).min(1)
     distinct = bool(n > 1 and np.median(neighbours) > 0.2)
-    return (
-        columns,
-        bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct),
-        distinct,
-    )
+    differs = bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct)
+    return columns, differs, distinct
 
 
 def _brightness(light: Array, expected: Array, noise: Array) -> float:
-    """Of the light over that expected, by their power: the sum of frames less a plane
-    may be 0, or below.
+    """Amplitude ratio of measured to expected light, by their power less the noise.
+
+    At least 0.1 of the power counts, as the difference may be 0 or negative.
     """
     power = float((light**2).sum())
-    seen = max(power - float((noise**2).sum()), 0.1 * power)
-    return math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
+    signal = max(power - float((noise**2).sum()), 0.1 * power)
+    return math.sqrt(signal / max(float((expected**2).sum()), 1e-300))
 
 
 def _distance(a: Array, b: Array) -> float:
@@ -412,15 +436,14 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _plainest_turn(scores: Array) -> tuple[int, bool]:
-    """Of equal likenesses the plainest turn; whether it beats the first, that of frames
-    as stated, beyond doubt.
+    """(simplest orientation of best likeness, whether it clearly beats the first).
+
+    Within 2e-3 the first of equals is taken. Clearly: half of the missing likeness and
+    0.02 better than the frames as stated.
     """
     best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
-    return best, bool(
-        best != 0
-        and (1 - scores[best]) < 0.5 * (1 - scores[0])
-        and scores[best] - scores[0] > 0.02
-    )
+    halved = (1 - scores[best]) < 0.5 * (1 - scores[0])
+    return best, bool(best != 0 and halved and scores[best] - scores[0] > 0.02)
 
 
 def _bare(x: Array) -> Array:

@@ -137,18 +137,17 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Total (marginal) 95 % interval: the profile interval and what is open about
-        the unstated effects, in quadrature, about the value less what these effects, as
-        large as the frames make likely, do to it; no less than the statistical one.
+        """Total (marginal) 95 % interval of a parameter.
+
+        Profile interval and the spread of shifts by unstated effects, in quadrature,
+        about the value less their expected shift. It contains the statistical interval.
         """
         return _ends(
             self.names.index(name), self.value, self.covariance, self.low, self.high
         )
 
     def within_model(self, name: str) -> tuple[float, float]:
-        """95 % interval where what the model lacks is absent, or stated: too narrow
-        where it is not.
-        """
+        """Statistical 95 % interval, if the model is complete; too narrow if it is not."""
         if not len(self.within.covariance):
             return self.interval(name)
         return _ends(
@@ -160,11 +159,10 @@ class AsBuilt:
         )
 
     def most(self, name: str) -> tuple[str, ...]:
-        """Causes that nobody stated and that widen the interval of a parameter, the
-        most telling first.
+        """Unstated causes that widen the interval of a parameter, the largest first.
 
-        Those that alone move it by a quarter of its standard error and by a third of
-        what the worst does.
+        Those that alone shift it by a quarter of its standard error, and by a third of
+        the shift of the largest.
         """
         i = self.names.index(name)
         own = self.by_cause[:, i] if len(self.causes) else np.empty(0)
@@ -176,43 +174,33 @@ class AsBuilt:
         """All parameters in the order of ``parameters.NAMES``; ``value``: of the fitted
         ones, the best without it.
         """
-        fitted = self.value if value is None else value
-        return parameter_vector(
-            self.held
-            | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True))
-        )
+        fitted = np.asarray(self.value if value is None else value, float).tolist()
+        return parameter_vector(self.held | dict(zip(self.names, fitted, strict=True)))
 
     def samples(self, count: int, seed: int = 0) -> Array:
-        """(count, p) draws of the fitted parameters from their posterior: of the
-        process, for the next mask.
+        """(count, p) draws of the fitted parameters from their posterior.
 
-        Those of ``draws`` where the posterior is bent or double (again from the first
-        where more are asked for), else
-        Gaussian.
+        Of the process, for the next mask. Resampled from ``draws`` where the
+        posterior is not Gaussian.
         """
         rng = np.random.default_rng(seed)
-        return _bounded(
-            self.names,
-            self.design,
-            _drawn(rng, count, self.value, self.covariance, self.draws),
-        )
+        draws = _drawn(rng, count, self.value, self.covariance, self.draws)
+        return _bounded(self.names, self.design, draws)
 
     def lens_samples(self, count: int, seed: int = 0) -> Array:
-        """(count, p) draws of what the lens does to light, for training and PSFs under
-        uncertainty.
+        """(count, p) draws of what the lens does to light: for training and PSF errors.
 
-        Narrower than :meth:`samples`: a leaning wall or a shifted write field that was
-        taken for height or trefoil goes
-        with the lens, and does there what it did on the bench. What was the bench's
-        (glass, source, light) does not.
+        Narrower than :meth:`samples`. A tilted wall or displaced write field that was
+        taken for height or trefoil stays with the lens, and acts on light as it did on
+        the bench. What belonged to the bench (glass, source, light) does not.
         """
         if not len(self.within.covariance):
             return self.samples(count, seed)
-        rng, one = np.random.default_rng(seed), self.within
-        own = _drawn(rng, count, self.value, one.covariance, one.draws)
-        return _bounded(
-            self.names, self.design, own + gaussian_draws(rng, count, self.bench)
-        )
+        rng = np.random.default_rng(seed)
+        within = self.within
+        own = _drawn(rng, count, self.value, within.covariance, within.draws)
+        draws = own + gaussian_draws(rng, count, self.bench)
+        return _bounded(self.names, self.design, draws)
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of
@@ -248,11 +236,8 @@ class AsBuilt:
             side,
             side,
         )
-        depths = np.unique(
-            np.round(
-                true_depth(self.parameters(), setting, float(self.depth_um.mean())), 3
-            )
-        )
+        depth_um = true_depth(self.parameters(), setting, float(self.depth_um.mean()))
+        depths = np.unique(np.round(depth_um, 3))
         angles = tuple(
             (float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0)
         )
@@ -263,19 +248,22 @@ class AsBuilt:
     def psf_stack(
         self, view: "psfs.View", value: Array | None = None, *, tolerance: float = 1e-4
     ) -> "psfs.PsfStack":
-        """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of
-        :meth:`samples`.
+        """PSFs (angle, depth, y, x) of the lens as built.
 
-        Windows are centred on the chief ray of the best fit. A draw's own is moved by
-        the difference of the two
-        decentres, so that draws differ by what the frames leave open and not by a
-        gradient of the bias that
-        the decentre makes up for.
+        Windows are centred on the chief ray of the best fit. That of a draw is moved by
+        the difference of both decentres: draws then differ by the uncertainty of the
+        lens, not by a gradient of the bias that the decentre compensates.
+
+        Args:
+            view: angles, depths and window.
+            value: (p,) fitted parameters, a row of :meth:`samples`; default: the best.
+            tolerance: relative error.
 
         Raises:
             PropagationError: as :func:`metalens.psf.psf_stack`.
         """
-        x, best = self.parameters(value), self.parameters()
+        x = self.parameters(value)
+        best = self.parameters()
         dx, dy = (
             float(x[PLACE[name]] - best[PLACE[name]])
             for name in ("decentre_x_um", "decentre_y_um")
@@ -284,10 +272,10 @@ class AsBuilt:
         return made.psf_stack(self.design, self.response, x, view, **more)
 
     def psf_posterior(self, view: "psfs.View", *, draws: int = 8) -> float:
-        """Relative L2 error of :meth:`psf_stack` by what the captures leave open.
+        """Relative L2 error of :meth:`psf_stack` from the uncertainty of the lens.
 
-        Root mean square over draws of the lens from its posterior, the worst field
-        angle. Accuracy: a quarter, from 8 draws.
+        Root mean square over draws from its posterior, at the worst field angle.
+        Accuracy: a quarter, from 8 draws.
         """
         best = self.psf_stack(view, tolerance=1e-3).intensity
         square = np.zeros(len(best))
@@ -309,7 +297,7 @@ class AsBuilt:
 def _ends(
     i: int, value: Array, covariance: Array, low: Array, high: Array
 ) -> tuple[float, float]:
-    """Of a profile where there is one, else 1.96 sigma to either side."""
+    """Ends of a 95 % interval: of a profile if there is one, else value +- 1.96 sigma."""
     if len(low):
         return float(low[i]), float(high[i])
     reach = 1.959964 * math.sqrt(float(covariance[i, i]))
@@ -319,9 +307,7 @@ def _ends(
 def _drawn(
     rng: np.random.Generator, count: int, value: Array, covariance: Array, draws: Array
 ) -> Array:
-    """(count, p) of ``draws``, again from the first where more are asked for; Gaussian
-    ones where there are none.
-    """
+    """(count, p) draws: of ``draws`` in random order, repeated as needed, else Gaussian."""
     if not len(draws):
         return np.asarray(value + gaussian_draws(rng, count, covariance))
     order = [rng.permutation(len(draws)) for _ in range(-(-count // len(draws)))]

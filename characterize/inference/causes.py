@@ -37,18 +37,18 @@ from metalens.fabrication import (
 from metalens.lens import Lens
 from metalens.optics import Stop
 
+# amounts by which the causes are probed
 _STITCH_UM = 0.05
 _STOP_UM = 3.0
 _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
-_ENOUGH = 4e-3
 _CAMERA_DEG, _TALL = 0.5, 0.01
-_DENSE = 3  # samples a pixel's side between which turned frames are interpolated
+_ENOUGH = 4e-3  # relative error of the fields in these differences
+_DENSE = 3  # samples a pixel's side from which turned frames are interpolated
 LAMP = "a lamp or exposure that changes from frame to frame"
 WINDOWS = "a window off the chief ray at a field angle"
-_ROUND = (
-    1e-4  # of the peak: round light does not turn, what is left is of the interpolation
-)
+# share of the peak below which a turn of round light is error of interpolation
+_ROUND = 1e-4
 _GRID = 41  # places across the lens at which write fields are sampled
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
@@ -60,16 +60,14 @@ _OF_MASK = {*names_of_kind(CDError), *names_of_kind(ResponseError)}
 class ImageChange:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
-    amount, amount_text: of the first, in words with a place for the number; empty where no
-    amount is said.
-    sigma: of every change, one for all or each its own, how much of it is assumed
-    where nobody states it: a
-    standard deviation, 0 for none.
-    frees: parameters that describe it. stated: whether one of these is stated without
-    an error. sought: whether it is looked for alone.
-    roughly: the change is of the right kind but of an unknown pattern, so that the
-    frames cannot bound it by what they
-    show of it. of_mask: of the lens itself.
+    amount: of the cause in the first change. amount_text: sentence part with a place
+    for that number; empty where none is reported.
+    sigma: standard deviation of the factor of each change, assumed where nobody states
+    it; one for all or one for each, 0 for none.
+    frees: parameters that describe the cause. stated: whether one of these is stated
+    without an error. sought: whether it has a score test of its own.
+    roughly: the pattern of the change is not known well enough for the frames to bound
+    it. of_mask: the cause belongs to the lens itself.
     """
 
     cause: str
@@ -87,32 +85,29 @@ class ImageChange:
 def systematic_changes(
     task: SearchTask, x: Array, slopes: dict[str, Array]
 ) -> Iterator[ImageChange]:
-    """Every cause that is not among the fitted parameters; ``slopes``: of these.
+    """Changes of the images by every systematic effect that is not fitted.
 
-    From differences of images that leave ``_ENOUGH`` of a field out: what causes are
-    taken for moves by a percent.
+    Differences of images with fields to ``_ENOUGH``: the shifts of parameters that are
+    computed from these change by a percent.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         x: all parameters, in the order of ``PARAMETERS``.
+        slopes: derivatives of the images by the fitted parameters.
     """
-    task = dataclasses.replace(
-        task, model=task.model.rough(max(task.model.cut, _ENOUGH))
-    )
+    rough = task.model.rough(max(task.model.cut, _ENOUGH))
+    task = dataclasses.replace(task, model=rough)
     image = task.model.images(x)[0]
     yield from _of_model(task, x, image)
     if "sidewall_deg" not in task.names or task.model.lens.cell.sidewall_rad == 0:
         leaning = task.model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
-        amount_text = "an angle whose square is {:.3g} deg²"
-        sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
-        words = "a side wall that leans about half height"
-        # resonances are left out of it
+        # roughly: resonances are left out
         yield ImageChange(
-            words,
+            "a side wall that leans about half height",
             leaning[None],
             _WALL_DEG**2,
-            amount_text,
-            sigma,
+            "an angle whose square is {:.3g} deg²",
+            (_size(task, "sidewall_deg") / _WALL_DEG) ** 2,
             roughly=True,
             of_mask=True,
         )
@@ -130,25 +125,28 @@ def systematic_changes(
     yield from _of_windows(task, slopes)
     yield from _of_camera(task, x, light)
     yield from _of_stop(task, x, image)
-    held = tuple(name for name in LIGHT if name not in task.names)
-    if held:
-        uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
-        sizes = np.array([_size(task, name) for name in held]) / _LIGHT_STEP
-        frees = tuple(name for name in held if not _exactly(task, name))
+    fixed = tuple(name for name in LIGHT if name not in task.names)
+    if fixed:
+        uneven = _LIGHT_STEP * np.asarray(task.model.images(x, fixed)[1])
+        sizes = np.array([_size(task, name) for name in fixed]) / _LIGHT_STEP
+        frees = tuple(name for name in fixed if not _exactly(task, name))
         yield ImageChange(
             "uneven illumination",
             uneven,
             _LIGHT_STEP,
-            held[0] + " {:.3g}",
+            fixed[0] + " {:.3g}",
             sizes,
-            frees or held,
+            frees or fixed,
             not frees,
         )
     yield from _of_phase(task, x, image, slopes)
 
 
 def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
-    """Parameters of the model that are held."""
+    """Changes by parameters of the model that are not fitted, each by its probe amount.
+
+    Tilts of the glass without glass are those of a plate of 100 um.
+    """
     for row in (row for row in PARAMETERS if row.effect):
         name, amount = row.name, row.probe
         base: dict[str, float] = {}
@@ -162,28 +160,24 @@ def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]
         for key, value in base.items():
             before[PLACE[key]] = after[PLACE[key]] = value
         after[PLACE[name]] += amount
-        with contextlib.suppress(
-            FitError
-        ):  # a spectrum wider than the proxy knows, a plate with no room
+        # a spectrum beyond the proxy's range, or a plate that does not fit, is skipped
+        with contextlib.suppress(FitError):
             first = task.model.images(before)[0] if base else image
-            change = (task.model.images(after)[0] - first)[None]
-            sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
-            words = row.effect.format(before[PLACE["glass_um"]])
-            frees = ("glass_um", name) if base else (name,)
+            change = task.model.images(after)[0] - first
             yield ImageChange(
-                words,
-                change,
+                row.effect.format(before[PLACE["glass_um"]]),
+                change[None],
                 amount,
                 name + " {:.3g}",
-                sigma,
-                frees,
+                (_size(task, name) / amount) ** (2 if name in _SQUARE else 1),
+                ("glass_um", name) if base else (name,),
                 _exactly(task, name),
                 of_mask=name in _OF_MASK,
             )
 
 
 def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[ImageChange]:
-    """What changes from frame to frame."""
+    """Changes of single frames: brightness, shifts, blur, stage, and wavelength drift."""
     yield ImageChange(LAMP, _each(light))
     sideways = [_each(np.gradient(light, axis=a)) for a in (1, 2)]
     yield ImageChange("shifts from frame to frame", np.concatenate(sideways))
@@ -200,14 +194,14 @@ def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[ImageChange]:
 
 
 def _of_camera(task: SearchTask, x: Array, light: Array) -> Iterator[ImageChange]:
-    """Pixels that lie elsewhere: along turned axes, or farther apart along y.
+    """Changes by pixels at other places: turned axes, or a larger pitch along y.
 
-    Pixels that are higher too blur by a share of their own width more, which is left
-    out.
+    The added blur of higher pixels is left out.
     """
     places = np.eye(2), _turn(_CAMERA_DEG), np.diag([1 + _TALL, 1.0])
-    upright, *moved = seen_at(task.model, x, places)
-    turned, tall = (frames - upright for frames in moved)
+    frames = seen_at(task.model, x, places)
+    turned = frames[1] - frames[0]
+    tall = frames[2] - frames[0]
     if np.abs(turned).max() > _ROUND * light.max():
         sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
         yield ImageChange(
@@ -221,8 +215,9 @@ def _of_camera(task: SearchTask, x: Array, light: Array) -> Iterator[ImageChange
 
 
 def _of_windows(task: SearchTask, slopes: dict[str, Array]) -> Iterator[ImageChange]:
-    """Windows of one field angle moved along x and along y, at every angle but the
-    first: decentre moves them all.
+    """Changes by windows of one field angle that are off by a pixel along x and y.
+
+    At every angle but the first, as decentre moves all windows.
     """
     s = task.model.setting
     sideways = [
@@ -230,42 +225,39 @@ def _of_windows(task: SearchTask, slopes: dict[str, Array]) -> Iterator[ImageCha
         for name in ("decentre_x_um", "decentre_y_um")
         if name in slopes
     ]
-    aside = [one.index for one in task.model.groups[1:]]
-    if aside and sideways:
-        moved = np.zeros((len(aside), len(sideways), *sideways[0].shape))
-        for k, index in enumerate(aside):
+    indices = [group.index for group in task.model.groups[1:]]
+    if indices and sideways:
+        moved = np.zeros((len(indices), len(sideways), *sideways[0].shape))
+        for k, index in enumerate(indices):
             moved[k, :, index] = np.stack(sideways, 1)[index]
-        amount_text = "{:.3g} px at one of the angles"
         yield ImageChange(
             WINDOWS,
             moved.reshape(-1, *sideways[0].shape),
             1.0,
-            amount_text,
+            "{:.3g} px at one of the angles",
             _size(task, "window_px"),
         )
 
 
 def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
-    """An aperture stop beside its place: the part of the lens that the light meets
-    moves, as by a lean of the lens.
+    """Changes by an aperture stop off its place, along x and along y.
+
+    The illuminated part of the lens moves, as by a tilt of the lens.
     """
-    model, stop = task.model, task.model.lens.layers.stop
+    stop = task.model.lens.layers.stop
     if stop is None:
         return
     for along in (0, 1):
         centre = np.add(stop.centre_um, _STOP_UM * np.eye(2)[along])
-        moved = model_behind_stop(
-            model,
-            dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1]))),
-        ).images(x)[0]
-        amount_text = "{:.3g} um"
-        sigma = _size(task, "stop_um") / _STOP_UM
+        centre_um = float(centre[0]), float(centre[1])
+        displaced = dataclasses.replace(stop, centre_um=centre_um)
+        moved = model_behind_stop(task.model, displaced).images(x)[0]
         yield ImageChange(
             f"an aperture stop off along {'xy'[along]}",
             (moved - image)[None],
             _STOP_UM,
-            amount_text,
-            sigma,
+            "{:.3g} um",
+            _size(task, "stop_um") / _STOP_UM,
         )
 
 
@@ -284,38 +276,33 @@ def model_behind_stop(model: ForwardModel, stop: Stop) -> ForwardModel:
 def _of_phase(
     task: SearchTask, x: Array, image: Array, slopes: dict[str, Array]
 ) -> Iterator[ImageChange]:
-    """Phases that no parameter describes: half of the mask off, smooth ones, write
-    fields.
+    """Changes by phases that no parameter describes.
+
+    Half of the mask displaced, smooth phases, and write fields displaced at random.
     """
     model = task.model
     for along, name in enumerate("xy"):
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
-        amount_text = "{:.3g} nm of the right half"
         yield ImageChange(
             f"a write field off along {name}",
             moved[None],
             _STITCH_UM * 1e3,
-            amount_text,
+            "{:.3g} nm of the right half",
         )
     names = [f"residual_{k}" for k in range(MODES + 3)]
-    bent = np.asarray(
-        model.with_residual(np.zeros(MODES + 3), smooth_phase_changes).images(x, names)[
-            1
-        ]
-    )
+    smooth = model.with_residual(np.zeros(MODES + 3), smooth_phase_changes)
+    bent = np.asarray(smooth.images(x, names)[1])
     sized = bent[:MODES] * prior_rad()[:, None, None, None]
     yield ImageChange("a smooth phase that no parameter describes", sized)
-    known = [
+    wavefront = [
         slopes.get(name, np.zeros_like(image)) for name in names_of_kind(WavefrontError)
     ]
-    every = np.concatenate([bent, np.stack(known)])
-    fields = np.tensordot(write_fields(model.lens), every, 1)
-    sigma = _size(task, "stitching_nm") * 1e-3
+    every = np.concatenate([bent, np.stack(wavefront)])
     yield ImageChange(
         "write fields out of place",
-        fields,
-        sigma=sigma,
+        np.tensordot(write_fields(model.lens), every, 1),
+        sigma=_size(task, "stitching_nm") * 1e-3,
         sought=False,
         roughly=True,
         of_mask=True,
@@ -330,25 +317,22 @@ def _exactly(task: SearchTask, name: str) -> bool:
 
 
 def _size(task: SearchTask, name: str) -> float:
-    """Standard deviation of a cause: as it is stated, 0 where it
-    is held as stated.
+    """Standard deviation of a cause: as stated, else a Type B estimate.
+
+    0 where it is held as stated.
     """
     if name in task.unfitted:
         return task.unfitted[name]
-    known = task.known.get(name)
-    if known is not None:
-        return (
-            math.hypot(known.sigma, known.value)
-            if name == "sidewall_deg"
-            else known.sigma
-        )
-    return type_b_sigma(name, task.model.lens)
+    stated = task.known.get(name)
+    if stated is None:
+        return type_b_sigma(name, task.model.lens)
+    if name == "sidewall_deg":  # the model has upright walls: the mean counts too
+        return math.hypot(stated.sigma, stated.value)
+    return stated.sigma
 
 
 def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
-    """Phase for 1 um by which the pillars right of the axis are moved along x (0) or y
-    (1).
-    """
+    """Phase, rad, of the right half of the pillars moved by 1 um along x (0) or y (1)."""
 
     def phase(u: Array, v: Array, count: int) -> Array:
         return np.asarray((_moved_phase(lens, u, v, along) * (u > 0))[None])
@@ -357,29 +341,34 @@ def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
 
 
 def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
-    """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus
-    there.
+    """Phase, rad, of pillars moved by 1 um along x (0) or y (1).
+
+    The slope of the focusing phase, k x (1 / hypot(r, d) + 1 / hypot(r, s)) at place x
+    along the axis, with focal distance d and source distance s.
     """
     k = 2 * math.pi / lens.wavelength_um
     radius = lens.diameters.radius_um
     d = lens.reduced_um
     r = radius * np.hypot(u, v)
-    sine = 1 / np.hypot(r, d) + (
-        1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0
-    )
+    # sine of the angle to the focus over r, and to the source where it is near
+    sine = 1 / np.hypot(r, d)
+    if lens.source_distance_um > 0:
+        sine = sine + 1 / np.hypot(r, lens.source_distance_um)
     return np.asarray(k * radius * (u, v)[along] * sine)
 
 
 def write_fields(lens: Lens) -> Array:
-    """(fields, modes and known phases) of :func:`smooth_phase_changes` and the
-    wave-front parameters
-    for 1 um along x, then y.
+    """Write-field displacements as combinations of smooth phases.
 
-    Four fields across the lens each way. What is no smooth phase is left out: it
-    scatters light and moves nothing.
+    Least-squares coefficients (fields, phases) of the phase of one field moved by 1 um,
+    along x, then along y; four fields across the lens each way. The phases are those of
+    :func:`smooth_phase_changes` and the wave-front parameters. What they cannot
+    represent scatters light and shifts no parameter.
     """
     t = np.linspace(-1, 1, _GRID)
-    u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 1] for part in np.meshgrid(t, t))
+    u, v = np.meshgrid(t, t)
+    inside = np.hypot(u, v) <= 1
+    u, v = u[inside], v[inside]
     shapes = np.concatenate(
         [
             smooth_phase_changes(u, v, MODES + 3),
@@ -387,9 +376,8 @@ def write_fields(lens: Lens) -> Array:
             np.ones((1, len(u))),
         ]
     )
-    field = (
-        np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)
-    ).astype(int)
+    row, column = (np.minimum(np.floor(2 * (w + 1)), 3) for w in (v, u))
+    field = (row * 4 + column).astype(int)  # number, 0 to 15
     parts = [
         phase * (field == k)
         for phase in (_moved_phase(lens, u, v, a) for a in (0, 1))
@@ -401,12 +389,12 @@ def write_fields(lens: Lens) -> Array:
 
 
 def smooth_phase_changes(u: Array, v: Array, count: int) -> Array:
-    """Smooth phases that no parameter describes, then leans and defocus.
+    """(count, *shape) smooth phases: thin-plate modes, then tilts and defocus, rad.
 
     Args:
         u: x on the lens over its radius.
         v: y on the lens over its radius.
-        count: of the phases.
+        count: number of phases.
     """
     return np.concatenate(
         [thin_plate_basis(u, v, MODES), np.stack([u, v, u * u + v * v])]
@@ -421,11 +409,11 @@ def _each(change: Array) -> Array:
 
 
 def _along_one(light: Array) -> Array:
-    """(2, n, y, x): a blur s² wider along x than along y, and along one diagonal than
-    the other, is s²/2 of these.
+    """(2, n, y, x) changes by a directional blur: xx - yy and 2 xy second differences.
 
-    Second differences of the light, xx - yy and 2 xy: the blur that parameters describe
-    is round.
+    A blur of variance s² wider along x than along y, or along one diagonal than along
+    the other, changes the light by s²/2 of these. Round blur has parameters of its
+    own.
     """
     xx, yy = (
         ndimage.correlate1d(light, [1.0, -2.0, 1.0], axis, mode="nearest")
@@ -453,28 +441,27 @@ def _curvature(light: Array) -> Array:
 
 
 def seen_at(model: ForwardModel, x: Array, places: Sequence[Array]) -> Array:
-    """(k, n, y, x) light, less the background, of pixels as wide as ever that lie
-    elsewhere.
+    """(k, n, y, x) light without background of pixels at other places.
 
-    Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order.
+    Pixels keep their width. Fifth-order splines on samples ``_DENSE`` times as dense.
 
     Args:
         model: the forward model.
+        x: all parameters.
         places: k matrices (2, 2) from (y, x) of a pixel, counted from the window's
-            middle, to where it lies.
+            middle, to its actual place.
     """
-    s, dense = model.setting, _sampled(model, _DENSE)
-    close = dense.images(x)[0] - background_planes(x, dense.setting)
-    pixels = np.stack(
-        np.meshgrid(
-            *(np.arange(n) - (n - 1) / 2 for n in (s.rows, s.columns)), indexing="ij"
-        )
-    )
-    middle = np.array([(n - 1) / 2 for n in close.shape[1:]])[:, None, None]
-    seen = (middle + _DENSE * np.tensordot(one, pixels, 1) for one in places)
+    s = model.setting
+    dense = _sampled(model, _DENSE)
+    light = dense.images(x)[0] - background_planes(x, dense.setting)
+    # (y, x) of the pixels from the window's middle
+    axes = (np.arange(n) - (n - 1) / 2 for n in (s.rows, s.columns))
+    pixels = np.stack(np.meshgrid(*axes, indexing="ij"))
+    middle = np.array([(n - 1) / 2 for n in light.shape[1:]])[:, None, None]
+    moved = (middle + _DENSE * np.tensordot(place, pixels, 1) for place in places)
     frames = [
-        [ndimage.map_coordinates(frame, at, order=5, mode="nearest") for frame in close]
-        for at in seen
+        [ndimage.map_coordinates(frame, at, order=5, mode="nearest") for frame in light]
+        for at in moved
     ]
     return np.array(frames)
 
@@ -491,12 +478,15 @@ def _turn(turn_deg: float) -> Array:
 def _sampled(model: ForwardModel, dense: int) -> ForwardModel:
     """The model of frames whose pixels lie ``dense`` times as close and stay as wide."""
     part = copy.copy(model)
-    s, over = model.setting, math.ceil(model.grid.oversample / dense)
-    rows = dense * s.rows
-    columns = dense * s.columns
-    margin = dense * s.margin
-    now: dict[str, Any] = {"rows": rows, "columns": columns, "margin": margin}
-    now |= {"pixel_um": s.pixel_um / dense, "fill": dense * s.fill}
-    part.setting = dataclasses.replace(s, **now)
-    part.grid = dataclasses.replace(model.grid, **now, oversample=over)
+    s = model.setting
+    over = math.ceil(model.grid.oversample / dense)
+    changes: dict[str, Any] = {
+        "rows": dense * s.rows,
+        "columns": dense * s.columns,
+        "margin": dense * s.margin,
+        "pixel_um": s.pixel_um / dense,
+        "fill": dense * s.fill,
+    }
+    part.setting = dataclasses.replace(s, **changes)
+    part.grid = dataclasses.replace(model.grid, **changes, oversample=over)
     return part

@@ -58,12 +58,11 @@ from metalens.lens import Lens
 LIKENESS = 0.45
 # fitted too where the usual parameters do not explain the frames
 EXTRA = tuple(row.name for row in PARAMETERS if row.extra)
-_ROUNDS, _STAYS = (
-    5,
-    0.1,
-)  # of rounded counts; sigma by which the last moves nothing farther
+# fits with rounded counts: at most so many, until none moves by more sigma
+_ROUNDS, _STAYS = 5, 0.1
+# a solution, its score tests, and stated values that it contradicts
 Looked = tuple[FitSolution, ScoreTests, list[ResidualFinding]]
-# chi-square a pixel of frames left out, with what their prediction is uncertain by
+# chi-square a pixel of frames left out, over noise and uncertainty of the prediction
 _LEFT_OUT = 1.25
 
 
@@ -105,15 +104,20 @@ def fit(
             frames, a parameter at its
             bound, no convergence.
     """
-    with (
-        threads.one_blas_thread()
-    ):  # matrices are small: a second thread of BLAS takes a core to wait on
+    # matrices are small: more BLAS threads only occupy cores
+    with threads.one_blas_thread():
         return _fit(capture, lens, options or FitOptions(), response)
 
 
 def _fit(
     capture: Capture, lens: Lens, options: FitOptions, response: Sensitivity | None
 ) -> AsBuilt:
+    """:func:`fit` in its steps, on one BLAS thread.
+
+    Prepare the frames, find their arrangement, search the modes, free the parameters
+    of likely causes, explore the posterior, check. Problems are refused before and
+    after the posterior.
+    """
     capture, frames = merge_exposures(capture, to_electrons(capture))
     setting, window = setting_of(capture, options.window)
     check_depths(setting.depth_um, lens)
@@ -121,36 +125,32 @@ def _fit(
     known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
     sizes = unfitted_sizes(known, lens)
     check_enough(data, multistart.names_of(known, options.free))
-    model = ForwardModel(
-        lens, setting, response or log_response_slopes(lens, wanted=_spoken_of(options))
-    )
+    response = response or log_response_slopes(lens, wanted=_spoken_of(options))
+    model = ForwardModel(lens, setting, response)
     start = parameter_vector({name: k.value for name, k in known.items()})
-    scan_um = (
-        0.12 * float(np.median(setting.depth_um))
-        if options.scan_um is None
-        else options.scan_um
-    )
-    found = find_arrangement(
+    scan_um = options.scan_um
+    if scan_um is None:
+        scan_um = 0.12 * float(np.median(setting.depth_um))
+    arrangement = find_arrangement(
         model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens)
     )
-    _check_likeness(found, lens)
-    whole = SearchTask(model, data, start, known, found, options.free, sizes)
+    _check_likeness(arrangement, lens)
+    whole = SearchTask(model, data, start, known, arrangement, options.free, sizes)
     task = multistart.choose_orientation(
-        [_as_laid(whole, one) for one in (found, *found.others)]
+        [_as_laid(whole, candidate) for candidate in (arrangement, *arrangement.others)]
     )
     cautions = [
         *frames.corrections,
-        *laid_words(task.found or found),
+        *laid_words(task.found or arrangement),
         *verdict.spectrum_text(lens, known),
     ]
     cautions += roughly_known(lens, model.response)
     unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
-    task = dataclasses.replace(
-        task, model=quick_enough(task.model, task.data, unbiased)
-    )
-    task, ends = _unrounded(
-        *multistart.place_windows(*_ends(task, frames.gain, cautions)), frames.gain
-    )
+    fast = quick_enough(task.model, task.data, unbiased)
+    task = dataclasses.replace(task, model=fast)
+    task, ends = _ends(task, frames.gain, cautions)
+    task, ends = multistart.place_windows(task, ends)
+    task, ends = _unrounded(task, ends, frames.gain)
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
@@ -165,9 +165,7 @@ def _fit(
 
 
 def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
-    """Half the range of distances that is looked at: two sigma of what is known, within
-    the bounds.
-    """
+    """Half the range of distances to scan, um: two prior sigma, within the bounds."""
     prior = multistart.prior_of(("distance_um",), known, lens)
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
@@ -175,44 +173,39 @@ def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
 def _refuse(
     problems: Sequence[str], options: FitOptions, leans: list[ScoreTest]
 ) -> None:
-    """Refuse by the problems, with what the residuals lean to: where to look on the
-    bench.
-    """
+    """Raise FitRefused with the problems and the causes the residuals lean to."""
     if problems and not options.insist:
-        raise FitRefused(
-            "fit refused: "
-            + "; ".join(
-                dict.fromkeys(
-                    [*problems, *(one.words for one in missing.score_test_text(leans))]
-                )
-            )
-        )
+        leaning = (finding.words for finding in missing.score_test_text(leans))
+        reasons = dict.fromkeys([*problems, *leaning])  # each once
+        raise FitRefused("fit refused: " + "; ".join(reasons))
 
 
 def _ends(
     task: SearchTask, gain: SensorNoise, cautions: list[str]
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The valleys of the usual parameters, or of more where these do not explain the
-    frames.
+    """Modes of the usual parameters, or with ``EXTRA`` where these do not fit.
+
+    The extra parameters stay only where chi-square falls by 3 % or more.
     """
     task, ends = multistart.search_modes(task)
     if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
         return task, ends
-    more = dataclasses.replace(task, free=(*task.free, *EXTRA))
-    wide = multistart.widen_search(more, task.all_of(ends[0].value))
-    if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
+    extended = dataclasses.replace(task, free=(*task.free, *EXTRA))
+    wider = multistart.widen_search(extended, task.all_of(ends[0].value))
+    if wider is None or wider[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
     cautions.append(
         f"the usual parameters did not explain the frames: {', '.join(EXTRA)} fitted too"
     )
-    return wide
+    return wider
 
 
 def _unrounded(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The fit by the likelihood of rounded counts, where these are too coarse for their
-    noise.
+    """The fit with the likelihood of rounded counts, where rounding matters.
+
+    Repeated with the correction at the last fit, until no parameter moves.
     """
     if not (gain.coarse and task.data.count_e):
         return task, ends
@@ -234,11 +227,13 @@ def _unrounded(
 def _with_what_is_there(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
 ) -> tuple[SearchTask, list[FitSolution], Looked | None]:
-    """The task with parameters of causes that are likely there (:func:`missing.to_fit`)
-    and explain the frames better.
+    """The task with the parameters of likely causes (:func:`missing.to_fit`) freed.
 
-    With the last look beside the fit, the solution it was at, and what that contradicts;
-    None without a known gain.
+    At most four, one after the other, each the largest fall of the misfit.
+
+    Returns:
+        (task, its modes, (solution, score tests, contradicted statements)); the last is
+        None without a known gain.
     """
     if not gain.known:
         return task, ends, None
@@ -248,20 +243,20 @@ def _with_what_is_there(
         if not ends[0].converged:
             break
         falls = _falls(task, ends[0], looked.leans)
-        cause = next((one for _, one in falls if not one.stated), None)
+        cause = next((test for _, test in falls if not test.stated), None)
         if cause is None:
             break
-        more = dataclasses.replace(task, free=(*task.free, *cause.frees))
-        wide = multistart.widen_search(more, task.all_of(ends[0].value))
-        if wide is None or wide[1][0].merit > ends[0].merit:
+        extended = dataclasses.replace(task, free=(*task.free, *cause.frees))
+        wider = multistart.widen_search(extended, task.all_of(ends[0].value))
+        if wider is None or wider[1][0].merit > ends[0].merit:
             break
-        fall = ends[0].merit - wide[1][0].merit
+        fall = ends[0].merit - wider[1][0].merit
         cautions.append(
             f"{cause.cause} explains the frames better (chi-square falls by "
             f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
         )
         doubts += _contradicted(cause, falls)
-        task, ends = wide
+        task, ends = wider
         looked = missing.run_score_tests(task, ends[0])
     return task, ends, (ends[0], looked, doubts)
 
@@ -273,9 +268,10 @@ def _falls(
     *,
     out_of_bounds: float = 10.0,
 ) -> list[tuple[float, ScoreTest]]:
-    """(fall of the misfit by their parameters, cause), largest first: of those that
-    lower it by half of what the residuals promise, or, where a parameter ran to its
-    bound, by ``out_of_bounds`` of -2 ln L.
+    """(fall of the misfit, cause) of causes whose parameters explain the frames better.
+
+    Largest first. A cause must lower -2 ln L by half of its score-test chi-square, or,
+    where a parameter ran to its bound, by ``out_of_bounds``.
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
@@ -289,20 +285,22 @@ def _falls(
 def _contradicted(
     fitted: ScoreTest, falls: list[tuple[float, ScoreTest]]
 ) -> list[ResidualFinding]:
-    """What is stated without an error and, were it wrong, would explain the frames as
-    well as the cause that is fitted in its place.
+    """Statements without an error that contradict the frames.
+
+    Were one wrong, it would explain the frames about as well as the cause that is
+    ``fitted`` in its place.
     """
-    most = next(fall for fall, cause in falls if cause is fitted)
+    largest = next(fall for fall, cause in falls if cause is fitted)
     return [
         ResidualFinding(
-            f"{one.cause} would explain the frames about as well as {fitted.cause} "
+            f"{test.cause} would explain the frames about as well as {fitted.cause} "
             f"({math.sqrt(fall):.1f} sigma: chi-square falls by {fall:.0f}), but "
-            f"{', '.join(one.frees)} is held as stated: state it with its error, or "
+            f"{', '.join(test.frees)} is held as stated: state it with its error, or "
             "mend the bench",
             math.sqrt(fall),
         )
-        for fall, one in falls
-        if one.stated and fall > most - multistart.MODES_WITHIN
+        for fall, test in falls
+        if test.stated and fall > largest - multistart.MODES_WITHIN
     ]
 
 
@@ -320,11 +318,9 @@ def _check_likeness(found: FrameArrangement, lens: Lens) -> None:
 
 
 def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
-    """The task with its frames laid as found, and its windows held where the light then
-    lies.
-    """
-    aside = found.clearly and found.orientation % 2 == 1
-    model = task.model.exchanged() if aside else task.model
+    """The task with its frames in an arrangement, and its window fixed at the light."""
+    sideways = found.clearly and found.orientation % 2 == 1
+    model = task.model.exchanged() if sideways else task.model
     model = model.about(multistart.window_um(found, model))
     return dataclasses.replace(
         task,
@@ -337,24 +333,33 @@ def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
 def _result(
     capture: Capture,
     task: SearchTask,
-    found: FitPosterior,
+    posterior: FitPosterior,
     cautions: list[str],
     gain: SensorNoise,
-    seen: Looked,
+    looked: Looked,
 ) -> AsBuilt:
-    _, looked, doubts = seen
+    """The as-built lens of a posterior, with its checks, intervals and texts.
+
+    Errors of causes that nobody stated widen covariance and intervals.
+
+    Args:
+        looked: (solution, its score tests, contradicted statements).
+    """
+    _, tests, doubts = looked
     model = task.model
     data = task.data
-    solution = found.best
+    solution = posterior.best
     names = task.names
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
     unseen = verdict.left_out(task, solution)
-    covariance = _with_gain(names, found, gain)
-    unstated = looked.shifts()
-    within = _within(found, covariance, names)
-    findings = [*_findings(task, solution, looked), *doubts]
-    more, value = uncertainty.REACH * unstated.spread, solution.value
+    covariance = _with_gain(names, posterior, gain)
+    unstated = tests.shifts()
+    within = _within(posterior, covariance, names)
+    findings = [*_findings(task, solution, tests), *doubts]
+    value = solution.value
+    # intervals about the value less the expected shift, widened by its spread
     centre = value - unstated.mean
+    more = uncertainty.REACH * unstated.spread
     return AsBuilt(
         design=model.lens,
         response=model.response,
@@ -380,26 +385,26 @@ def _result(
                 names, solution.information, task.prior.sigma
             )
         ),
-        degeneracies=_open(task, found, covariance, looked if gain.known else None),
+        degeneracies=_open(task, posterior, covariance, tests if gain.known else None),
         cautions=(
             *cautions,
-            *(one.words for one in findings),
+            *(finding.words for finding in findings),
             *(_extrapolation(unseen) if gain.known else ()),
         ),
         problems=(
-            *_problems(task, solution, gain, looked.leans),
+            *_problems(task, solution, gain, tests.leans),
             *verdict.held_back(names, solution, task.prior),
             *missing.decisive_findings(findings),
         ),
         low=np.minimum(centre - np.hypot(value - within.low, more), within.low),
         high=np.maximum(centre + np.hypot(within.high - value, more), within.high),
-        draws=_drawn(task, found.draws, unstated),
+        draws=_drawn(task, posterior.draws, unstated),
         within=within,
         curves={
-            name: np.stack([one.value, one.rise])
-            for name, one in found.profiles.items()
+            name: np.stack([profile.value, profile.rise])
+            for name, profile in posterior.profiles.items()
         },
-        verdicts=_verdicts(task, found, unseen, unstated),
+        verdicts=_verdicts(task, posterior, unseen, unstated),
         causes=unstated.causes,
         by_cause=unstated.by_cause,
         bench=unstated.bench,
@@ -407,24 +412,27 @@ def _result(
 
 
 def _within(
-    found: FitPosterior, covariance: Array, names: tuple[str, ...]
+    posterior: FitPosterior, covariance: Array, names: tuple[str, ...]
 ) -> WithinModel:
-    """The posterior with the error of the gain in what is counted in electrons."""
-    value = found.best.value
-    counted = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
-    low = np.minimum(found.low, value - counted)
-    high = np.maximum(found.high, value + counted)
-    return WithinModel(covariance, low, high, found.draws)
+    """Intervals and covariance within the model, with the error of the gain.
+
+    The gain scales what is counted in electrons.
+    """
+    value = posterior.best.value
+    by_gain = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
+    low = np.minimum(posterior.low, value - by_gain)
+    high = np.maximum(posterior.high, value + by_gain)
+    return WithinModel(covariance, low, high, posterior.draws)
 
 
 def _drawn(task: SearchTask, draws: Array, unstated: UnmodelledShifts) -> Array:
     """Draws with the shifts by unstated effects; none where there are none."""
     if not len(draws):
         return draws
-    moved = draws + gaussian_draws(
+    shifted = draws + gaussian_draws(
         np.random.default_rng(2), len(draws), unstated.covariance
     )
-    return np.asarray(np.clip(moved, task.prior.low, task.prior.high))
+    return np.asarray(np.clip(shifted, task.prior.low, task.prior.high))
 
 
 def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
@@ -440,30 +448,33 @@ def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
 
 
 def _verdicts(
-    task: SearchTask, found: FitPosterior, unseen: float, unstated: UnmodelledShifts
+    task: SearchTask, posterior: FitPosterior, unseen: float, unstated: UnmodelledShifts
 ) -> tuple[str, str]:
+    """Texts on the accuracy of the PSF and of the process parameters."""
     rows = usual_parameters(task.names, task.model.lens)
-    known = verdict.process_verdict(
-        rows, found.low, found.high, _prior_share(task, found), unstated
+    process = verdict.process_verdict(
+        rows, posterior.low, posterior.high, _prior_share(task, posterior), unstated
     )
-    errors = verdict.predicted_error(task, found), verdict.predicted_aside(task, found)
-    return _psf_verdict(*errors, unseen, len(task.model.groups)), known
+    errors = (
+        verdict.predicted_error(task, posterior),
+        verdict.predicted_aside(task, posterior),
+    )
+    return _psf_verdict(*errors, unseen, len(task.model.groups)), process
 
 
 def _findings(
     task: SearchTask, solution: FitSolution, looked: ScoreTests
 ) -> list[ResidualFinding]:
-    """What is in the frames and in no parameter: structure of the residuals, effects.
+    """Findings in the residuals: correlated structure, and causes that they lean to.
 
-    Residuals are taken over the noise that they have where more than the noise model
-    gives is left, and where no gain says how much that is.
+    Residuals are scaled to unit chi-square, as the noise may be more than its model.
     """
     data = task.data
-    r = solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
+    residual = solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
     noise = np.sqrt(data.variance(solution.image))
     shared = data.shared(solution.image) / noise
     structure = verdict.correlated_residuals_text(
-        np.where(data.saturated, 0.0, r), shared
+        np.where(data.saturated, 0.0, residual), shared
     )
     return [*structure, *missing.score_test_text(looked.leans)]
 
@@ -479,14 +490,17 @@ def _extrapolation(unseen: float) -> list[str]:
 
 
 def _open(
-    task: SearchTask, found: FitPosterior, covariance: Array, looked: ScoreTests | None
+    task: SearchTask,
+    posterior: FitPosterior,
+    covariance: Array,
+    looked: ScoreTests | None,
 ) -> tuple[str, ...]:
     """What cannot be distinguished: bent and double posteriors, pairs, and causes that
     nobody fitted.
     """
     pairs = knowable.correlated_pairs(task.names, covariance, task.prior.sigma)
     return (
-        *uncertainty.posterior_text(task.names, found),
+        *uncertainty.posterior_text(task.names, posterior),
         *pairs,
         *(missing.undetectable_effects(looked.leans) if looked else ()),
     )
@@ -496,34 +510,41 @@ def _named(names: tuple[str, ...]) -> Array:
     return np.array([not name.startswith(("log_gain", "background")) for name in names])
 
 
-def _prior_share(task: SearchTask, found: FitPosterior) -> Array:
+def _prior_share(task: SearchTask, posterior: FitPosterior) -> Array:
     """(p,) width of the intervals over that of the prior."""
     return np.asarray(
-        (found.high - found.low) / (2 * uncertainty.REACH) / task.prior.sigma
+        (posterior.high - posterior.low) / (2 * uncertainty.REACH) / task.prior.sigma
     )
 
 
 def _psf_verdict(
-    known: tuple[float, float],
-    aside: tuple[float, float] | None,
+    at_depths: tuple[float, float],
+    at_angles: tuple[float, float] | None,
     unseen: float,
     angles: int,
 ) -> str:
-    captured, between = known
-    tested = (
-        ""
-        if np.isnan(unseen)
-        else f"; frames left out agree within {unseen:.2f} times their noise"
-    )
+    """Sentence on the relative error of the PSF.
+
+    Args:
+        at_depths: errors at the captured depths and between them.
+        at_angles: errors between the captured angles and half a step beyond; or None.
+        unseen: reduced chi-square of frames left out; nan without such.
+        angles: number of captured angles.
+    """
+    captured, between = at_depths
+    tested = ""
+    if not np.isnan(unseen):
+        tested = f"; frames left out agree within {unseen:.2f} times their noise"
     at = "at one angle" if angles == 1 else f"at the {angles} captured angles"
-    if aside is not None:
-        at += f" ({aside[0]:.1%} between these, {aside[1]:.1%} half a step beyond)"
+    if at_angles is not None:
+        at += f" ({at_angles[0]:.1%} between these, {at_angles[1]:.1%} half a step beyond)"
     return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
 
 
 def _problems(
     task: SearchTask, solution: FitSolution, gain: SensorNoise, leans: list[ScoreTest]
 ) -> list[str]:
+    """Reasons to refuse a solution, in words; empty where it passes."""
     problems = [
         *verdict.fit_problems(task.names, solution, gain),
         *verdict.too_quiet(solution, gain),
@@ -538,15 +559,18 @@ def _problems(
     return problems
 
 
-def _with_gain(names: tuple[str, ...], found: FitPosterior, gain: SensorNoise) -> Array:
-    """Covariance with the error of the sensor's gain, which scales everything that is
-    counted in electrons.
+def _with_gain(
+    names: tuple[str, ...], posterior: FitPosterior, gain: SensorNoise
+) -> Array:
+    """(p, p) covariance with the error of the sensor's gain.
+
+    The gain scales everything that is counted in electrons: background and brightness.
     """
     relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
     by_gain = np.zeros(len(names))
     for i, name in enumerate(names):
         if name.startswith("background"):
-            by_gain[i] = found.best.value[i] * relative
+            by_gain[i] = posterior.best.value[i] * relative
         elif name == "log_gain":
             by_gain[i] = relative
-    return np.asarray(found.covariance + np.outer(by_gain, by_gain))
+    return np.asarray(posterior.covariance + np.outer(by_gain, by_gain))

@@ -30,8 +30,8 @@ def correlated_pairs(
             either = dict.fromkeys(
                 PARAMETERS[PLACE[names[k]]].measured_by for k in (j, i)
             )
-            known = " or ".join(one for one in either if one)
-            why = f"measure {known or 'either'}, which settles both"
+            methods = " or ".join(method for method in either if method)
+            why = f"measure {methods or 'either'}, which settles both"
             words.append(
                 f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): {why}"
             )
@@ -61,18 +61,18 @@ def identifiable_combinations(
     for value, vector in sorted(
         zip(values, vectors.T, strict=True), key=lambda t: -t[0]
     ):
-        known = 1 / np.sqrt(max(value, 1e-30))
+        sigma = 1 / np.sqrt(max(value, 1e-30))
         before = np.sqrt(
             (np.where(np.isfinite(prior), prior, 1e9) ** 2 * vector**2).sum()
         )
-        if known < 0.5 * before:
+        if sigma < 0.5 * before:
             main = np.argsort(-np.abs(vector))[:3]
             parts = [
                 f"{vector[i]:+.2f} {names[i]}/{unit[i]:g}"
                 for i in main
                 if abs(vector[i]) > 0.15
             ]
-            lines.append(f"{' '.join(parts)} to {known:.2g}")
+            lines.append(f"{' '.join(parts)} to {sigma:.2g}")
     return lines
 
 
@@ -91,25 +91,23 @@ def information_eigenvectors(
 
 
 def profile_density(curve: Array, at: Array) -> Array:
-    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its
-    profile (2, points) by value.
+    """(*shape) probability density of a parameter from its profile likelihood.
 
-    The signed root of the rise, straight where the valley is a parabola, runs linearly
-    between the points and beyond.
+    exp(-rise / 2), normalised. The signed root of the rise, straight for a parabola, is
+    interpolated linearly between the points and extrapolated.
 
     Args:
         curve: (2, points) values and rise of -2 ln L.
+        at: (*shape) values of the parameter.
     """
     value, keep = np.unique(curve[0], return_index=True)
     root = np.sqrt(np.maximum(curve[1][keep], 0.0))
     root = np.where(np.arange(len(value)) < int(np.argmin(root)), -root, root)
-    ends = (
-        (root[1] - root[0]) / (value[1] - value[0]),
-        (root[-1] - root[-2]) / (value[-1] - value[-2]),
-    )
-    seen = np.interp(at, value, root)
-    seen = np.where(at < value[0], root[0] + ends[0] * (at - value[0]), seen)
-    seen = np.where(at > value[-1], root[-1] + ends[1] * (at - value[-1]), seen)
+    first = (root[1] - root[0]) / (value[1] - value[0])
+    last = (root[-1] - root[-2]) / (value[-1] - value[-2])
+    at_root = np.interp(at, value, root)
+    at_root = np.where(at < value[0], root[0] + first * (at - value[0]), at_root)
+    at_root = np.where(at > value[-1], root[-1] + last * (at - value[-1]), at_root)
     fine = np.linspace(value[0], value[-1], 2001)
     whole = np.trapezoid(np.exp(-(np.interp(fine, value, root) ** 2) / 2), fine)
-    return np.asarray(np.exp(-(seen**2) / 2) / whole)
+    return np.asarray(np.exp(-(at_root**2) / 2) / whole)

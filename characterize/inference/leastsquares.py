@@ -14,8 +14,7 @@ from scipy import special
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 
-# sigma of a step from which on images tell slopes: they are rounded by a thousandth of
-# one or two
+# sigma of the least step that updates slopes: images are rounded to about 1e-3 sigma
 _TELLING = 0.03
 HUBER = 6.0  # sigma beyond which a residual counts linearly
 _NODES, _WEIGHTS = special.roots_jacobi(4, 1.0, 0.0)
@@ -26,17 +25,16 @@ Model = Callable[[Array, bool], tuple[Array, Array | None]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FitImages:
-    """What is fitted, in electrons: images, masks, variance at zero light, shot-noise
-    scale.
+    """Frames to fit, in electrons, with masks and noise.
 
-    model_error: standard deviation of the model itself, as a share of the light in a
-    pixel; added to the noise.
+    variance_e2: at zero light. scale: light over its shot-noise variance.
+    model_error: standard deviation of the model, as a share of the light in a pixel;
+    added to the noise.
     common_floor: share of ``variance_e2`` that is one error in all frames.
-    common_light: relative error of the light of
-        a pixel that is one in all frames, not in the variance. Neither weighs; both
-        widen intervals.
-    count_e: electrons of a count, over ``scale`` apart, where pixels are rounded
-    counts; 0 where they are means.
+    common_light: relative error of a pixel's light that is one in all frames, not in
+    the variance. Both widen intervals and do not change the weights.
+    count_e: electrons of a count, ``count_e / scale`` in a pixel, where pixels are
+    rounded counts; 0 where they are means.
     """
 
     electrons: Array
@@ -55,8 +53,7 @@ class FitImages:
         return self.variance_e2 + light / self.scale + (self.model_error * light) ** 2
 
     def shared(self, image: Array) -> Array:
-        """(2, n, y, x) electrons of one standard deviation of what is one error in all
-        frames: by dark, by flat.
+        """(2, n, y, x) standard deviations of errors that all frames share: dark, flat.
 
         The first is part of the noise of every frame, the second is not.
         """
@@ -77,11 +74,11 @@ class FitImages:
         """
         off = np.where(self.usable, self.electrons - image, 0.0)
         off = np.where(self.saturated, np.maximum(off, 0.0), off)
-        whole = sum(
+        integral = sum(
             weight / self.variance(image + share * off)
             for share, weight in zip(*_JACOBI, strict=True)
         )
-        return np.asarray(2 * off**2 * whole)
+        return np.asarray(2 * off**2 * integral)
 
     def planes(self, index: Array) -> "FitImages":
         """Some of the frames."""
@@ -89,13 +86,14 @@ class FitImages:
 
     def arranged(self, change: Callable[[Array], Array]) -> "FitImages":
         """The same of frames that are laid otherwise, or of some of them."""
-        parts = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
-        moved: dict[str, Any] = {
-            name: change(part)
-            for name, part in parts.items()
-            if isinstance(part, np.ndarray)
+        fields = dataclasses.fields(self)
+        values = {field.name: getattr(self, field.name) for field in fields}
+        changed: dict[str, Any] = {
+            name: change(value)
+            for name, value in values.items()
+            if isinstance(value, np.ndarray)
         }
-        return dataclasses.replace(self, **moved)
+        return dataclasses.replace(self, **changed)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -118,15 +116,15 @@ class GaussianPrior:
 
 @dataclass(frozen=True, slots=True)
 class SolverSettings:
-    """When to stop, and how far an outlier is (sigma).
+    """When a fit stops, how it treats outliers, and when it renews the Jacobian.
 
-    secant: between exact Jacobians the last one is brought up to date by the images
-    that each step gave (Broyden 1965);
-        steps that look final, and those that fail, are checked with an exact one.
-    near: sigma that an exact Jacobian still holds for: shorter steps go on with it.
+    huber: sigma beyond which a residual counts linearly.
+    secant: update the Jacobian by the images of each step (Broyden 1965); steps that
+    look final, and those that fail, are checked with an exact one.
+    near: length of steps, sigma, over which an exact Jacobian is reused.
+    miss: relative error of the predicted change of the images above which the Jacobian
+    is computed anew.
     finish: the Jacobian at the end is exact, or was so within ``near``.
-    miss: share of what a step changes by which images may miss their prediction before
-    the Jacobian is made anew.
     """
 
     iterations: int = 40
@@ -217,16 +215,20 @@ def fit_levenberg_marquardt(
     settings: SolverSettings | None = None,
     slopes: Array | None = None,
 ) -> FitSolution:
-    """Levenberg-Marquardt from one start, with the Jacobian there or with ``slopes``
-    (p, n, y, x) from places close by.
+    """Maximum posterior of the parameters by Levenberg-Marquardt from one start.
 
-    Stops when a full step moves every combination of parameters by less than
-    ``step_tolerance`` sigma.
+    Steps solve (C + damping diag C) s = -g with curvature C and gradient g of the
+    weighted residuals and the prior. The fit stops when a full step moves every
+    combination of parameters by less than ``step_tolerance`` sigma.
 
     Args:
+        model: (parameters, with Jacobian) -> (images, Jacobian or None).
         data: frames, masks and noise.
+        start: (p,) parameters.
         prior: prior knowledge of the fitted parameters.
         settings: when to stop.
+        slopes: (p, n, y, x) Jacobian of a place close by, to begin with; computed
+            without it.
 
     Raises:
         FitError: the model is not finite at the start, or no pixel is usable.
@@ -248,8 +250,10 @@ def fit_levenberg_marquardt(
         )
         moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
         done = not accepted or moved < settings.step_tolerance * (1 + damping)
+        # the Jacobian is exact, or was computed close enough
         fresh = state.travel <= settings.near if accepted else state.travel == 0
         if not fresh and (done or moved < settings.near):
+            # what looks final is checked with an exact Jacobian
             x = state.x + step if accepted else state.x
             state = _linearise(model, data, x, prior, settings)
             damping = 1e-3
@@ -307,6 +311,11 @@ def _linearise(
     settings: SolverSettings,
     slopes: Array | None = None,
 ) -> _State:
+    """The problem at (p,) ``x``, with an exact Jacobian or with ``slopes``.
+
+    Raises:
+        FitError: the images are not finite.
+    """
     image, jacobian = model(x, slopes is None)
     jacobian = jacobian if slopes is None else slopes
     if jacobian is None or not np.isfinite(image).all():
@@ -323,8 +332,9 @@ def _linearise(
 
 
 def _missed(state: _State, step: Array, image: Array) -> float:
-    """Share of the change by a step, each in sigma of the pixels, that the Jacobian did
-    not foresee.
+    """Relative error of the Jacobian's prediction of a step, in sigma of the pixels.
+
+    |dI - J s| / |dI| for the change dI of the images by the step s.
     """
     root = np.sqrt(state.weight) / state.noise
     change = (image - state.image) * root
@@ -342,23 +352,19 @@ def _secant(
     *,
     moved: float,
 ) -> _State:
-    """The problem after a step, with the least change of the Jacobian that explains how
-    the images changed.
+    """The problem after a step, with the Jacobian updated by the images (Broyden).
 
-    J + (dI - J s) sᵀC / (sᵀC s), where C, the curvature, is the natural measure of a
-    step. After one of less than
-    ``_TELLING`` sigma the Jacobian stays: how images are rounded (float32), over so
-    short a way, would be taken for
-    slopes, and all that a fit ends in, covariance and a quick model put right by its
-    slopes, with it.
+    J + (dI - J s) sᵀC / (sᵀC s), with the curvature C as the metric: the least change
+    that explains dI. After a step of less than ``_TELLING`` sigma the Jacobian stays:
+    rounding of the images (float32) over so short a step would be mistaken for slopes.
+    Covariance and corrected fast models depend on these.
     """
     jacobian = state.jacobian
     if moved >= _TELLING:
         measure = state.curvature @ step
         missed = (image - state.image) - np.tensordot(step, jacobian, 1)
-        jacobian = jacobian + np.multiply.outer(
-            measure / max(float(step @ measure), 1e-300), missed
-        )
+        share = measure / max(float(step @ measure), 1e-300)
+        jacobian = jacobian + np.multiply.outer(share, missed)
     return _state(
         data,
         (state.x + step, image, jacobian),
@@ -376,6 +382,12 @@ def _state(
     *,
     travel: float = 0.0,
 ) -> _State:
+    """Gradient, curvature and weights of the problem at a point.
+
+    Args:
+        at: (parameters, image, Jacobian).
+        travel: sigma from the point where the Jacobian was computed.
+    """
     x, image, jacobian = at
     noise, residual, weight = pixel_weights(data, image, settings.huber)
     root = np.sqrt(weight)
@@ -406,12 +418,15 @@ def _step(
     settings: SolverSettings,
     damping: float,
 ) -> tuple[Array, Array, float, bool]:
-    """A step that lowers the misfit at the weights of ``state``: (step, image there,
-    next damping, found).
+    """A step that lowers the misfit: (step, image there, next damping, accepted).
+
+    Damping grows by 6 until -2 ln posterior does not rise; parameters blocked by a
+    bound stay. Two attempts with an approximate Jacobian, ten with an exact one.
     """
     before = _merit(data, state.image, state.x, prior, settings.huber)
     size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
     scaled = state.curvature / np.outer(size, size)
+    # at a bound, with the gradient beyond it
     blocked = ((state.x <= prior.low) & (state.gradient > 0)) | (
         (state.x >= prior.high) & (state.gradient < 0)
     )
@@ -420,10 +435,8 @@ def _step(
     for _ in range(10 if state.travel == 0 else 2):
         matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
         step = np.zeros_like(state.x)
-        step[free] = (
-            -np.linalg.lstsq(matrix, state.gradient[free] / size[free], rcond=1e-14)[0]
-            / size[free]
-        )
+        gradient = state.gradient[free] / size[free]
+        step[free] = -np.linalg.lstsq(matrix, gradient, rcond=1e-14)[0] / size[free]
         step = np.clip(state.x + step, prior.low, prior.high) - state.x
         image, _ = model(state.x + step, False)
         if np.isfinite(image).all():
@@ -450,7 +463,9 @@ def pixel_weights(
     """Noise, residual over the noise, and robust weight of every pixel, (n, y, x) each.
 
     Args:
-        data: what is fitted. image: (n, y, x) model. huber: sigma of an outlier.
+        data: what is fitted.
+        image: (n, y, x) model.
+        huber: sigma of an outlier.
 
     Returns:
         (noise in electrons, (data - model) / noise with saturated pixels only as far as
@@ -472,6 +487,11 @@ def _solution(
     settings: SolverSettings,
     ended: tuple[bool, str, int],
 ) -> FitSolution:
+    """The solution at the end of a fit: covariance, reduced chi-square.
+
+    Args:
+        ended: (converged, reason, iterations).
+    """
     counted = data.usable & ~data.saturated
     shown = state.residual * data.usable
     inlier = counted & (np.abs(state.residual) <= settings.huber)

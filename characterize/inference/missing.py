@@ -18,18 +18,14 @@ from characterize.inference.multistart import SearchTask
 from characterize.model import PLACE, background_planes
 from metalens.core.arrays import Array
 
-# of one cause to be spoken of where there is none: one fit in 350 with the 28 of a
-# small lens
+# significance of one cause: with 28 causes one fit in 350 reports an absent one
 CHANCE = 1e-4
-# for a cause of plausible size from which on it is fitted: by chance in one fit of 100
-# or fewer
+# Bayes factor above which a cause is fitted: by chance in one fit of 100 or fewer
 ODDS = 10.0
-_SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
-_SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
-_PATCHY, _SPOT = (
-    3.0,
-    0.2,
-)  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
+_SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it is detected
+_SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost: number and range
+# sigma of chi-square above which dark spots are tested; their spacing over the radius
+_PATCHY, _SPOT = 3.0, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +44,7 @@ def decisive_findings(
     Args:
         found: what residuals hold.
     """
-    return [one.words for one in found if one.sigma > sigma]
+    return [finding.words for finding in found if finding.sigma > sigma]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +86,20 @@ class ScoreTests:
     of_mask: frozenset[str] = frozenset()
 
     def shifts(self) -> "UnmodelledShifts":
-        """What the causes may have done to the parameters; see
-        :meth:`FitAtMode.amounts`.
+        """Shifts of the parameters that unfitted causes may have caused.
+
+        A cause has factors c of its changes, N(0, 1) or their posterior
+        (:meth:`FitAtMode.amounts`) where the change is well known. The parameters shift
+        by M c; summed are second moments over causes.
         """
-        names, p = tuple(self.unstated), len(self.fit.names)
+        names = tuple(self.unstated)
+        p = len(self.fit.names)
         if not names:
             return UnmodelledShifts.none(p)
         every = np.concatenate([self.unstated[name] for name in names])
-        moved, open_ = self.fit.moved_by(every), np.eye(len(every))
+        moved = self.fit.moved_by(every)
+        # posterior of the factors: covariance and mean, that of the prior at first
+        covariance = np.eye(len(every))
         amount = np.zeros(len(every))
         exact = np.concatenate(
             [
@@ -107,13 +109,14 @@ class ScoreTests:
         )
         if exact.any():
             part, pull = self.fit.amounts(every[exact])
-            open_[np.ix_(exact, exact)], amount[exact] = part, part @ pull
-        second = open_ + np.outer(amount, amount)
+            covariance[np.ix_(exact, exact)] = part
+            amount[exact] = part @ pull
+        second = covariance + np.outer(amount, amount)  # second moment
         first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
         own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
         by_cause = [
-            np.einsum("pi,ij,pj->p", moved[:, some], second[some, some], moved[:, some])
-            for some in own
+            np.einsum("pi,ij,pj->p", moved[:, part], second[part, part], moved[:, part])
+            for part in own
         ]
         off = np.concatenate(
             [
@@ -122,7 +125,7 @@ class ScoreTests:
             ]
         )
         bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
-        spread = np.einsum("pi,ij,pj->p", moved, open_, moved)
+        spread = np.einsum("pi,ij,pj->p", moved, covariance, moved)
         return UnmodelledShifts(
             names,
             np.sqrt(np.maximum(by_cause, 0)),
@@ -165,20 +168,29 @@ class UnmodelledShifts:
 
 
 def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
-    """Look for every cause that is not fitted, by the image and the slopes that a fit
-    ended with.
+    """Score tests of every cause that is not fitted, at the end of a fit.
+
+    Each cause changes the images by G; tested is whether the residuals lean along the
+    part of G that the fit does not take up. Image and slopes are those of the fit.
+    Where chi-square exceeds 1, noise is scaled by its root.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         mode: the fit it is judged at.
+
+    Returns:
+        Tests, least probable by chance first, with causes of assumed size.
     """
-    x, image, slopes = task.all_of(mode.value), mode.image, mode.slopes
+    x = task.all_of(mode.value)
+    image = mode.image
+    slopes = mode.slopes
+    # 1 / sigma of every pixel, 0 where it is not counted
     root = np.where(
         task.data.usable & ~task.data.saturated,
         1 / np.sqrt(task.data.variance(image)),
         0.0,
     )
-    rest = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
+    residual = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
     fitted = (slopes * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
@@ -188,53 +200,55 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
         task.names,
         fitted,
         known,
-        rest / over,
+        residual / over,
         task.data.shared(image) * root,
         pull / over,
     )
-    found, unstated = [], {}
+    tests = []
+    unstated = {}
     roughly: set[str] = set()
     of_mask: set[str] = set()
-    for one in causes.systematic_changes(
-        task, x, dict(zip(task.names, slopes, strict=True))
-    ):
-        change = (one.images * root).reshape(len(one.images), -1)
-        if np.any(one.sigma):
-            unstated[one.cause] = np.reshape(one.sigma, (-1, 1)) * change
-            roughly |= {one.cause} if one.roughly else set()
-            of_mask |= {one.cause} if one.of_mask else set()
-        if one.sought:
-            taken = (
-                fit.taken(change[0], one.amount, one.amount_text)
-                if one.amount_text
-                else ""
-            )
-            odds = (
-                fit.odds(unstated[one.cause])
-                if one.cause in unstated and one.frees and not one.stated
-                else 0.0
-            )
-            lean = fit.lean(one.cause, change)
-            found.append(
-                dataclasses.replace(
-                    lean, taken=taken, frees=one.frees, odds=odds, stated=one.stated
-                )
-            )
-    found.append(_ghost(task, x, image, root, fit))
-    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(
-        2 / max(float((root > 0).sum()), 1.0)
-    ):
-        found.append(_patch(task, x, root, fit))
+    by_name = dict(zip(task.names, slopes, strict=True))
+    for effect in causes.systematic_changes(task, x, by_name):
+        cause = effect.cause
+        change = (effect.images * root).reshape(len(effect.images), -1)
+        if np.any(effect.sigma):
+            unstated[cause] = np.reshape(effect.sigma, (-1, 1)) * change
+            if effect.roughly:
+                roughly.add(cause)
+            if effect.of_mask:
+                of_mask.add(cause)
+        if not effect.sought:
+            continue
+        taken = ""
+        if effect.amount_text:
+            taken = fit.taken(change[0], effect.amount, effect.amount_text)
+        odds = 0.0
+        if cause in unstated and effect.frees and not effect.stated:
+            odds = fit.odds(unstated[cause])
+        test = dataclasses.replace(
+            fit.lean(cause, change),
+            taken=taken,
+            frees=effect.frees,
+            odds=odds,
+            stated=effect.stated,
+        )
+        tests.append(test)
+    tests.append(_ghost(task, x, image, root, fit))
+    pixels = max(float((root > 0).sum()), 1.0)
+    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / pixels):
+        tests.append(_patch(task, x, root, fit))
     named = sorted(
-        (one for one in found if one.degrees or one.taken),
-        key=lambda one: (one.chance, -one.chi2),
+        (test for test in tests if test.degrees or test.taken),
+        key=lambda test: (test.chance, -test.chi2),
     )
     return ScoreTests(named, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
 def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
-    """Shifts that a fit of frames to come will allow for: at the task's start, of frames
-    that are as expected there.
+    """Shifts by unfitted causes to be expected of frames not taken yet.
+
+    At the task's start, with residuals of 0.
     """
     image, slopes = task.model.images(task.start, task.names)
     p = len(task.names)
@@ -260,40 +274,41 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
 def to_fit(
     found: list[ScoreTest], *, stuck: bool = False, most: int = 5
 ) -> list[ScoreTest]:
-    """Causes that free parameters describe and that may explain the frames, likeliest
-    first; with those that are stated otherwise without an error.
+    """Causes to fit next: those that have parameters and may explain the frames.
 
-    Those that the residuals lean to beyond chance; else those that are likelier there
-    than not.
+    Those that the residuals lean to beyond chance; else those whose odds exceed
+    ``ODDS``, likeliest first. At most ``most``.
 
     Args:
         found: score tests.
-        stuck: a parameter ran to its bound, so that any cause may stand behind it.
+        stuck: a parameter ran to its bound: any unstated cause may be behind it.
         most: causes that are fitted in turn to see which explains most.
     """
-    some = [one for one in found if one.frees]
-    clear = [one for one in some if one.chance < CHANCE]
-    likely = sorted((one for one in some if one.odds > ODDS), key=lambda one: -one.odds)
+    free = [test for test in found if test.frees]
+    clear = [test for test in free if test.chance < CHANCE]
+    likely = sorted(
+        (test for test in free if test.odds > ODDS), key=lambda test: -test.odds
+    )
     if stuck:
-        clear = [one for one in some if not one.stated]
+        clear = [test for test in free if not test.stated]
     return (clear or likely)[:most]
 
 
 def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
-    """The cause that the residuals lean to most, with those that are as likely.
+    """Sentence on the cause that the residuals lean to most, with the next three.
 
-    Nothing where all is chance. Its significance is that of a normal variable which is
-    as improbable.
+    Empty where all is chance. Significance in sigma of a normal variable of equal
+    probability.
 
     Args:
         found: score tests, the most telling first.
     """
-    clear = [one for one in found if one.chance < CHANCE]
+    clear = [test for test in found if test.chance < CHANCE]
     if not clear:
         return []
     first = clear[0]
-    alike = [one.cause for one in clear[1:4]]
-    more = f"; {', '.join(alike)} would explain much of it too" if alike else ""
+    others = [test.cause for test in clear[1:4]]
+    more = f"; {', '.join(others)} would explain much of it too" if others else ""
     cure = "state it, free it, or mend the bench"
     if first.cause == causes.LAMP:
         cure = (
@@ -311,24 +326,23 @@ def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
 
 
 def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
-    """Whether windows of single field angles lie off, in words: what they explain is
-    half of what any cause does.
+    """Sentence on misplaced windows at single field angles, if they explain most.
 
-    The fit then bends the lens, or turns the frames, until the spots of all angles lie
-    where their windows are.
+    They must explain half of what any cause does. The fit would otherwise bend the
+    lens, or turn the frames, until the spots of all angles fit their windows.
 
     Args:
         found: score tests.
     """
-    most = max((one.chi2 - one.degrees for one in found), default=0.0)
+    most = max((test.chi2 - test.degrees for test in found), default=0.0)
     return [
-        f"{one.cause} explains what is left (chi-square {one.chi2:.0f} with {one.degrees} degrees): one decentre is "
+        f"{test.cause} explains what is left (chi-square {test.chi2:.0f} with {test.degrees} degrees): one decentre is "
         "fitted for all angles; cut the frames of every angle about its chief ray, distance times tan(angle) off that "
         "on the axis, or fit the angles one by one"
-        for one in found
-        if one.cause == causes.WINDOWS
-        and one.chance < CHANCE
-        and one.chi2 - one.degrees >= most / 2
+        for test in found
+        if test.cause == causes.WINDOWS
+        and test.chance < CHANCE
+        and test.chi2 - test.degrees >= most / 2
     ]
 
 
@@ -339,7 +353,7 @@ def undetectable_effects(found: list[ScoreTest]) -> list[str]:
     Args:
         found: score tests.
     """
-    return [f"{one.cause} is not fitted: {one.taken}" for one in found if one.taken]
+    return [f"{test.cause} is not fitted: {test.taken}" for test in found if test.taken]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -360,8 +374,10 @@ class FitAtMode:
     pull: Array
 
     def lean(self, cause: str, changes: Array) -> ScoreTest:
-        """Score test of (k, pixels) changes; directions of which the fit takes up all
-        but a thousandth are left out.
+        """Score test of a cause by its changes G (k, pixels).
+
+        Score s = G'ᵀr of the part G' that the fit does not take up; chi-square sᵀS⁻¹s
+        with S its scatter. Directions taken up to all but a thousandth are left out.
         """
         size = np.sqrt((changes**2).sum(1))
         changes = changes[size > 0] / size[size > 0, None]
@@ -378,11 +394,10 @@ class FitAtMode:
         return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
     def left(self, changes: Array) -> tuple[Array, Array]:
-        """(k, pixels) what the fit does not take up of changes G, and (k,) their scores
-        Gᵀr.
+        """(k, pixels) changes less what the fit takes up, and their (k,) scores.
 
-        As G'ᵀr + Mᵀ pull, which is the same at the mode and feels no small step that
-        the fit is off it.
+        G' = G - M J of changes G, with shifts M and slopes J. The score is G'ᵀr + Mᵀ
+        pull, which equals Gᵀr at the mode and does not change to first order off it.
         """
         moved = self.moved_by(changes).T
         left = changes - moved @ self.slopes
@@ -393,18 +408,18 @@ class FitAtMode:
         return np.asarray(np.linalg.solve(self.known, self.slopes @ changes.T))
 
     def odds(self, changes: Array) -> float:
-        """For (k, pixels) changes of one standard deviation each, in some amount,
-        against their absence (Bayes factor).
+        """Bayes factor of a cause against its absence, at most exp(100).
 
-        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to
-        exp(tᵀC t / 2) (det C)^½.
+        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹, integration over its factors c,
+        N(0, 1), gives exp(tᵀC t / 2) (det C)^½.
+
+        Args:
+            changes: (k, pixels) of one standard deviation each.
         """
-        open_, weighted = self.amounts(changes)
-        size = (
-            float(weighted @ open_ @ weighted) / 2
-            + float(np.linalg.slogdet(open_)[1]) / 2
-        )
-        return math.exp(min(size, 100.0))
+        covariance, weighted = self.amounts(changes)
+        explained = float(weighted @ covariance @ weighted) / 2
+        log_odds = explained + float(np.linalg.slogdet(covariance)[1]) / 2
+        return math.exp(min(log_odds, 100.0))
 
     def amounts(self, changes: Array) -> tuple[Array, Array]:
         """Posterior of the factors c of (k, pixels) changes G of one standard deviation
@@ -413,37 +428,42 @@ class FitAtMode:
         With H = GᵀG' and S the scatter of their scores s, C = (1 + H S⁻¹ H)⁻¹.
         """
         left, score = self.left(changes)
-        seen = changes @ left.T
-        scatter = seen + self.in_common(left)
+        effect = changes @ left.T
+        scatter = effect + self.in_common(left)
         scatter += max(1e-9 * float(np.trace(scatter)), 1e-300) * np.eye(len(scatter))
-        weight = np.linalg.solve(scatter, seen)
-        return np.linalg.inv(np.eye(len(seen)) + seen @ weight), weight.T @ score
+        weight = np.linalg.solve(scatter, effect)
+        return np.linalg.inv(np.eye(len(effect)) + effect @ weight), weight.T @ score
 
     def in_common(self, left: Array) -> Array:
-        """(k, k) by which scores scatter more since errors of dark and flat are one in
-        all frames.
+        """(k, k) additional scatter of scores by errors that all frames share.
+
+        Errors of dark and of flat; less what of the dark is in the noise already.
+
+        Args:
+            left: (k, pixels) changes that the fit does not take up.
         """
         shape = self.shared.shape[1:]
         dark, flat = (
-            (left.reshape(-1, *shape) * one).sum(1).reshape(len(left), -1)
-            for one in self.shared
+            (left.reshape(-1, *shape) * error).sum(1).reshape(len(left), -1)
+            for error in self.shared
         )
         counted = left * self.shared[0].ravel()
         return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
     def taken(self, change: Array, amount: float, amount_text: str) -> str:
-        """What the parameters would do with a change of the images; empty where it does
-        nothing.
+        """Sentence on the parameters that would take up a change of the images.
 
-        Of ``amount``, or as much of it as would not be seen: of what they leave
-        ``_SEEN`` sigma or less. Nothing: no
-        parameter moves by one sigma. ``amount_text``: the cause's amount in words, with a
-        place for the number.
+        For ``amount`` of the cause, or as much of it as leaves ``_SEEN`` sigma in the
+        residuals, more of which would be detected. Empty where no
+        parameter moves by one sigma.
+
+        Args:
+            change: (pixels,) over the noise.
+            amount_text: the cause's amount in words, with a place for the number.
         """
         moved = np.linalg.solve(self.known, self.slopes @ change)
-        left = math.sqrt(
-            max(float(change @ change - (self.slopes @ change) @ moved), 0.0)
-        )
+        remainder = float(change @ change - (self.slopes @ change) @ moved)
+        left = math.sqrt(max(remainder, 0.0))
         share = min(1.0, _SEEN / max(left, 1e-12))
         step = share * moved / np.sqrt(np.diag(np.linalg.inv(self.known)))
         most = [i for i in np.argsort(-np.abs(step))[:3] if abs(step[i]) > 1]
@@ -451,35 +471,41 @@ class FitAtMode:
             f"{self.names[i]} {share * moved[i]:+.2g} ({abs(step[i]):.1f} sigma)"
             for i in most
         )
-        return (
-            f"{amount_text.format(share * amount)} would be taken for {parts}; state it if there is any"
-            if most
-            else ""
-        )
+        if not most:
+            return ""
+        return f"{amount_text.format(share * amount)} would be taken for {parts}; state it if there is any"
 
 
 def _strongest(
     changes: Iterable[Array], root: Array, fit: FitAtMode
 ) -> tuple[float, int, float]:
-    """(chi-square, index, chance) of the one of many (n, y, x) changes above 0 that
-    explains most; its chance is that of the best of all.
+    """The change above 0 that explains most: (chi-square, index, chance).
+
+    The chance is that of the best of all changes (Bonferroni).
+
+    Args:
+        changes: (n, y, x) each.
+        root: (n, y, x) 1 / sigma of the pixels.
     """
-    best, place, count = 0.0, 0, 0
-    for one in changes:
-        change = (one * root).reshape(1, -1)
+    best, index, count = 0.0, 0, 0
+    for image in changes:
+        change = (image * root).reshape(1, -1)
         left, score = fit.left(change)
-        seen = float((change * left).sum())
-        if seen > 1e-3 * float((change**2).sum()) and score[0] > 0:
-            chi2 = float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
-            best, place = max((best, place), (chi2, count))
+        effect = float((change * left).sum())
+        if effect > 1e-3 * float((change**2).sum()) and score[0] > 0:
+            chi2 = float(score[0]) ** 2 / (effect + float(fit.in_common(left)[0, 0]))
+            best, index = max((best, index), (chi2, count))
         count += 1
-    return best, place, min(1.0, count * float(stats.chi2.sf(best, 1)) / 2)
+    return best, index, min(1.0, count * float(stats.chi2.sf(best, 1)) / 2)
 
 
 def _ghost(
     task: SearchTask, x: Array, image: Array, root: Array, fit: FitAtMode
 ) -> ScoreTest:
-    """The shift of the light at which a fainter copy of it explains most."""
+    """Score test of a ghost: a fainter, shifted copy of the light at any shift.
+
+    Up to about ``_SHIFTS`` shifts of ``_NEAREST_PX`` to ``_FARTHEST_PX`` pixels.
+    """
     light = image - background_planes(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
     steps = range(-reach, reach + 1)
@@ -494,10 +520,10 @@ def _ghost(
 
 
 def _patch(task: SearchTask, x: Array, root: Array, fit: FitAtMode) -> ScoreTest:
-    """The place on the lens whose light, left out, explains most.
+    """Score test of a patch of the lens without light, at any place.
 
-    The light that is left out of a spot is linear in its depth, as long as it is a
-    small share of all: -2 Re(E* E_s).
+    Light missing from a small spot changes the intensity by -2 Re(E* E_s), linear in
+    its depth.
     """
     u, v = _places()
     names = [f"residual_{k}" for k in range(len(u))]

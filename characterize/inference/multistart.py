@@ -39,10 +39,8 @@ from metalens.lens import Lens
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
 _LEANING_RAD = 0.3  # of the starts that look for a twin
-_ALONG_NM, _ASIDE_UM = (
-    9.0,
-    50.0,
-)  # bias by which starts are moved along the valley; where windows begin at most
+# bias by which starts are moved along the valley; largest offset of a window
+_ALONG_NM, _ASIDE_UM = 9.0, 50.0
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
 # sigma of a prior to either side that is scanned, and of a step
@@ -128,35 +126,37 @@ def named_images(
 
 
 def correct_surrogate(task: SearchTask, at: FitSolution) -> SearchTask:
-    """The task by a quick model put right at a fit, where there is light: a third of
-    the work for an image, or less.
+    """The task with a fast model, corrected at a fit: a third of the work or less.
 
-    Few terms leave out a percent or two of the light, and of a change of the light. All
-    lenses that explain the frames
-    give images a few sigma apart: what is left out differs among them by about a tenth
-    of one (a test holds it on a
-    small lens; on 1 mm, two tenths were met where images are 20 sigma apart).
+    The difference of images and slopes to the full model at the fit is added
+    (:class:`LeftOut`). The fast model omits a percent or two of the light and of its
+    changes. Among lenses that explain the frames, whose images differ by a few sigma,
+    that omission varies by about 0.1 sigma. (A test checks this on a small lens; on
+    1 mm it was 0.2 where images differ by 20 sigma.)
+
+    Args:
+        task: model, frames and priors.
+        at: fit at which the model is corrected.
     """
-    lit = lit_part(task.model, task.data, task.all_of(at.value), at.image)
-    quick = dataclasses.replace(task, model=task.model.quick(*lit), left_out=None)
+    window = lit_part(task.model, task.data, task.all_of(at.value), at.image)
+    quick = dataclasses.replace(task, model=task.model.quick(*window), left_out=None)
     image, slopes = quick.problem()(at.value, True)
-    beside = np.ones(at.image.shape[1:], bool)
-    beside[lit] = False
+    outside = np.ones(at.image.shape[1:], bool)
+    outside[window] = False
     return dataclasses.replace(
         quick,
         left_out=LeftOut(
-            at.value, at.image - image, at.slopes - np.asarray(slopes), beside
+            at.value, at.image - image, at.slopes - np.asarray(slopes), outside
         ),
     )
 
 
 def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
-    """Of tasks that differ by how the frames lie the one that a short fit to some of
-    them makes likeliest.
+    """The likeliest of tasks that differ by the arrangement of the frames.
 
-    The first unless another is better by what a short fit may be off, and still is once
-    both go on; those within that
-    cannot be told from it.
+    By short fits to a few frames. The first is chosen unless another is better by
+    ``_PROMISING``, and still is after longer fits. Orientations within that are marked
+    as indistinguishable.
     """
     if len(tasks) == 1:
         return tasks[0]
@@ -164,59 +164,53 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     tries = [
         _short(task, few, starting_points(task, biases_nm=(0.0,)))[0] for task in tasks
     ]
-    merits = np.array([one.merit for one in tries])
+    merits = np.array([trial.merit for trial in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
             merits[k] = tasks[k].posed(few).fit(tries[k].value, _ONWARD).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
-    found = [task.found for task in tasks if task.found is not None]
-    near = [
-        one
-        for one, merit in zip(found, merits, strict=True)
-        if merit < merits[best] + _PROMISING
-    ]
+    arrangements = [task.found for task in tasks if task.found is not None]
+    chosen = arrangements[best]
+    # turns that cannot be distinguished from the chosen one
     turns = {
-        relative_orientation(found[best].orientation, o.orientation)
-        for o in near
-        if o.reordered == found[best].reordered
+        relative_orientation(chosen.orientation, other.orientation)
+        for other, merit in zip(arrangements, merits, strict=True)
+        if merit < merits[best] + _PROMISING and other.reordered == chosen.reordered
     }
-    alike = {*found[best].alike, *turns} - {0}
+    turns = {*chosen.alike, *turns} - {0}
     return dataclasses.replace(
         tasks[best],
-        found=dataclasses.replace(found[best], alike=tuple(sorted(alike)), others=()),
+        found=dataclasses.replace(chosen, alike=tuple(sorted(turns)), others=()),
     )
 
 
 def search_modes(
     task: SearchTask, *, begins: Sequence[Array] = ()
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The valleys that explain the frames, best first, the others within
-    ``MODES_WITHIN`` of it; and the task with its
-    windows held where the best has them.
+    """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
-    Short fits on a few frames from the nominal lens, the twins of its bias and leaning
-    wave fronts, or from ``begins``;
-    the best to the end, most of the way by the quick model. Then from what it found
-    with even aberrations reversed and
-    moved along its weakest valley: whatever of all these promises as much is fitted to
-    the end too.
+    1. Short fits on a few frames, from the nominal lens, other global biases and
+       astigmatic wave fronts, or from ``begins``.
+    2. The best of these to the end, mostly by the fast model.
+    3. Short fits from it with even aberrations reversed and along the valley of the
+       bias; all promising ones of both to the end.
+
+    Returns:
+        (the task with its windows fixed at the light, modes).
     """
     few = few_frames(task.model.setting)
     plain = starting_points(task)
     first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
     task = hold_windows(task, first[0].value)
-    near = _nearer(task, first[0].value)
-    best = _long(task, near.value, near.slopes)
-    tries = sorted(
-        [*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit
-    )
+    nearer = _nearer(task, first[0].value)
+    best = _long(task, nearer.value, nearer.slopes)
+    twins = _short(task, few, _twins(task, best))
+    tries = sorted([*first[1:], *twins], key=lambda t: t.merit)
     floor = min(tries[0].merit, first[0].merit)
     promising = [t.value for t in tries if t.merit < floor + _PROMISING]
-    about = correct_surrogate(task, best)
-    return task, add_mirrored_starts(
-        about,
-        distinct_modes([best, *follow_starts(about, best, promising[: 2 * _MOST])]),
-    )
+    fast = correct_surrogate(task, best)
+    others = follow_starts(fast, best, promising[: 2 * _MOST])
+    return task, add_mirrored_starts(fast, distinct_modes([best, *others]))
 
 
 def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
@@ -243,17 +237,19 @@ def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSo
 def scan_parameter(
     task: SearchTask, modes: Sequence[FitSolution], i: int
 ) -> list[FitSolution]:
-    """The modes with those that a scan of parameter number ``i`` leads to, best first.
+    """The modes, with those that a scan of parameter ``i`` leads to, best first.
 
-    It is held at places across its prior with all others fitted to a few frames, from
-    the best mode outwards; minima on the way are followed with all free, on all frames.
+    The parameter is held at places across its prior with all others fitted to a few
+    frames, from the best mode outwards. Minima are then fitted with all free, on all
+    frames.
 
     Args:
         task: model, frames, priors and arrangement of the search.
+        modes: fits so far, best first.
     """
-    kept = list(modes)
+    modes_so_far = list(modes)
     for _ in range(_AGAIN):
-        best, few = kept[0], few_frames(task.model.setting)
+        best, few = modes_so_far[0], few_frames(task.model.setting)
         problem = task.posed(few)
         here = dataclasses.replace(
             best,
@@ -264,30 +260,38 @@ def scan_parameter(
         scan = functools.partial(_scan_side, problem, here, i)
         sides = threads.run_each(scan, (-1, 1))
         stops = [*sides[0][::-1], here, *sides[1]]
-        wall = np.array([math.inf, *(one.merit for one in stops), math.inf])
+        wall = np.array([math.inf, *(stop.merit for stop in stops), math.inf])
         low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
         begins = [stops[k].value for k in low[np.argsort(wall[1:-1][low])]]
         begins = [x for x in begins if x[i] != best.value[i]][:_MINIMA]
-        kept = distinct_modes([*kept, *follow_starts(task, best, begins)])
-        if kept[0].merit > best.merit - 1:
+        modes_so_far = distinct_modes(
+            [*modes_so_far, *follow_starts(task, best, begins)]
+        )
+        if modes_so_far[0].merit > best.merit - 1:
             break
-    return kept
+    return modes_so_far
 
 
 def _scan_side(
     problem: FitProblem, mode: FitSolution, i: int, sign: int
 ) -> list[FitSolution]:
-    """Fits with one parameter held at places from the mode to one end of its prior."""
-    prior, own = problem.prior, math.sqrt(float(mode.covariance[i, i]))
-    wide, middle = float(prior.sigma[i]), float(prior.mean[i])
-    if not math.isfinite(wide):
-        wide, middle = 3 * own, float(mode.value[i])
-    end = float(np.clip(middle + sign * _REACH * wide, prior.low[i], prior.high[i]))
-    count = max(math.ceil(sign * (end - float(mode.value[i])) / (_STEP * wide)), 0)
-    out, here = list[FitSolution](), mode
-    for goal in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
-        way = here.covariance[:, i] / here.covariance[i, i] * (goal - here.value[i])
-        here = problem.held(i, goal).fit(here.value + way, _SCANNED, here.slopes)
+    """Fits with parameter ``i`` held at steps from the mode to one end of its prior.
+
+    Args:
+        sign: side, -1 or 1.
+    """
+    prior = problem.prior
+    own = math.sqrt(float(mode.covariance[i, i]))
+    sigma, middle = float(prior.sigma[i]), float(prior.mean[i])
+    if not math.isfinite(sigma):
+        sigma, middle = 3 * own, float(mode.value[i])
+    end = float(np.clip(middle + sign * _REACH * sigma, prior.low[i], prior.high[i]))
+    count = max(math.ceil(sign * (end - float(mode.value[i])) / (_STEP * sigma)), 0)
+    out = list[FitSolution]()
+    here = mode
+    for target in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
+        way = here.covariance[:, i] / here.covariance[i, i] * (target - here.value[i])
+        here = problem.held(i, target).fit(here.value + way, _SCANNED, here.slopes)
         out.append(here)
     return out
 
@@ -295,13 +299,13 @@ def _scan_side(
 def follow_starts(
     task: SearchTask, best: FitSolution, begins: Sequence[Array]
 ) -> list[FitSolution]:
-    """Where some starts lead: a few steps on all frames, and to the end what promises
-    as much as the best.
+    """Modes that some starts lead to: short fits, then full ones.
 
-    At most ``_MOST`` ends, none that leads to the best itself or to another.
+    At most ``_MOST``, none equal to the best or to another.
 
     Args:
         task: model, frames, priors and arrangement of the search.
+        best: the best fit so far.
         begins: (p,) starts.
     """
     settings = SolverSettings(
@@ -313,44 +317,40 @@ def follow_starts(
             break
         if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
             continue
-        one = task.posed().fit(begin, settings)
-        if one.merit < best.merit + MODES_WITHIN + _WORTH and all(
-            _apart(one.value, e) > 2.0 for e in [best, *ends]
+        trial = task.posed().fit(begin, settings)
+        if trial.merit < best.merit + MODES_WITHIN + _WORTH and all(
+            _apart(trial.value, e) > 2.0 for e in [best, *ends]
         ):
-            ends.append(_long(task, one.value, one.slopes))
+            ends.append(_long(task, trial.value, trial.slopes))
     return ends
 
 
 def bias_reversals(task: SearchTask, best: FitSolution) -> list[Array]:
-    """Starts with the sign of some biases turned round, all other parameters going
-    along as the parabola says.
+    """(p,) starts with the sign of some biases reversed.
 
-    The whole field of the bias first, where it stands off 0 by its sigma: near focus
-    images show products of its parts
-    nearly alone, which are the same for a field of the other sign. Then each gradient
-    that does, and these together.
+    Near focus images depend almost only on products of parts of the bias field, which
+    are equal for the reversed field. First the whole field, where it differs from 0 by
+    its sigma; then each such gradient, and these together. The other parameters take
+    their conditional mean.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         best: fit that is reversed.
     """
-    value, covariance = best.value, best.covariance
+    value = best.value
+    covariance = best.covariance
     rows = usual_parameters(task.names, task.model.lens)
     whole = [i for i, row in enumerate(rows) if row.reversible]
     places = [i for i in whole if task.names[i] != "bias_nm"]
-    off = (
-        float(
-            value[whole]
-            @ leastsquares.invert_information(covariance[np.ix_(whole, whole)])
-            @ value[whole]
-        )
-        if whole
-        else 0.0
-    )
-    far = [i for i in places if abs(value[i]) > math.sqrt(covariance[i, i])]
-    turned = [whole if off > 1 else [], *([i] for i in far), far]
+    off = 0.0  # squared distance of the whole field from 0, in sigma
+    if whole:
+        inverse = leastsquares.invert_information(covariance[np.ix_(whole, whole)])
+        off = float(value[whole] @ inverse @ value[whole])
+    clear = [i for i in places if abs(value[i]) > math.sqrt(covariance[i, i])]
+    reversals = [whole if off > 1 else [], *([i] for i in clear), clear]
     out = []
-    for some in (list(one) for one in dict.fromkeys(map(tuple, turned)) if one):
+    for some in (list(key) for key in dict.fromkeys(map(tuple, reversals)) if key):
+        # conditional mean of the others where these change sign
         block = np.linalg.solve(covariance[np.ix_(some, some)], -2 * value[some])
         moved = value + covariance[:, some] @ block
         out.append(np.clip(moved, task.prior.low, task.prior.high))
@@ -368,39 +368,36 @@ def refine_fit(task: SearchTask, value: Array) -> FitSolution:
 
 
 def hold_windows(task: SearchTask, value: Array) -> SearchTask:
-    """The task with its windows held where values of the fitted parameters have them.
+    """The task with its windows fixed at the fitted decentre.
 
-    Frames begin where the light lies, up to a pixel off the decentre (a prism of the
-    bias moves light too): at NA 0.2
-    and 6000 electrons half a pixel each way moves trefoil by 0.7 sigma.
+    Windows start at the light, up to a pixel off the decentre, as a prism of the bias
+    moves light too. At NA 0.2 and 6000 electrons half a pixel shifts trefoil by 0.7
+    sigma.
 
     Args:
+        task: model, frames and priors.
         value: (p,) fitted parameters.
     """
-    model, x = task.model, task.all_of(value)
+    model = task.model
+    x = task.all_of(value)
     middle = float(x[PLACE["decentre_x_um"]]), float(x[PLACE["decentre_y_um"]])
     off = max(abs(a - b) for a, b in zip(middle, model.grid.middle_um, strict=True))
-    return (
-        task
-        if off < _HELD_PX * model.setting.pixel_um
-        else dataclasses.replace(task, model=model.about(middle))
-    )
+    if off < _HELD_PX * model.setting.pixel_um:
+        return task
+    return dataclasses.replace(task, model=model.about(middle))
 
 
 def place_windows(
     task: SearchTask, ends: list[FitSolution]
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The task with its windows held where the best end has them, and the ends followed
-    there.
-    """
-    there = hold_windows(task, ends[0].value)
-    if there is task:
+    """The task with windows fixed at the best mode, and the modes fitted again there."""
+    moved = hold_windows(task, ends[0].value)
+    if moved is task:
         return task, ends
-    best = _long(there, ends[0].value, ends[0].slopes)
-    about = correct_surrogate(there, best)
-    return there, distinct_modes(
-        [best, *(_long(about, end.value, end.slopes) for end in ends[1:])]
-    )
+    best = _long(moved, ends[0].value, ends[0].slopes)
+    fast = correct_surrogate(moved, best)
+    others = (_long(fast, end.value, end.slopes) for end in ends[1:])
+    return moved, distinct_modes([best, *others])
 
 
 def widen_search(
@@ -434,10 +431,9 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
         iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
     try:
-        found = more.posed().fit(begin, settings)
+        return more.posed().fit(begin, settings).merit
     except FitError:
         return math.inf
-    return found.merit
 
 
 def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
@@ -446,27 +442,25 @@ def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
     Args:
         ends: fits that were led to an end.
     """
-    kept: list[FitSolution] = []
-    for one in sorted(ends, key=lambda e: e.merit):
-        near = one.merit < kept[0].merit + MODES_WITHIN if kept else True
-        if near and all(_apart(one.value, other) > 1.0 for other in kept):
-            kept.append(one)
-    return kept
+    modes: list[FitSolution] = []
+    for end in sorted(ends, key=lambda e: e.merit):
+        likely = end.merit < modes[0].merit + MODES_WITHIN if modes else True
+        if likely and all(_apart(end.value, mode) > 1.0 for mode in modes):
+            modes.append(end)
+    return modes
 
 
 def _apart(value: Array, end: FitSolution) -> float:
     """Distance in sigma of the end's own parabola."""
     step = value - end.value
-    return float(
-        math.sqrt(
-            max(step @ leastsquares.invert_information(end.covariance) @ step, 0.0)
-        )
-    )
+    square = step @ leastsquares.invert_information(end.covariance) @ step
+    return float(math.sqrt(max(square, 0.0)))
 
 
 def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSolution]:
-    """Short fits on few frames from several starts, best first; wave-front errors by a
-    prior that keeps them near 0.
+    """Short fits on few frames from several starts, best first.
+
+    The prior keeps wave-front errors near 0.
     """
     place = [PLACE[name] for name in task.names]
     problem = task.posed(few)
@@ -474,18 +468,17 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
     sigma = np.where(
         waves, np.minimum(problem.prior.sigma, WAVES_RAD / 2), problem.prior.sigma
     )
-    problem = dataclasses.replace(
-        problem, prior=dataclasses.replace(problem.prior, sigma=sigma)
-    )
+    prior = dataclasses.replace(problem.prior, sigma=sigma)
+    problem = dataclasses.replace(problem, prior=prior)
     short = SolverSettings(
         iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False
     )
 
-    def one(begin: Array) -> FitSolution:
+    def fit_from(begin: Array) -> FitSolution:
         opened = with_values(begin, _opened(task, begin))
         return problem.fit(opened[place], short)
 
-    return sorted(threads.run_each(one, begins), key=lambda t: t.merit)
+    return sorted(threads.run_each(fit_from, begins), key=lambda t: t.merit)
 
 
 def _long(task: SearchTask, value: Array, slopes: Array | None = None) -> FitSolution:
@@ -498,11 +491,11 @@ def _nearer(task: SearchTask, value: Array) -> FitSolution:
     """Near the lowest place on all frames, by a quick model put right where a short fit
     ended.
     """
-    at = task.posed().fit(value, SolverSettings(iterations=0))
+    end = task.posed().fit(value, SolverSettings(iterations=0))
     settings = SolverSettings(
         iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
-    return correct_surrogate(task, at).posed().fit(at.value, settings, at.slopes)
+    return correct_surrogate(task, end).posed().fit(end.value, settings, end.slopes)
 
 
 def _opened(task: SearchTask, x: Array) -> dict[str, float]:
@@ -516,28 +509,31 @@ def _opened(task: SearchTask, x: Array) -> dict[str, float]:
 
 
 def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ...]:
-    """What is fitted: the usual, what is asked for, what is known with an error.
+    """Names of the fitted parameters: usual, freed, or stated with an error.
+
+    Without those stated exactly that are not freed.
 
     Args:
+        known: stated values by name.
         free: names of further parameters.
     """
     for name in free:
         parameter_vector({name: 0.0})
-    wanted = {p.name for p in PARAMETERS if p.free} | set(free)
-    wanted |= {k.name for k in known.values() if k.sigma > 0}
-    wanted -= {k.name for k in known.values() if k.sigma == 0 and k.name not in free}
-    return tuple(name for name in NAMES if name in wanted)
+    fitted = {p.name for p in PARAMETERS if p.free} | set(free)
+    fitted |= {k.name for k in known.values() if k.sigma > 0}
+    fitted -= {k.name for k in known.values() if k.sigma == 0 and k.name not in free}
+    return tuple(name for name in NAMES if name in fitted)
 
 
 def prior_of(
     names: Sequence[str], known: dict[str, KnownValue], lens: Lens
 ) -> GaussianPrior:
-    """Priors of the fitted parameters: metrology where there is, else what is usual for
-    such a lens.
+    """Priors of the fitted parameters: as stated, else usual for such a lens.
 
     Args:
         names: (p,) names of the fitted parameters.
         known: stated values by name.
+        lens: the design.
     """
     table = usual_parameters(names, lens)
     entries = [known.get(name) for name in names]
@@ -568,8 +564,7 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
 
 
 def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, float]:
-    """(x, y) of the window's middle from the chief ray, as the light lies in the
-    frames.
+    """(x, y) of the window's middle from the chief ray, um, by the light in the frames.
 
     Args:
         found: how the frames lie.
@@ -586,37 +581,36 @@ def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, floa
 def starting_points(
     task: SearchTask, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)
 ) -> list[Array]:
-    """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain,
-    background off the frames.
+    """Starts: the nominal lens and other global biases, placed by the frames.
+
+    Stage zero, distance, decentre, background and gain are estimated from the frames.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         biases_nm: bias of each start, nm at 0.85 um.
     """
-    model, data, found = task.model, task.data, task.found
+    model = task.model
+    data = task.data
+    found = task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
     place = window_um(found, model)
     level = float(np.median((data.electrons / model.setting.glow)[data.usable]))
-    lies = {
+    values = {
         "stage_zero_um": found.stage_zero_um,
         "distance_um": found.distance_um,
         "background_e": level,
+        "decentre_x_um": place[0],
+        "decentre_y_um": place[1],
     }
-    base = with_values(
-        task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]}
-    )
+    base = with_values(task.start, values)
     out = []
     for bias in biases_nm:
-        x = with_values(
-            base,
-            {
-                "bias_nm": base[PLACE["bias_nm"]]
-                + bias * wavelength_scale(model.lens.wavelength_um)
-            },
-        )
+        bias_nm = bias * wavelength_scale(model.lens.wavelength_um)
+        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias_nm})
         light = model.images(with_values(x, {"background_e": 0.0}))[0]
         keep = data.usable & ~data.saturated
+        # least-squares brightness of the design over the frames
         gain = float(
             (light * (data.electrons - level * model.setting.glow))[keep].sum()
             / (light[keep] ** 2).sum()
@@ -640,16 +634,14 @@ def _leaning(plain: Array) -> list[Array]:
 
 
 def _twins(task: SearchTask, best: FitSolution) -> list[Array]:
-    """What was found with its even aberrations reversed, and moved along the valley of
-    the bias to either side.
-    """
-    found = task.all_of(best.value)
+    """Starts from the best with even aberrations reversed, and moved along the bias."""
+    x = task.all_of(best.value)
     even = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-    out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]
+    out = [with_values(x, {name: -float(x[PLACE[name]]) for name in even})]
     if "bias_nm" in task.names:
         i = task.names.index("bias_nm")
-        far_nm = _ALONG_NM * wavelength_scale(task.model.lens.wavelength_um)
-        along = far_nm * best.covariance[:, i] / best.covariance[i, i]
+        step_nm = _ALONG_NM * wavelength_scale(task.model.lens.wavelength_um)
+        along = step_nm * best.covariance[:, i] / best.covariance[i, i]
         for sign in (1, -1):
             moved = np.clip(best.value + sign * along, task.prior.low, task.prior.high)
             out.append(task.all_of(moved))

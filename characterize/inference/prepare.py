@@ -39,10 +39,10 @@ _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 def merge_exposures(
     capture: Capture, frames: ElectronFrames
 ) -> tuple[Capture, ElectronFrames]:
-    """Exposures of one depth and angle as one frame each, by inverse variance.
+    """Exposures of one depth and angle merged into one frame, by inverse variance.
 
-    As they are where exposures are not known, or differ and nobody says what is counted
-    without light.
+    Unchanged where exposures are unknown, or where they differ and the dark level is
+    unknown.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -51,19 +51,19 @@ def merge_exposures(
     place = np.column_stack([capture.position_um, capture.angle_rad])
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
     exposure = np.asarray(capture.exposure_s, float)
-    known = _timed(capture) and np.isfinite(place).all()
-    if not known or len(set(group.tolist())) == len(group):
+    numbers = set(group.tolist())
+    complete = _timed(capture) and np.isfinite(place).all()
+    if not complete or len(numbers) == len(group):
         return capture, frames
-    if not _dark_known(capture) and any(
-        np.ptp(exposure[group == one]) for one in set(group.tolist())
-    ):
+    differ = any(np.ptp(exposure[group == number]) for number in numbers)
+    if differ and not _dark_known(capture):
         said = "exposures of one depth are fitted one by one: no dark frame tells what is added to all of them"
         return capture, dataclasses.replace(
             frames, corrections=(*frames.corrections, said)
         )
     merged, first = merge_brackets(frames, exposure, group)
     longest = np.array([exposure[group == group[i]].max() for i in first])
-    kept = dataclasses.replace(
+    single = dataclasses.replace(
         capture,
         frames=capture.frames[first],
         position_um=capture.position_um[first],
@@ -71,7 +71,7 @@ def merge_exposures(
         exposure_s=longest,
         names=tuple(capture.names[i] for i in first),
     )
-    return kept, merged
+    return single, merged
 
 
 def setting_of(
@@ -131,7 +131,10 @@ def _dark_known(capture: Capture) -> bool:
 
 
 def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
-    """The whole frame if small, else a square about the light's centre."""
+    """(rows, columns) of at most ``largest`` pixels about the centre of the light.
+
+    The centroid of the median frame above 0.2 of its peak.
+    """
     frames = np.asarray(capture.frames, float)
     light = np.median(frames, axis=0) - np.median(frames)
     light = np.maximum(light - 0.2 * np.percentile(light, 99.9), 0)
@@ -155,9 +158,10 @@ def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
     cut = (slice(None), *window)
     wide = frames.variance_e2, frames.scale, frames.common_floor
     floor, scale, dark = (np.broadcast_to(a, shape)[cut] for a in wide)
-    seen = frames.electrons[cut], frames.usable[cut], frames.saturated[cut]
     return FitImages(
-        *seen,
+        frames.electrons[cut],
+        frames.usable[cut],
+        frames.saturated[cut],
         floor,
         scale,
         common_floor=dark,
@@ -167,18 +171,18 @@ def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
 
 
 def correct_quantization(data: FitImages, image: Array) -> FitImages:
-    """Rounded counts as the means and variances that say the same of light near
-    ``image`` (n, y, x).
+    """Rounded counts as means and variances of equal information about ``image``.
 
-    Fisher's scoring, of a pixel: I + score / information with a variance of 1 /
-    information, so that a fit to them ends
-    where the likelihood of the counts (:mod:`characterize.captures.rounding`) is
-    greatest, once ``image`` is of it.
+    Fisher scoring in each pixel: mean I + score / information, variance 1 over the
+    information. A fit to them ends at the greatest likelihood of the counts
+    (:mod:`characterize.captures.rounding`), once ``image`` is that of the fit.
 
     Args:
         data: frames, masks and noise that are fitted.
+        image: (n, y, x) expected electrons.
     """
-    step, variance = data.count_e / data.scale, data.variance(image)
+    step = data.count_e / data.scale
+    variance = data.variance(image)
     noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
     score, information = quantization_score((data.electrons - image) / step, noise)
     floor = np.where(
@@ -198,34 +202,32 @@ def correct_quantization(data: FitImages, image: Array) -> FitImages:
 
 
 def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel:
-    """The model with the fewest terms of its fields that change the misfit by nothing
-    that counts.
+    """The model with the fewest terms of its fields that does not change the misfit.
 
-    Judged at parameters ``x``, against all terms: a rise of chi-square of ``_NOTHING``
-    over all pixels.
+    At parameters ``x`` chi-square against all terms rises by less than ``_NOTHING``.
 
     Args:
+        model: the full model.
         data: frames and their noise.
+        x: all parameters.
     """
     exact = model.images(x)[0]
     noise = np.sqrt(data.variance(exact))
     for cut in _CUTS:
         rough = model.rough(cut)
-        if (
-            float((((rough.images(x)[0] - exact) / noise)[data.usable] ** 2).sum())
-            < _NOTHING
-        ):
+        residual = ((rough.images(x)[0] - exact) / noise)[data.usable]
+        if float((residual**2).sum()) < _NOTHING:
             return rough
     return model
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LeftOut:
-    """What a quick model leaves out at (p,) ``value``: (n, y, x) of the images, (p, n,
-    y, x) of the slopes.
+    """Difference of the full to a fast model, at (p,) ``value``.
 
-    beside: (y, x) pixels that it knows nothing of; there images go straight on from
-    ``value``.
+    image: (n, y, x). slopes: (p, n, y, x).
+    beside: (y, x) pixels outside the fast model's region; there images are extrapolated
+    linearly from ``value``.
     """
 
     value: Array
@@ -234,16 +236,17 @@ class LeftOut:
     beside: Array
 
     def added(self, plain: Model, frames: Array | None) -> Model:
-        """The model with what it leaves out, of all frames or some."""
-        some = slice(None) if frames is None else frames
-        image, slopes = self.image[some], self.slopes[:, some]
+        """The fast model ``plain`` with the difference added, of all frames or some."""
+        chosen = slice(None) if frames is None else frames
+        image = self.image[chosen]
+        slopes = self.slopes[:, chosen]
         dark = slopes[:, :, self.beside]
 
         def images(value: Array, jacobian: bool) -> tuple[Array, Array | None]:
-            found, rates = plain(value, jacobian)
-            found = found + image
-            found[:, self.beside] += np.tensordot(value - self.value, dark, 1)
-            return found, None if rates is None else rates + slopes
+            frames, rates = plain(value, jacobian)
+            frames = frames + image
+            frames[:, self.beside] += np.tensordot(value - self.value, dark, 1)
+            return frames, None if rates is None else rates + slopes
 
         return images
 
@@ -270,15 +273,15 @@ def lit_part(
 
 
 def check_enough(data: FitImages, names: Sequence[str]) -> None:
-    """Refuse what cannot fix its parameters however good the frames are.
+    """Refuse frames that cannot determine the parameters, whatever their quality.
 
     Args:
         data: frames, masks and noise that are fitted.
         names: (p,) names of the fitted parameters.
 
     Raises:
-        CaptureError: one frame for more parameters than one image can tell apart, or
-            fewer pixels than parameters.
+        CaptureError: one frame for more parameters than one image can distinguish, or
+            fewer than three pixels a parameter.
     """
     lens = [
         name
@@ -300,8 +303,7 @@ def check_enough(data: FitImages, names: Sequence[str]) -> None:
 
 
 def check_depths(depth_um: Array, lens: Lens) -> None:
-    """Refuse depths that are no micrometres: a thousand times nearer or farther than
-    the lens is focused on.
+    """Refuse depths in another unit: a thousandth or a thousand times the design's.
 
     Args:
         depth_um: (n,) stated source depths, um.
@@ -309,16 +311,14 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
     Raises:
         CaptureError: with the column that would be right.
     """
-    middle, wanted = float(np.median(depth_um)), lens.source_distance_um
-    if not math.isfinite(wanted):
-        wanted = 10 * lens.sensor_distance_um
+    middle = float(np.median(depth_um))
+    focus_um = lens.source_distance_um
+    if not math.isfinite(focus_um):
+        focus_um = 10 * lens.sensor_distance_um
     for factor, column in ((1e3, "depth_mm"), (1e-3, "depth_nm")):
-        if (
-            abs(math.log10(max(middle, 1e-9) * factor / wanted)) < 0.7
-            and abs(math.log10(factor)) > 2
-        ):
+        if abs(math.log10(max(middle, 1e-9) * factor / focus_um)) < 0.7:
             raise CaptureError(
-                f"depths about {middle:g} um, the design is focused on {wanted:g} um: they look like "
+                f"depths about {middle:g} um, the design is focused on {focus_um:g} um: they look like "
                 f"{column.removeprefix('depth_')}; rename the column depth_um of stage.csv to {column}"
             )
 
@@ -332,30 +332,19 @@ def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     """
     offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
     usual_nm = usual_parameters(["wavelength_nm"], lens)[0].sigma
-    known = [
-        KnownValue(
-            "wavelength_nm",
-            offset,
-            float(capture.about.get("wavelength_sigma_nm", usual_nm)),
-        )
-    ]
-    held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
-    known += [
+    sigma_nm = float(capture.about.get("wavelength_sigma_nm", usual_nm))
+    priors = [KnownValue("wavelength_nm", offset, sigma_nm)]
+    exact = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
+    priors += [
         KnownValue(name, _number(capture, name), 0.0)
-        for name in held
+        for name in exact
         if name in capture.about
     ]
     if "pixel_sigma_um" in capture.about:
-        known.append(
-            KnownValue(
-                "pixel_percent",
-                0.0,
-                100
-                * _number(capture, "pixel_sigma_um")
-                / (capture.fill * capture.pixel_um),
-            )
-        )
-    return known
+        width_um = capture.fill * capture.pixel_um
+        percent = 100 * _number(capture, "pixel_sigma_um") / width_um
+        priors.append(KnownValue("pixel_percent", 0.0, percent))
+    return priors
 
 
 def _number(capture: Capture, name: str) -> float:
@@ -389,13 +378,13 @@ def _beyond_table(lens: Lens) -> list[str]:
         return []
     kinds = Kinds.of(lens.diameters)
     reach_um = usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3
-    near = np.zeros(len(kinds.count), bool)
+    at_ends = np.zeros(len(kinds.count), bool)
     for size, axis in (
         (kinds.width_um, lens.pairs.x_um),
         (kinds.length_um, lens.pairs.y_um),
     ):
-        near |= (size < axis[0] + reach_um) | (size > axis[-1] - reach_um)
-    share = float(kinds.count[near].sum() / kinds.count.sum())
+        at_ends |= (size < axis[0] + reach_um) | (size > axis[-1] - reach_um)
+    share = float(kinds.count[at_ends].sum() / kinds.count.sum())
     if share < _FEW_BEYOND:
         return []
     return [

@@ -31,9 +31,9 @@ from metalens.core.arrays import Array
 REACH = 1.959964  # sigma of a 95 % interval
 DRAWS = 96
 _PARABOLIC = 0.85, 1.18  # end of an interval over that of the parabola
-_SIDE = 4  # places of a profile on each side of the mode
-_CLOSE = 0.05  # share of the goal within which a place of a profile is its end
-_LOWER = 0.5  # of -2 ln posterior below the mode at which a better mode is followed
+_SIDE = 4  # most places of a profile on each side of the mode
+_CLOSE = 0.05  # relative error of the goal at which a place is the profile's end
+_LOWER = 0.5  # fall of -2 ln posterior below the mode that counts as a better mode
 _RESTARTS = 2
 _OF_THE_BENCH = ("log_gain", "background")
 _HELD = SolverSettings(
@@ -45,10 +45,10 @@ _HELD = SolverSettings(
 class ProfileLikelihood:
     """Profile likelihood of one parameter about a mode.
 
-    low, high: 95 % interval. value, rise: (k,) the parameter, and by how much -2 ln
-    posterior has risen with all others fitted. parabolic: whether the ends are those of
-    the parabola. found: whether the low and the high end were reached. stops: fits with
-    the parameter held.
+    low, high: 95 % interval. value, rise: (k,) the parameter, and the rise of -2 ln
+    posterior there with all others fitted. parabolic: whether the ends are those of the
+    parabola. found: whether the low and the high end were reached. stops: the fits with
+    the parameter fixed.
     """
 
     low: float
@@ -87,12 +87,18 @@ class FitPosterior:
 
 
 def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPosterior:
-    """Intervals, profiles, covariance and draws about the modes ``ends`` (best first)
-    of ``task``; a place below a mode that a profile meets is followed first.
+    """Intervals, profiles, covariance and draws about the modes of a fit.
 
-    They hold the errors of dark and flat too, which all frames have in common.
+    Where a profile falls below the best mode, its lowest place is fitted and the
+    profiles are repeated. Errors of dark and flat, which all frames share, are
+    included.
+
+    Args:
+        task: model, frames and priors.
+        ends: the modes, best first.
     """
-    task, modes = correct_surrogate(task, ends[0]), list(ends)
+    task = correct_surrogate(task, ends[0])
+    modes = list(ends)
     if "bias_nm" in task.names:
         modes = scan_parameter(task, modes, task.names.index("bias_nm"))
     if modes[0] is not ends[0]:
@@ -101,16 +107,16 @@ def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPoste
     named = [i for i, n in enumerate(task.names) if not n.startswith(_OF_THE_BENCH)]
     for _ in range(_RESTARTS + 1):
         spread = max(1.0, modes[0].chi2_per_dof)
-        found = profile_parameters(problem, modes[0], named, REACH**2 * spread)
+        profiles = profile_parameters(problem, modes[0], named, REACH**2 * spread)
         lowest = min(
-            (stop for one in found.values() for stop in one.stops),
+            (stop for profile in profiles.values() for stop in profile.stops),
             key=lambda stop: stop.merit,
             default=modes[0],
         )
         if lowest.merit > modes[0].merit - _LOWER:
             break
         modes = distinct_modes([*modes, refine_fit(task, lowest.value)])
-    return _joined(task, problem, modes, found)
+    return _joined(task, problem, modes, profiles)
 
 
 def profile_parameters(
@@ -124,23 +130,24 @@ def profile_parameters(
     Args:
         problem: images, frames and prior.
     """
-    at = problem.merit(mode.value)
-    here = dataclasses.replace(mode, merit=at)
-    return dict(
-        zip(
-            index,
-            threads.run_each(lambda i: _profile(problem, here, i, level), index),
-            strict=True,
-        )
-    )
+    here = dataclasses.replace(mode, merit=problem.merit(mode.value))
+    profiles = threads.run_each(lambda i: _profile(problem, here, i, level), index)
+    return dict(zip(index, profiles, strict=True))
 
 
 def _profile(
     problem: FitProblem, mode: FitSolution, i: int, level: float
 ) -> ProfileLikelihood:
+    """Profile likelihood of parameter ``i``: the parabola where it holds, else fits.
+
+    The parabola holds where -2 ln posterior at its interval's ends rises by ``level``
+    within ``_PARABOLIC``.
+    """
     sigma = math.sqrt(float(mode.covariance[i, i]))
     goal = math.sqrt(level)
-    middle, along = float(mode.value[i]), mode.covariance[:, i] / sigma
+    middle = float(mode.value[i])
+    # all parameters on the ridge of the parabola, for one sigma of this one
+    along = mode.covariance[:, i] / sigma
     low, high = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
     places = [mode.value + sign * goal * along for sign in (-1, 1)]
     inside = all(
@@ -153,72 +160,82 @@ def _profile(
             middle - goal * sigma, middle + goal * sigma, value, steps**2, True
         )
     sides = [_profile_side(problem, mode, i, sign, goal) for sign in (-1, 1)]
-    ends = [middle + sign * one[0] for sign, one in zip((-1, 1), sides, strict=True)]
-    stops = tuple(itertools.chain.from_iterable(one[2] for one in sides))
-    seen = sorted(
-        [(middle, 0.0), *((float(s.value[i]), s.merit - mode.merit) for s in stops)]
-    )
-    value, rise = np.array(seen).T
+    ends = [middle + sign * side[0] for sign, side in zip((-1, 1), sides, strict=True)]
+    stops = tuple(itertools.chain.from_iterable(side[2] for side in sides))
+    points = ((float(stop.value[i]), stop.merit - mode.merit) for stop in stops)
+    value, rise = np.array(sorted([(middle, 0.0), *points])).T
     ratio = np.abs(np.array(ends) - middle) / (goal * sigma)
     straight = bool(((ratio > _PARABOLIC[0]) & (ratio < _PARABOLIC[1])).all())
-    found = sides[0][1], sides[1][1]
-    return ProfileLikelihood(ends[0], ends[1], value, rise, straight, found, stops)
+    reached = sides[0][1], sides[1][1]
+    return ProfileLikelihood(ends[0], ends[1], value, rise, straight, reached, stops)
 
 
 def _profile_side(
     problem: FitProblem, mode: FitSolution, i: int, sign: int, goal: float
 ) -> tuple[float, bool, list[FitSolution]]:
-    """(distance of the end from the mode, whether it was reached, fits on the way).
+    """One end of a profile: where the root of the rise of -2 ln posterior is ``goal``.
 
-    The root of the rise grows evenly with the distance, so that each place is where the
-    line through the two nearest has it at ``goal``.
+    That root grows evenly with the distance, so that each place is the secant's through
+    the two nearest to ``goal``. At every place the other parameters are fitted.
+
+    Args:
+        sign: side, -1 or 1.
+
+    Returns:
+        (distance of the end from the mode, whether it was reached, fits on the way).
     """
-    prior, middle = problem.prior, float(mode.value[i])
+    prior = problem.prior
+    middle = float(mode.value[i])
     bound = abs(float((prior.high if sign > 0 else prior.low)[i]) - middle)
-    far = min(goal * math.sqrt(float(mode.covariance[i, i])), bound)
-    places, roots, stops, here = [0.0], [0.0], list[FitSolution](), mode
+    distance = min(goal * math.sqrt(float(mode.covariance[i, i])), bound)
+    # distances from the mode, roots of the rise there, and the fits
+    places, roots = [0.0], [0.0]
+    stops = list[FitSolution]()
+    here = mode
     for _ in range(_SIDE):
-        value = middle + sign * far
+        value = middle + sign * distance
         way = here.covariance[:, i] / here.covariance[i, i] * (value - here.value[i])
-        held = problem.held(i, value)
-        stop = held.fit(here.value + way, _HELD, here.slopes)
+        stop = problem.held(i, value).fit(here.value + way, _HELD, here.slopes)
         stops.append(stop)
-        places.append(far)
+        places.append(distance)
         roots.append(math.sqrt(max(stop.merit - mode.merit, 0.0)))
-        if abs(roots[-1] - goal) < _CLOSE * goal or (far >= bound and roots[-1] < goal):
+        if abs(roots[-1] - goal) < _CLOSE * goal or (
+            distance >= bound and roots[-1] < goal
+        ):
             break
+        # secant through the two places about the goal, or the last two
         order = np.argsort(places)
         place, root = (np.array(v)[order] for v in (places, roots))
         above = np.flatnonzero(root >= goal)
         k = int(above[0]) if len(above) else len(root) - 1
         slope = (root[k] - root[k - 1]) / max(place[k] - place[k - 1], 1e-300)
         step = (goal - root[k - 1]) / slope if slope > 0 else math.inf
-        far = min(float(place[k - 1] + step), 2 * max(places), bound)
-        nearest = int(np.argmin(np.abs(np.array(places) - far)))
+        distance = min(float(place[k - 1] + step), 2 * max(places), bound)
+        nearest = int(np.argmin(np.abs(np.array(places) - distance)))
         here = [mode, *stops][nearest]
     order = np.argsort(places)
     place = np.array(places)[order]
     root = np.maximum.accumulate(np.array(roots)[order])
     reached = bool(root[-1] > (1 - _CLOSE) * goal)
-    if reached:
-        k = min(int(np.searchsorted(root, goal)), len(root) - 1)
-        rising = max(float(root[k] - root[k - 1]), 1e-300)
-        share = (goal - float(root[k - 1])) / rising
-        end = float(place[k - 1] + share * (place[k] - place[k - 1]))
-        return min(end, bound), True, stops
-    return float(place[-1]), bool(place[-1] >= bound), stops
+    if not reached:
+        return float(place[-1]), bool(place[-1] >= bound), stops
+    k = min(int(np.searchsorted(root, goal)), len(root) - 1)
+    rising = max(float(root[k] - root[k - 1]), 1e-300)
+    share = (goal - float(root[k - 1])) / rising
+    end = float(place[k - 1] + share * (place[k] - place[k - 1]))
+    return min(end, bound), True, stops
 
 
 def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
-    """(p, p) covariance by what all frames of ``problem`` have in common beyond the
-    noise of each: errors of dark and flat, about ``mode``.
+    """(p, p) covariance by errors of dark and flat, which all frames share.
 
-    C AᵀW S W A C with S the covariance of the pixels by them, less what of it is in the
-    noise already.
+    C AᵀW S W A C, with C the covariance of the fit, A its Jacobian, W weights and S the
+    covariance of the pixels by these errors, less what the noise already contains.
     """
     noise, _, weight = pixel_weights(problem.data, mode.image)
     root = np.sqrt(weight) / noise
-    slopes, p = mode.slopes * root, len(mode.value)
+    slopes = mode.slopes * root
+    p = len(mode.value)
     dark, light = problem.data.shared(mode.image) * root
     flat, floor = ((slopes * c).sum(1).reshape(p, -1) for c in (light, dark))
     counted = (slopes * dark).reshape(p, -1)
@@ -227,13 +244,15 @@ def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
 
 
 def mode_probabilities(modes: Sequence[FitSolution], spread: float = 1.0) -> Array:
-    """(k,) probability of every mode by Laplace's rule: exp(-merit / 2) times the
-    volume of its covariance; ``spread``: factor of all variances.
+    """(k,) probability of every mode by Laplace's rule.
+
+    exp(-merit / 2) times the root of the determinant of its covariance, normalised.
 
     Args:
         modes: fits at the modes, best first.
+        spread: factor of all variances.
     """
-    log = np.array([_log_mass(one.merit, one.covariance, spread) for one in modes])
+    log = np.array([_log_mass(mode.merit, mode.covariance, spread) for mode in modes])
     return np.asarray(special.softmax(log))
 
 
@@ -249,26 +268,30 @@ def draw_posterior(
     spread: float = 1.0,
     seed: int = 0,
 ) -> tuple[Array, float]:
-    """((count, p) draws of the posterior, their effective sample size).
+    """(count, p) draws of the posterior, and their effective sample size.
 
-    Importance resampling from the mixture of Gaussians about ``components``, twice
-    ``count`` of them, with weights truncated at their mean times the root of their
-    number (Ionides 2008). ``spread``: factor of all variances.
+    Importance resampling from a mixture of Gaussians about ``components``, 2 ``count``
+    draws. Weights are truncated at their mean times the root of their number (Ionides
+    2008).
 
     Args:
         problem: images, frames and prior.
+        components: fits; each is a Gaussian of its covariance.
+        spread: factor of all variances.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    centre = np.array([one.value for one in components])
-    inverse = np.array([invert_information(one.covariance) for one in components])
+    centre = np.array([fit.value for fit in components])
+    inverse = np.array([invert_information(fit.covariance) for fit in components])
     inverse = inverse / spread
     share = mode_probabilities(components, spread)
     roots = [
-        np.linalg.cholesky(spread * one.covariance + 1e-12 * _diagonal(one.covariance))
-        for one in components
+        np.linalg.cholesky(spread * fit.covariance + 1e-12 * _diagonal(fit.covariance))
+        for fit in components
     ]
-    total, drawn = 2 * count, list[Array]()
+    # draws x of the mixture q, within the bounds
+    total = 2 * count
+    drawn = list[Array]()
     for _ in range(50):
         kind = rng.choice(len(components), total, p=share)
         normal = rng.standard_normal((total, centre.shape[1]))
@@ -280,15 +303,18 @@ def draw_posterior(
         if len(drawn) >= total:
             break
     x = np.array(drawn[:total])
+    # ln q, but for a constant
     off = x[:, None] - centre
     square = np.einsum("nki,kij,nkj->nk", off, inverse, off)
     volume = np.array([np.log(np.diag(root)).sum() for root in roots])
     log_q = special.logsumexp(np.log(share) - volume - square / 2, axis=1)
+    # weights posterior / q, truncated
     merit = np.array(threads.run_each(problem.merit, list(x)))
     log_w = -merit / (2 * spread) - log_q
     weight = np.exp(log_w - log_w.max())
     weight = np.minimum(weight, weight.mean() * math.sqrt(len(weight)))
     weight /= weight.sum()
+    # systematic resampling
     places = (rng.random() + np.arange(count)) / count
     index = np.searchsorted(np.cumsum(weight), places).clip(0, len(x) - 1)
     return rng.permutation(x[index]), float(1 / (weight**2).sum())
@@ -302,24 +328,39 @@ def _joined(
     task: SearchTask,
     problem: FitProblem,
     modes: list[FitSolution],
-    found: dict[int, ProfileLikelihood],
+    profiles: dict[int, ProfileLikelihood],
 ) -> FitPosterior:
-    """The posterior over all modes, with the errors of dark and flat."""
-    best, names, prior = modes[0], task.names, task.prior
+    """The posterior over all modes, with the errors of dark and flat.
+
+    Draws are made only where a parabola does not describe it; the covariance is then
+    scaled to the widths of the intervals.
+
+    Args:
+        problem: the least-squares problem of the modes.
+        profiles: by index of the parameter.
+    """
+    best = modes[0]
+    names = task.names
+    prior = task.prior
     spread = max(1.0, best.chi2_per_dof)
     level = REACH**2 * spread
     sigma = np.sqrt(spread * np.diag(best.covariance))
-    low, high = best.value - REACH * sigma, best.value + REACH * sigma
+    # intervals: of the parabola, of the profiles, then over the other modes
+    low = best.value - REACH * sigma
+    high = best.value + REACH * sigma
     parabolic = np.ones(len(names), bool)
-    for i, one in found.items():
-        low[i], high[i], parabolic[i] = one.low, one.high, one.parabolic
+    for i, profile in profiles.items():
+        low[i] = profile.low
+        high[i] = profile.high
+        parabolic[i] = profile.parabolic
     for mode in modes[1:]:
-        room = math.sqrt(max(level - (mode.merit - best.merit), 0.0))
-        reach = room * np.sqrt(np.diag(mode.covariance))
-        low = np.minimum(low, np.where(room > 0, mode.value - reach, low))
-        high = np.maximum(high, np.where(room > 0, mode.value + reach, high))
-    apart = np.maximum(high - best.value, best.value - low) / (REACH * sigma)
-    parabolic &= apart < _PARABOLIC[1]
+        root = math.sqrt(max(level - (mode.merit - best.merit), 0.0))
+        reach = root * np.sqrt(np.diag(mode.covariance))
+        low = np.minimum(low, np.where(root > 0, mode.value - reach, low))
+        high = np.maximum(high, np.where(root > 0, mode.value + reach, high))
+    ratio = np.maximum(high - best.value, best.value - low) / (REACH * sigma)
+    parabolic &= ratio < _PARABOLIC[1]
+    # errors that all frames share, added in quadrature
     calibration = shared_calibration(problem, best)
     common = REACH * np.sqrt(np.maximum(np.diag(calibration), 0.0))
     low = np.maximum(best.value - np.hypot(best.value - low, common), prior.low)
@@ -328,7 +369,7 @@ def _joined(
     covariance = best.covariance * spread + calibration
     draws, size = np.empty((0, len(names))), 0.0
     if not parabolic.all() or share[0] < 0.99:
-        stops = [stop for one in found.values() for stop in one.stops]
+        stops = [stop for profile in profiles.values() for stop in profile.stops]
         draws, size = draw_posterior(problem, [*modes, *stops], spread=spread)
         rng = np.random.default_rng(1)
         shift = gaussian_draws(rng, len(draws), calibration)
@@ -336,27 +377,32 @@ def _joined(
         own = np.sqrt(np.diag(covariance))
         wide = (high - low) / (2 * REACH)
         covariance = covariance / np.outer(own, own) * np.outer(wide, wide)
-    profiles = {
-        names[i]: dataclasses.replace(one, low=float(low[i]), high=float(high[i]))
-        for i, one in found.items()
+    named = {
+        names[i]: dataclasses.replace(profile, low=float(low[i]), high=float(high[i]))
+        for i, profile in profiles.items()
     }
     return FitPosterior(
-        tuple(modes), share, low, high, parabolic, draws, size, profiles, covariance
+        tuple(modes), share, low, high, parabolic, draws, size, named, covariance
     )
 
 
 def posterior_text(names: Sequence[str], found: FitPosterior) -> list[str]:
-    """What the posterior ``found`` of parameters ``names`` leaves open, in words:
-    ends that were not reached, skewed intervals, second modes.
+    """Sentences on what the posterior leaves open.
+
+    Ends of intervals that were not reached, skewed intervals, second modes, few draws.
+
+    Args:
+        names: of the parameters.
+        found: their posterior.
     """
     out = [
         f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, "
         "perhaps beyond"
-        for name, one in found.profiles.items()
-        for which, place, there in zip(
-            ("lower", "upper"), (one.low, one.high), one.found, strict=True
+        for name, profile in found.profiles.items()
+        for which, place, reached in zip(
+            ("lower", "upper"), (profile.low, profile.high), profile.found, strict=True
         )
-        if not there
+        if not reached
     ]
     for i, name in enumerate(names):
         if not found.parabolic[i]:

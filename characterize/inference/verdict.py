@@ -30,11 +30,9 @@ from metalens.lens import Lens
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
-_ONE_COLOUR_NM = (
-    2.0  # over which pillars turn by 0.02 rad, those of a library at one wavelength too
-)
-# sigma by which residuals of neighbours may go together; a thousand frames of noise
-# reach 4
+# wavelength range over which phases of pillars change by 0.02 rad
+_ONE_COLOUR_NM = 2.0
+# significance of correlated residuals; a thousand frames of noise reach 4
 _STRUCTURE = 4.5
 
 
@@ -89,6 +87,7 @@ def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
 
 
 def _allowed(solution: FitSolution, gain: SensorNoise) -> float:
+    """Deviation of reduced chi-square from 1 that noise and the gain's error allow."""
     chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
     return max(MISFIT - 1, min(chance, 0.5))
 
@@ -134,13 +133,8 @@ def fit_problems(
         words.append(
             f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
         )
-    wave = math.hypot(
-        *(
-            v
-            for n, v in zip(names, solution.value.tolist(), strict=True)
-            if n.endswith("_rad")
-        )
-    )
+    by_name = zip(names, solution.value.tolist(), strict=True)
+    wave = math.hypot(*(value for name, value in by_name if name.endswith("_rad")))
     if wave > WAVES_RAD:
         words.append(
             f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens, or counts "
@@ -168,11 +162,10 @@ def held_back(
 def at_bounds(
     names: tuple[str, ...], solution: FitSolution, prior: GaussianPrior
 ) -> list[tuple[str, float]]:
-    """Parameters that a bound holds back, one which is not the natural zero of a blur.
+    """(name, value) of parameters that a bound holds back, but for blurs at 0.
 
-    The frames want them beyond it by more than ``_BEYOND`` sigma; where they say so
-    little that a value inside is
-    nearly as good, the bound is the end of an interval and no fault.
+    The frames favour values beyond it by more than ``_BEYOND`` sigma. Where a value
+    inside is nearly as good, the bound is the end of an interval and no fault.
 
     Args:
         names: (p,) names of the fitted parameters.
@@ -189,10 +182,10 @@ def at_bounds(
     )
     blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px", "glass_um")
     return [
-        (n, v)
-        for n, v, out, low, high in ends
-        if (v >= high and out > _BEYOND)
-        or (v <= low and out < -_BEYOND and n not in blurs)
+        (name, value)
+        for name, value, beyond, low, high in ends
+        if (value >= high and beyond > _BEYOND)
+        or (value <= low and beyond < -_BEYOND and name not in blurs)
     ]
 
 
@@ -234,7 +227,8 @@ def correlated_residuals_text(
     """
     r = np.clip(residual_sigma, -6, 6)
     dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
-    r = r / np.sqrt(1 + flat**2)
+    total = np.sqrt(1 + flat**2)
+    r = r / total
     found = []
     sides = np.array(
         [_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])]
@@ -248,37 +242,40 @@ def correlated_residuals_text(
         )
         found.append(ResidualFinding(words, float(sides.max())))
     if len(r) > 1:
-        frames = _from_frame_to_frame(
-            r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2)
-        )
+        frames = _from_frame_to_frame(r, dark / total, flat / total)
         if frames > _STRUCTURE:
             words = (
                 f"residuals go together from frame to frame ({frames:.1f} sigma): the "
                 "same is missed in each"
             )
             found.append(ResidualFinding(words, frames))
-    levels = r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1))
-    at = int(np.argmax(np.abs(levels)))
-    if abs(levels[at]) > _STRUCTURE + 0.5:
+    levels = np.abs(r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1)))
+    at = int(np.argmax(levels))
+    if levels[at] > _STRUCTURE + 0.5:
         words = (
             f"frame {at} is brighter or darker than the model by "
-            f"{abs(levels[at]):.1f} sigma: exposure or lamp"
+            f"{levels[at]:.1f} sigma: exposure or lamp"
         )
-        found.append(ResidualFinding(words, float(abs(levels[at]))))
+        found.append(ResidualFinding(words, float(levels[at])))
     return found
 
 
 def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
-    """Sum of products of neighbouring frames less what is expected of it, over its
-    standard deviation.
+    """Correlation of residuals in neighbouring frames, in standard deviations.
 
-    Of T = rᵀ A r with A = 1/2 beside the diagonal and covariance K in each pixel: tr AK
-    and 2 tr AKAK.
+    T = rᵀ A r, A = 1/2 next to the diagonal, less its expectation tr AK and over the
+    root of its variance 2 tr AKAK, with K the covariance of the frames in each pixel.
+
+    Args:
+        r: (n, y, x) residuals.
+        dark: (n, y, x) shared error of the dark over the noise.
+        flat: (n, y, x) the same of the flat.
     """
     expected, variance = 0.0, 0.0
     for row in range(r.shape[1]):
-        some = [part[:, row].T for part in (dark, flat)]
-        k = sum(np.einsum("pi,pj->pij", one, one) for one in some)
+        shared = [part[:, row].T for part in (dark, flat)]
+        # covariance K of the frames in every pixel, of unit variance
+        k = sum(np.einsum("pi,pj->pij", error, error) for error in shared)
         np.einsum("pii->pi", k)[:] = r[:, row].T != 0
         ak = np.zeros_like(k)
         ak[:, 1:] += k[:, :-1] / 2
@@ -288,9 +285,9 @@ def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
     return (float((r[1:] * r[:-1]).sum()) - expected) / math.sqrt(max(variance, 1.0))
 
 
-def _together(one: Array, other: Array) -> Array:
+def _together(first: Array, second: Array) -> Array:
     """(n,) mean product of neighbours over its standard deviation."""
-    product = one * other
+    product = first * second
     return np.asarray(
         product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1))
     )
@@ -303,18 +300,18 @@ def process_verdict(
     prior_share: Array,
     unstated: UnmodelledShifts,
 ) -> str:
-    """Which causes the frames fix, and which come from prior knowledge or only with
-    others.
+    """Sentence on which causes the frames determine.
 
-    ``rows``: (p,) of the fitted, for this lens. ``prior_share``: (p,) interval over that of
-    the prior alone, 1 where the
-    frames say nothing. Numbers are those with what ``unstated`` causes may have moved;
-    where these are too large, a
-    cause is known in the model alone, and so said.
+    The others come from prior knowledge, or are determined only within the model, where
+    unstated causes may have shifted them too much, or loosely.
 
     Args:
+        rows: (p,) of the fitted parameters, for this lens.
         low: (p,) lower ends of statistical 95 %.
         high: (p,) upper ends of statistical 95 %.
+        prior_share: (p,) interval over that of the prior alone; 1 where the frames add
+            nothing.
+        unstated: shifts by causes that nobody stated.
     """
     names = [row.name for row in rows]
     causes = [
@@ -322,6 +319,7 @@ def process_verdict(
         for i, n in enumerate(names)
         if n.endswith(("_nm", "_rad", "_deg")) or n == "index"
     ]
+    # standard deviations: statistical, and with the shifts by unstated causes
     own = (high - low) / 3.92
     close = [i for i in causes if own[i] <= rows[i].scale]
     whole = np.hypot(own, unstated.sigma)
@@ -340,16 +338,14 @@ def process_verdict(
         )
         more = f"; within the model only, that is without {without}: {parts}" + more
     open_ = [i for i in causes if i not in close and prior_share[i] <= 0.7]
-    middle, reach = (low + high) / 2, 1.96 * whole
+    middle = (low + high) / 2
+    reach = 1.96 * whole
     wide = ", ".join(
         f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}"
         for i in open_
     )
-    return (
-        f"the process is known to {known}"
-        + (f"; loosely: {wide}" if wide else "")
-        + more
-    )
+    loosely = f"; loosely: {wide}" if wide else ""
+    return f"the process is known to {known}" + loosely + more
 
 
 def predicted_error(task: SearchTask, found: FitPosterior) -> tuple[float, float]:
@@ -360,25 +356,27 @@ def predicted_error(task: SearchTask, found: FitPosterior) -> tuple[float, float
         task: model, frames, priors and arrangement of the search.
         found: the posterior.
     """
-    model, values = (
-        task.model.quick(),
-        _shown(task, found),
-    )  # differences of images, to a few percent
-    return _spread(task, model, found.best.value, values), _spread(
-        task, models_between_depths(model), found.best.value, values
-    )
+    values = _shown(task, found)
+    best = found.best.value
+    model = task.model.quick()  # accurate to a few percent of the differences
+    between = models_between_depths(model)
+    return _spread(task, model, best, values), _spread(task, between, best, values)
 
 
 def predicted_aside(
     task: SearchTask, found: FitPosterior
 ) -> tuple[float, float] | None:
-    """As :func:`predicted_error` at the captured depths: half-way between neighbouring
-    field angles, and half a step
-    beyond the outermost; None of frames at one angle.
+    """Expected NRMSE of as-built images off the captured field angles.
+
+    At the captured depths, as :func:`predicted_error`.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         found: the posterior.
+
+    Returns:
+        (half-way between neighbouring angles, half a step beyond the outermost); None
+        of frames at one angle.
     """
     angles = largest_angle_gap(task.model.setting.angle_rad)
     if angles is None:
@@ -401,40 +399,44 @@ def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
     angles = np.unique(angle_rad, axis=0)
     if len(angles) < 2:
         return None
-    apart = np.hypot(*(angles[:, None] - angles).T)
-    np.fill_diagonal(apart, np.inf)
-    nearest = angles[apart.argmin(1)]
-    wide = int(apart.min(1).argmax())
+    distances = np.hypot(*(angles[:, None] - angles).T)
+    np.fill_diagonal(distances, np.inf)
+    nearest = angles[distances.argmin(1)]
+    wide = int(distances.min(1).argmax())
     outer = int(np.hypot(*(angles - angles.mean(0)).T).argmax())
-    return (angles[wide] + nearest[wide]) / 2, angles[outer] + (
-        angles[outer] - nearest[outer]
-    ) / 2
+    middle = (angles[wide] + nearest[wide]) / 2
+    return middle, angles[outer] + (angles[outer] - nearest[outer]) / 2
 
 
 def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     """The model of all its depths at one field angle."""
     s = model.setting
-    there = dataclasses.replace(
-        s, angle_rad=np.broadcast_to(angle_rad, s.angle_rad.shape)
-    )
-    return ForwardModel(model.lens, there, model.response).about(model.grid.middle_um)
+    angles_rad = np.broadcast_to(angle_rad, s.angle_rad.shape)
+    setting = dataclasses.replace(s, angle_rad=angles_rad)
+    return ForwardModel(model.lens, setting, model.response).about(model.grid.middle_um)
 
 
 def _shown(task: SearchTask, found: FitPosterior) -> Array:
-    """(draws, p) of the posterior, within the bounds."""
+    """(draws, p) parameters of the posterior, within the bounds.
+
+    Its own draws, or Gaussian ones where there are none.
+    """
     if len(found.draws):
         values = found.draws[:_SHOWN]
     else:
         size, vectors = np.linalg.eigh(found.covariance)
-        normal = np.random.default_rng(0).standard_normal(
-            (_SHOWN, len(size))
-        ) * np.sqrt(np.maximum(size, 0))
+        normal = np.random.default_rng(0).standard_normal((_SHOWN, len(size)))
+        normal = normal * np.sqrt(np.maximum(size, 0))
         values = found.best.value + normal @ vectors.T
     return np.clip(values, task.prior.low, task.prior.high)
 
 
 def _spread(task: SearchTask, model: ForwardModel, best: Array, values: Array) -> float:
-    """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
+    """Relative rms error of the images over draws of the parameters (draws, p).
+
+    Root of the mean of |image - best|² / |best|², without background and at the
+    brightness of the best.
+    """
     images = named_images(model, task.names, task.start)
     dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
 
@@ -445,21 +447,23 @@ def _spread(task: SearchTask, model: ForwardModel, best: Array, values: Array) -
 
     mean = light(best)
 
-    def away(x: Array) -> float:
-        one = light(x)
-        one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
-        return float(((one - mean) ** 2).sum())
+    def squared_error(x: Array) -> float:
+        image = light(x)
+        # least-squares brightness
+        image *= (image * mean).sum() / max(float((image**2).sum()), 1e-300)
+        return float(((image - mean) ** 2).sum())
 
-    return float(
-        np.sqrt(sum(threads.run_each(away, values)) / len(values) / (mean**2).sum())
-    )
+    total = sum(threads.run_each(squared_error, values))
+    return float(np.sqrt(total / len(values) / (mean**2).sum()))
 
 
 def models_between_depths(model: ForwardModel) -> ForwardModel:
-    """The model half-way, in 1/z, between neighbouring depths at each angle; the
-    farthest frame moves inwards.
+    """The model half-way, in 1/z, between neighbouring depths at each angle.
+
+    The farthest frame takes the last of these depths too.
     """
-    part, s = copy.copy(model), model.setting
+    part = copy.copy(model)
+    s = model.setting
     depth = s.depth_um.copy()
     for group in model.groups:
         order = group.index[np.argsort(s.depth_um[group.index], kind="stable")]
@@ -472,49 +476,52 @@ def models_between_depths(model: ForwardModel) -> ForwardModel:
 
 
 def left_out(task: SearchTask, mode: FitSolution) -> float:
-    """Chi-square a pixel of frames left out, every second depth and then the others,
-    over that of the full fit.
+    """Reduced chi-square of frames left out of a fit (cross-validation).
 
-    About 1 + parameters over pixels where model and intervals hold; nan with fewer than
-    four frames.
+    About 1 where model and intervals hold; nan with fewer than four frames.
 
     Args:
         task: model, frames and priors.
-        mode: the fit it is judged at.
+        mode: the fit of all frames.
     """
     n = len(task.data.electrons)
     if n < 4:
         return float("nan")
     order = np.argsort(task.model.setting.depth_um, kind="stable")
+    # every second depth is fitted and the others are predicted, then the reverse
     halves = [
-        (np.sort(seen), np.sort(hidden))
-        for seen, hidden in itertools.permutations((order[::2], order[1::2]))
+        (np.sort(fitted), np.sort(hidden))
+        for fitted, hidden in itertools.permutations((order[::2], order[1::2]))
     ]
-    total, count = np.sum(
-        threads.run_each(functools.partial(_unseen, task, mode), halves), 0
-    )
+    predict = functools.partial(_unseen, task, mode)
+    total, count = np.sum(threads.run_each(predict, halves), 0)
     return float(total / max(count, 1))
 
 
 def _unseen(
     task: SearchTask, mode: FitSolution, halves: tuple[Array, Array]
 ) -> tuple[float, int]:
-    """(chi-square, pixels) of the second frames by what the first say."""
-    seen, hidden = halves
-    images = named_images(task.model.only(seen), task.names, task.start)
-    problem = FitProblem(images, task.data.planes(seen), task.prior)
+    """(chi-square, pixels) of frames that are predicted from a fit to the others.
+
+    Residuals are over noise and uncertainty of the prediction, at most 6 sigma.
+
+    Args:
+        halves: indices of the fitted and of the predicted frames.
+    """
+    fitted, hidden = halves
+    images = named_images(task.model.only(fitted), task.names, task.start)
+    problem = FitProblem(images, task.data.planes(fitted), task.prior)
     settings = SolverSettings(
         iterations=6, step_tolerance=0.3, secant=True, near=math.inf, finish=False
     )
-    part = problem.fit(mode.value, settings, mode.slopes[:, seen])
-    rest = task.data.planes(hidden)
-    image = named_images(task.model.only(hidden), task.names, task.start)(
-        part.value, False
-    )[0]
-    keep = rest.usable & ~rest.saturated
+    part = problem.fit(mode.value, settings, mode.slopes[:, fitted])
+    data = task.data.planes(hidden)
+    predict = named_images(task.model.only(hidden), task.names, task.start)
+    image = predict(part.value, False)[0]
+    keep = data.usable & ~data.saturated
     slopes = mode.slopes[:, hidden][:, keep]
-    known_e2 = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)
-    variance = rest.variance(image)[keep] + known_e2
-    return float(
-        np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()
-    ), int(keep.sum())
+    # variance of the prediction, e²
+    by_fit = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)
+    variance = data.variance(image)[keep] + by_fit
+    square = (data.electrons - image)[keep] ** 2 / variance
+    return float(np.minimum(square, 36.0).sum()), int(keep.sum())

@@ -15,8 +15,7 @@ from metalens.core.arrays import Array
 from metalens.lens import Lens
 
 _ROOM_UM = 20.0  # for decentre
-# pixels: a point has no slope by its size, so a search would see nothing to hold it
-# there
+# pixels: least disc of derivatives, as a point has no slope by its size
 _LEAST_DISC = 0.3
 
 
@@ -70,34 +69,32 @@ class DetectorGrid:
         return self.fill * self.pixel_um
 
     def axes_um(self) -> tuple[Array, Array]:
-        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel
-        ((rows - 1) / 2, (columns - 1) / 2).
+        """(y, x) of the fine samples from the chief ray, um.
+
+        ``middle_um`` is at pixel ((rows - 1) / 2, (columns - 1) / 2).
         """
         y, x = self._centre_um()
         return self._axis(self.rows) + y, self._axis(self.columns) + x
 
     def across_um(self, near_um: float) -> float:
-        """Side of a square about the chief ray that holds all that is seen; of what is
-        farther off than ``near_um``.
+        """Side of a square about the chief ray that contains the window, um.
+
+        Offsets of the window count beyond ``near_um`` only.
         """
         off = max(0.0, *(abs(v) - near_um for v in self._centre_um()))
-        return (
-            (max(self.rows, self.columns) + self.margin) * self.pixel_um
-            + _ROOM_UM
-            + 2 * off
-        )
+        side = (max(self.rows, self.columns) + self.margin) * self.pixel_um
+        return side + _ROOM_UM + 2 * off
 
     def part(self, rows: slice, columns: slice, margin: int) -> "DetectorGrid":
-        """Of neighbouring rows and columns, with so many pixels at most around them."""
-        some = range(self.rows)[rows], range(self.columns)[columns]
-        moved = (
-            (one[0] + one[-1] - (n - 1)) / 2
-            for one, n in zip(some, (self.rows, self.columns), strict=True)
-        )
-        y, x = (off + by for off, by in zip(self.aside, moved, strict=True))
+        """Grid of neighbouring rows and columns, at most ``margin`` pixels wider."""
+        y_part = range(self.rows)[rows]
+        x_part = range(self.columns)[columns]
+        # pixels from the middle of the whole to that of the part
+        y = self.aside[0] + (y_part[0] + y_part[-1] - (self.rows - 1)) / 2
+        x = self.aside[1] + (x_part[0] + x_part[-1] - (self.columns - 1)) / 2
         margin = min(margin, self.margin)
         return dataclasses.replace(
-            self, rows=len(some[0]), columns=len(some[1]), margin=margin, aside=(y, x)
+            self, rows=len(y_part), columns=len(x_part), margin=margin, aside=(y, x)
         )
 
     def _centre_um(self) -> tuple[float, float]:
@@ -117,13 +114,16 @@ class DetectorGrid:
         rows, columns = (
             (p + 2 * self.margin) * self.oversample for p in (self.rows, self.columns)
         )
-        return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(
-            columns, self.fine_um
-        )[None]
+        fy = fft.fftfreq(rows, self.fine_um)
+        fx = fft.rfftfreq(columns, self.fine_um)
+        return fy[:, None], fx[None]
 
     def sample(self, intensity: Array, transfer: Blur) -> Array:
-        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through
-        ``transfer``, at pixel centres.
+        """(..., rows, columns) blurred intensity at the pixel centres.
+
+        Args:
+            intensity: (..., y, x) on the fine grid.
+            transfer: blur, separable or as a transfer function.
         """
         if isinstance(transfer, SeparableBlur):
             return np.asarray(sum(y @ (intensity @ x.T) for y, x in transfer.pairs))
@@ -138,32 +138,33 @@ class DetectorGrid:
     def sums(
         self, sigma_um: float, kind: Any = float
     ) -> tuple[SeparableBlur, SeparableBlur]:
-        """Square pixel and Gaussian blur as sums along each axis, and their derivative
-        by ``sigma_um``: two small
-        products in place of two transforms, the same to rounding."""
+        """Separable pixel and Gaussian blur, and its derivative by ``sigma_um``.
+
+        Two small products of matrices in place of two transforms, equal to rounding.
+        """
         (y, by_y), (x, by_x) = (
             self._along(count, sigma_um, kind) for count in (self.rows, self.columns)
         )
         return SeparableBlur(((y, x),)), SeparableBlur(((by_y, x), (y, by_x)))
 
     def _along(self, pixels: int, sigma_um: float, kind: Any) -> tuple[Array, Array]:
-        """(pixels, fine samples) weights of pixel and blur along one axis, and their
-        derivative.
+        """(pixels, fine samples) weights of pixel and Gaussian blur along one axis, and
+        their derivative by the standard deviation, 1/um.
+
+        Inverse Fourier transform of sinc(f w) exp(-2 pi² f² sigma²).
         """
         o, m = self.oversample, self.margin
         count = (pixels + 2 * m) * o
         f = fft.fftfreq(count, self.fine_um)
-        at = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
-        place = np.arange(m * o + o // 2, (m + pixels) * o, o)[:, None] - np.arange(
-            count
-        )
-        parts = [
-            fft.ifft(np.sinc(f * self.wide_um) * at * part).real
+        # half a fine sample where none lies at a pixel's centre
+        shift = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
+        centres = np.arange(m * o + o // 2, (m + pixels) * o, o)
+        lag = (centres[:, None] - np.arange(count)) % count
+        value, slope = (
+            fft.ifft(np.sinc(f * self.wide_um) * shift * part).real
             for part in gaussian_transfer(f, np.zeros(1), sigma_um)
-        ]
-        return parts[0][place % count].astype(kind), parts[1][place % count].astype(
-            kind
         )
+        return value[lag].astype(kind), slope[lag].astype(kind)
 
 
 def detector_transfers(
@@ -175,17 +176,19 @@ def detector_transfers(
     sized: bool,
     kind: Any = float,
 ) -> tuple[Blur, dict[str, Blur]]:
-    """Of pixel, crosstalk and the image of a round source in every frame, and
-    derivatives by name.
+    """Transfer functions of pixel, crosstalk and round source, and derivatives by name.
 
-    Sums along the axes for a point source; else (frames, fy, fx), and by the source's
-    diameter where that is ``sized``.
+    For a point source the blur is separable, as weights along each axis; else it is
+    (frames, fy, fx). ``pinhole_um``: by the source's diameter. ``growth``: by a
+    relative change of the magnification, over the source's diameter.
 
     Args:
         grid: fine samples under the pixels.
-        crosstalk_px: standard deviation of blur, pixels.
-        sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over
-            the source's. kind: of the sums.
+        crosstalk_px: standard deviation of blur, pixel widths.
+        sizes_um: (frames,) diameter of the source's image.
+        shrink: (frames,) magnification of the source.
+        sized: the derivative by the source's diameter is needed.
+        kind: number type of the separable weights.
     """
     wide_um = grid.wide_um
     if not sizes_um.any() and not sized:
@@ -195,38 +198,36 @@ def detector_transfers(
     smooth, by_sigma = gaussian_transfer(fy, fx, crosstalk_px * wide_um)
     square = pixel_transfer(fy, fx, wide_um)
     shared = square * smooth
-    image = [disc_transfer(fy, fx, size) for size in sizes_um]
-    some = np.maximum(sizes_um, _LEAST_DISC * wide_um)
-    seen = (
-        np.stack([disc_transfer(fy, fx, size)[1] for size in some])
-        * shrink[:, None, None]
-    )
-    whole = np.stack([value for value, _ in image])
+    discs = [disc_transfer(fy, fx, size) for size in sizes_um]
+    disc = np.stack([value for value, _ in discs])
+    by_size = np.stack([slope for _, slope in discs])
+    # by the source's diameter: of a disc of least size, so that 0 has a slope too
+    least = np.maximum(sizes_um, _LEAST_DISC * wide_um)
+    by_source = np.stack([disc_transfer(fy, fx, size)[1] for size in least])
     slopes: dict[str, Blur] = {
-        "crosstalk_px": square * by_sigma * wide_um * whole,
-        "pinhole_um": shared * seen,
-        "growth": shared
-        * np.stack([slope for _, slope in image])
-        * shrink[:, None, None],
+        "crosstalk_px": square * by_sigma * wide_um * disc,
+        "pinhole_um": shared * (by_source * shrink[:, None, None]),
+        "growth": shared * by_size * shrink[:, None, None],
     }
-    return shared * whole, slopes
+    return shared * disc, slopes
 
 
 @functools.lru_cache(maxsize=4)
 def _half_step(grid: DetectorGrid) -> Array:
-    """Transfer that moves the light by half a fine sample, where no fine sample sits at
-    a pixel's centre.
+    """Transfer function of a shift by half a fine sample.
+
+    For even oversampling, where no sample lies at a pixel's centre.
     """
     fy, fx = grid.frequencies()
     return np.asarray(np.exp(-1j * np.pi * (fy + fx) * grid.fine_um))
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:
-    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled
-    at twice that or above.
+    """Least oversampling that samples ``highest`` cycles/um at the Nyquist rate.
 
     Args:
         pixel_um: pitch of the pixels, um.
+        highest: highest frequency of the intensity, cycles/um.
     """
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
@@ -277,9 +278,8 @@ def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Arra
     u = np.pi * np.hypot(fx, fy) * diameter_um
     safe = np.maximum(u, 1e-6)
     slope = -2 * special.jv(2, safe) / max(abs(diameter_um), 1e-12)
-    return np.where(u > 1e-6, 2 * special.j1(safe) / safe, 1.0), np.where(
-        u > 1e-6, slope, 0.0
-    )
+    value = 2 * special.j1(safe) / safe
+    return np.where(u > 1e-6, value, 1.0), np.where(u > 1e-6, slope, 0.0)
 
 
 def ball_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:

@@ -55,21 +55,18 @@ WIDENING, ANSWERING = (
     for kind in (CDError, ResponseError)
 )
 EVERY = slice(None)
-Light = tuple[Array, dict[str, Array]]  # and its derivatives by name
-_SLOPE_TOLERANCE = (
-    8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
-)
-_WINDOW = {
-    "distance_um": ("distance", 1.0),
-    "wavelength_nm": ("wave", 1e-3),
-}  # what moves the window, um in its unit
-_WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
+Light = tuple[Array, dict[str, Array]]  # light, and its derivatives by name
+# relative error of derivatives: it slows the last steps of a fit, not its result
+_SLOPE_TOLERANCE = 8e-3
+# parameters that change the kernel: name in WindowOperators.rates, and um a unit
+_WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}
+_WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02  # of difference quotients: wavelength, bandwidth
 _PITCH = PLACE["pixel_percent"]
-# off the chief ray, within which windows need no more directions than those of the
-# middle
+# offset from the chief ray up to which a window needs no further directions
 _NEAR_UM = 5.0
-_FEW, _FEWER = 2e-2, 0.85  # in a quick model: terms left out, and samples
-# pixels around a part of a window: what blur brings from farther off changes little
+# of a quick model: relative error of its fields, and its share of the oversampling
+_FEW, _FEWER = 2e-2, 0.85
+# pixels of margin around a part of a window: blur from farther off changes little
 _NARROW = 2
 
 
@@ -77,10 +74,9 @@ class ForwardModel:
     """Frames (n, rows, columns) in electrons as a function of
     :data:`parameters.PARAMETERS`.
 
-    Accuracy: of the pillars ``Pillars.error`` in t, of the geometry
-    ``setting.tolerance`` in the field; a test and the
-    benchmark hold both against the sum over all pillars. ``cut``: what :meth:`rough`
-    leaves out of it.
+    Accuracy: ``Pillars.error`` in the transmission of pillars, ``setting.tolerance``
+    in the field. A test and the benchmark compare both with the sum over all pillars.
+    ``cut``: relative error of the field that :meth:`rough` allows, 0 for none.
     """
 
     def __init__(
@@ -91,7 +87,16 @@ class ForwardModel:
         *,
         span: ChangeRange | None = None,
     ) -> None:
-        self.lens, self.setting, s = lens, setting, setting
+        """Gather the lens for every field angle of the frames.
+
+        Args:
+            lens: the design.
+            setting: depths, angles and window of the frames.
+            response: slopes of the pillars.
+            span: largest changes of the pillars; the usual ones without it.
+        """
+        self.lens = lens
+        self.setting = s = setting
         self.reference_um = float(
             2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max())
         )
@@ -102,13 +107,17 @@ class ForwardModel:
         self.grid = detector.DetectorGrid(
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
-        self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
+        self.response = response
+        self._span = span
+        self.cut = 0.0
+        self._lean_um = 0.0
         self.modes = np.empty(0)
         self._lit = EVERY, EVERY
+        # residual shapes on the nodes, by (reduced lens, basis, count)
         self._kept: dict[
             tuple[CompressedLens, Callable[[Array, Array, int], Array], int], Array
         ] = {}
-        self._pillars: dict[float, PillarResponse] = {}
+        self._pillars: dict[float, PillarResponse] = {}  # by angle of incidence
         self.films = FilmStack.of(lens.layers, lens.wavelength_um)
         self.area_um2 = (
             float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
@@ -122,7 +131,11 @@ class ForwardModel:
         ]
 
     def _group(self, angle_rad: Array) -> AngleGroup:
-        """Of the frames at one field angle."""
+        """Nodes, pillars and gathered fields of one field angle (x, y), rad.
+
+        The nodes serve depths from 15 % below the nearest to 15 % above the farthest.
+        Pillars are shared by angles of one incidence.
+        """
         setting = self.setting
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
@@ -155,28 +168,31 @@ class ForwardModel:
         )
 
     def only(self, frames: Array) -> "ForwardModel":
-        """The model of some of the frames, in rising order of their index; it shares
-        all that was gathered.
+        """The model of some frames, in rising order of their index.
+
+        It shares all gathered fields with this one.
+
+        Args:
+            frames: (k,) indices.
         """
-        part, s = copy.copy(self), self.setting
+        part = copy.copy(self)
+        s = self.setting
         part.setting = dataclasses.replace(
             s,
             depth_um=s.depth_um[frames],
             angle_rad=s.angle_rad[frames],
             exposure=s.exposure[frames],
         )
-        part.groups = [
-            one
-            for one in (group.only(frames) for group in self.groups)
-            if one is not None
-        ]
+        groups = [group.only(frames) for group in self.groups]
+        part.groups = [group for group in groups if group is not None]
         return part
 
     def about(self, middle_um: tuple[float, float]) -> "ForwardModel":
-        """The same model with the window's middle held at (x, y) from the chief ray.
+        """The same model, the window's middle fixed at (x, y) um from the chief ray.
 
-        Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5
-        sin² / d is missed at X off it.
+        Decentre acts as a phase about that middle. Of a point X from the middle this
+        misses the phase k decentre X 1.5 sin² / d. A window far from the chief ray
+        gets nodes of its own.
         """
         part = copy.copy(self)
         reach = max(
@@ -185,39 +201,38 @@ class ForwardModel:
         part.grid = dataclasses.replace(
             self.grid, middle_um=(float(middle_um[0]), float(middle_um[1]))
         )
-        if max(abs(v) for v in middle_um) > reach:  # wants more directions
-            part._kept, part.groups = (
-                {},
-                [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)],
-            )
+        if max(abs(v) for v in middle_um) > reach:  # needs more directions
+            angles_rad = np.unique(self.setting.angle_rad, axis=0)
+            part._kept = {}
+            part.groups = [part._group(angle_rad) for angle_rad in angles_rad]
         return part
 
     def exchanged(self) -> "ForwardModel":
-        """The same model of frames with rows and columns exchanged: those of a camera
-        on its side.
-        """
-        part, s = copy.copy(self), self.setting
+        """The same model with rows and columns exchanged: a camera turned by 90 deg."""
+        part = copy.copy(self)
+        s = self.setting
         part.setting = dataclasses.replace(s, rows=s.columns, columns=s.rows)
         part.grid = dataclasses.replace(self.grid, rows=s.columns, columns=s.rows)
         return part
 
     def rough(self, tolerance: float) -> "ForwardModel":
-        """The same model with fields to a relative ``tolerance``: quick enough to scan
-        with.
-        """
+        """The same model with fields to a relative ``tolerance``, fast enough for scans."""
         part = copy.copy(self)
         part.cut = tolerance
         return part
 
     def quick(self, rows: slice = EVERY, columns: slice = EVERY) -> "ForwardModel":
-        """The same model by few terms of every field and on fewer samples: for
-        differences to images of this one.
+        """A fast model for differences to its own images: few terms, fewer samples.
 
-        rows, columns: of the window, where there is light enough to differ; its images
-            are background alone beside it.
+        Args:
+            rows: of the part of the window that is bright enough to differ. Outside it
+                the images are background alone.
+            columns: of the same part.
         """
-        part, window_um = self.rough(_FEW), None
-        part.grid, part._lit = self._sparser(), (rows, columns)
+        part = self.rough(_FEW)
+        part.grid = self._sparser()
+        part._lit = rows, columns
+        window_um = None
         narrow = part.grid.part(rows, columns, _NARROW)
         if narrow.rows < self.grid.rows or narrow.columns < self.grid.columns:
             part.grid, window_um = narrow, narrow.across_um(_NEAR_UM)
@@ -225,21 +240,24 @@ class ForwardModel:
         return part
 
     def _sparser(self) -> detector.DetectorGrid:
-        """Samples for differences of images: of derivatives they miss less than a third
-        of ``_SLOPE_TOLERANCE``.
+        """Samples for differences of images.
+
+        Their error of derivatives is below a third of ``_SLOPE_TOLERANCE``.
         """
         return dataclasses.replace(self.grid, oversample=self._over)
 
     def with_pixel_pitch(self, ratio: float) -> "ForwardModel":
         """The same model with pixels ``ratio`` times as far apart and as wide."""
-        part, pixel_um = copy.copy(self), self.setting.pixel_um * ratio
+        part = copy.copy(self)
+        pixel_um = self.setting.pixel_um * ratio
         part.setting = dataclasses.replace(self.setting, pixel_um=pixel_um)
         part.grid = dataclasses.replace(self.grid, pixel_um=pixel_um)
         return part
 
     def with_walls(self, angle_rad: float) -> "ForwardModel":
-        """The same lens with side walls that lean by an angle about half height; its
-        derivatives are those without.
+        """The same lens with side walls leaning by an angle about half height.
+
+        Its derivatives are those of upright walls.
         """
         part = copy.copy(self)
         part._lean_um = math.tan(angle_rad) * self.lens.cell.height_um
@@ -248,10 +266,13 @@ class ForwardModel:
     def with_residual(
         self, modes: Array, basis: Callable[[Array, Array, int], Array]
     ) -> "ForwardModel":
-        """The same lens with a phase of ``modes`` (m,) times ``basis`` (u, v, m) -> (m,
-        *shape); see :mod:`thinplate`.
+        """The same lens with an additional phase: ``modes`` (m,) times ``basis``.
 
-        Their derivatives are wanted as ``residual_0`` and so on.
+        Their derivatives are named ``residual_0``, ``residual_1`` and so on.
+
+        Args:
+            modes: (m,) amplitudes.
+            basis: (u, v, m) -> (m, *shape) phases in rad; see :mod:`thinplate`.
         """
         part = copy.copy(self)
         part.modes = np.asarray(modes)
@@ -264,9 +285,7 @@ class ForwardModel:
     def _shapes(
         self, group: AngleGroup, count: int, basis: Callable[[Array, Array, int], Array]
     ) -> Array:
-        """(count, q, p) of a basis on the nodes of a group; kept, since a search asks
-        again for every step.
-        """
+        """(count, q, p) of a basis on the lens nodes of a group, cached."""
         key = group.reduced, basis, count
         if key not in self._kept:
             self._kept[key] = basis(group.reduced.u, group.reduced.v, count)
@@ -275,37 +294,44 @@ class ForwardModel:
     def images(
         self, x: Array, wanted: Sequence[str] | None = None
     ) -> tuple[Array, Array | None]:
-        """Frames, and with ``wanted`` their derivatives by those parameters
-        (len(wanted), n, rows, columns).
+        """Expected frames (n, rows, columns) in electrons, and their derivatives.
+
+        Frame = brightness * |E|² / lens area + background.
+
+        Args:
+            x: all parameters, in the order of ``PARAMETERS``.
+            wanted: parameters to differentiate by.
+
+        Returns:
+            Frames, and derivatives (len(wanted), n, rows, columns) or None.
         """
         if x[_PITCH]:
             return self._off_pitch(x, wanted)
         light, slopes = self._light(x, wanted)
         s = self.setting
         films = self.films
-        about = {"centre_um": self.stage_centre_um}
-        scale = (
-            pixel_brightness(
-                x, s, reference_um=self.reference_um, films=films, **about
-            )[:, None, None]
-            / self.area_um2
+        stage = {"centre_um": self.stage_centre_um}
+        brightness = pixel_brightness(
+            x, s, reference_um=self.reference_um, films=films, **stage
         )
+        scale = brightness[:, None, None] / self.area_um2
         sampled = scale * light
         if wanted is None:
             return sampled + background_planes(x, s), None
         out = np.zeros((len(wanted), *light.shape))
-        plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
+        # derivatives that need no field
+        direct: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
         if "pixel_percent" in wanted:
-            plain["pixel_percent"] = self._pitch_slope(x)
-        plain |= {
+            direct["pixel_percent"] = self._pitch_slope(x)
+        direct |= {
             name: s.glow * edge
             for name, edge in zip(
                 ("background_y_e", "background_x_e"), s.edges, strict=True
             )
         }
         for j, name in enumerate(wanted):
-            out[j] = plain[name] if name in plain else scale * slopes[name]
-        for name, rate in brightness_slopes(x, s, films=films, **about).items():
+            out[j] = direct[name] if name in direct else scale * slopes[name]
+        for name, rate in brightness_slopes(x, s, films=films, **stage).items():
             if name in wanted:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return sampled + background_planes(x, s), out
@@ -313,7 +339,11 @@ class ForwardModel:
     def _off_pitch(
         self, x: Array, wanted: Sequence[str] | None
     ) -> tuple[Array, Array | None]:
-        """:meth:`images` where the pixel pitch is not the stated one."""
+        """:meth:`images` where the pixel pitch is not the stated one.
+
+        A model of the actual pitch is evaluated, at 0 percent. Its derivative is per
+        percent of that pitch, hence the division by ``ratio``.
+        """
         ratio = 1 + float(x[_PITCH]) / 100
         stated = x.copy()
         stated[_PITCH] = 0.0
@@ -335,10 +365,18 @@ class ForwardModel:
     def _light(
         self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None
     ) -> Light:
-        """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
+        """(n, rows, columns) |E|² over the pixels, and its derivatives by name.
+
+        Sum over spectral samples and field angles. The derivative by the bandwidth is
+        a forward difference.
+
+        Args:
+            wanted: parameters to differentiate by.
+            like_nm: bandwidth whose spectral samples are used; default: that of ``x``.
+        """
         s = self.setting
         wanted = list(wanted or ())
-        wide_nm = float(x[PLACE["bandwidth_nm"]])
+        bandwidth_nm = float(x[PLACE["bandwidth_nm"]])
         names = list(
             dict.fromkeys(
                 "stage_zero_um" if name == "stage_scale" else name for name in wanted
@@ -346,106 +384,122 @@ class ForwardModel:
         )
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
-        for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
+        for offset_nm, weight in self.spectrum.colours(bandwidth_nm, like_nm):
             for group in (
                 part for whole in self.groups for part in whole.illuminated_parts
             ):
-                part, more = self._group_light(x, group, offset_nm, names)
-                light[group.index, *self._lit] += weight * part
+                intensity, rates = self._group_light(x, group, offset_nm, names)
+                light[group.index, *self._lit] += weight * intensity
                 for name in names:
-                    if name in more:
-                        slopes[name][group.index, *self._lit] += weight * more[name]
+                    if name in rates:
+                        slopes[name][group.index, *self._lit] += weight * rates[name]
         if "bandwidth_nm" in names:
-            up = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
-            slopes["bandwidth_nm"] = (
-                self._light(up, None, wide_nm)[0] - light
-            ) / _WIDER_NM
-        if (
-            "stage_scale" in wanted
-        ):  # of one frame as its stage zero's, by how far it is from the middle
-            slopes["stage_scale"] = (
-                slopes["stage_zero_um"]
-                * (s.depth_um - self.stage_centre_um)[:, None, None]
-            )
+            widened = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
+            wider = self._light(widened, None, bandwidth_nm)[0]
+            slopes["bandwidth_nm"] = (wider - light) / _WIDER_NM
+        if "stage_scale" in wanted:
+            # d/d(scale) = (depth - mean depth) d/d(stage zero)
+            off_um = s.depth_um - self.stage_centre_um
+            slopes["stage_scale"] = slopes["stage_zero_um"] * off_um[:, None, None]
         return light, slopes
 
     def _group_light(
         self, x: Array, group: AngleGroup, offset_nm: float, names: list[str]
     ) -> Light:
+        """Light of one field angle at one wavelength, and its derivatives by ``names``.
+
+        Field E = K P exp(i phi): kernel K of nodes to window, pupil P, phase phi. The
+        pixels see |E|² blurred by the transfer; its derivative is 2 Re(E* dE) blurred.
+
+        Args:
+            x: all parameters.
+            group: lens and frames of the field angle.
+            offset_nm: of the wavelength from that in ``x``.
+
+        Returns:
+            (frames, rows, columns) light, and its derivative by each acting parameter.
+        """
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
-        operators, phasor, lens = threads.run_concurrently(
+        operators, phasor, pupil = threads.run_concurrently(
             lambda: self._operators(x, group),
             lambda: wrapped_phasors(self._phase(x, group), group.reduced.kind),
             lambda: self._pupil(x, group, bool(names)),
         )
-        lit = lens[0] * phasor
-        field = operators.envelope(operators.coarse(lit, self.cut))
+        lens_field = pupil[0] * phasor
+        field = operators.envelope(operators.coarse(lens_field, self.cut))
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
-        conjugate, power = field.conj(), np.vdot(lit, lit).real
-        rough, out = max(self.cut, _SLOPE_TOLERANCE), dict[str, Array]()
+        conjugate = field.conj()
+        power = np.vdot(lens_field, lens_field).real
+        tolerance = max(self.cut, _SLOPE_TOLERANCE)
+        slopes = dict[str, Array]()
         for name in names:
-            rate = self._lens_rate(x, group, name, lens, phasor)
-            if rate is None:
+            slope = self._lens_rate(x, group, name, pupil, phasor)
+            if slope is None:
                 continue
-            # the part of a change that is the light itself needs no sum, nor loses
-            # digits
-            same = np.vdot(lit, rate) / power
-            rate = rate - same * lit
-            seen = operators.envelope(operators.coarse(rate, rough))
+            # the part of the derivative along the field itself: exact without a sum
+            along = np.vdot(lens_field, slope) / power
+            slope = slope - along * lens_field
+            field_slope = operators.envelope(operators.coarse(slope, tolerance))
             if name in _WINDOW:
-                moves, um = _WINDOW[name]
-                other = float(np.linalg.norm(rate)) / math.sqrt(power) / um
-                seen = seen + um * operators.rates(lit, moves, rough, beside=other)
-            out[name] = (
-                self.grid.sample(2 * (conjugate * seen).real, transfer)
-                + 2 * same.real * light
-            )
+                kernel_name, um = _WINDOW[name]
+                ratio = float(np.linalg.norm(slope)) / math.sqrt(power) / um
+                field_slope = field_slope + um * operators.rates(
+                    lens_field, kernel_name, tolerance, beside=ratio
+                )
+            change = 2 * (conjugate * field_slope).real
+            slopes[name] = self.grid.sample(change, transfer) + 2 * along.real * light
         growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
-        for name in growth.keys() & out.keys():  # the source's image grows too
-            disc = (
-                np.asarray(blurs["growth"])
-                * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
-            )
-            out[name] = out[name] + self.grid.sample(intensity, disc)
+        for name in growth.keys() & slopes.keys():  # the source's image grows too
+            widening_um = x[PLACE["pinhole_um"]] * growth[name]
+            disc_slope = np.asarray(blurs["growth"]) * widening_um[:, None, None]
+            slopes[name] = slopes[name] + self.grid.sample(intensity, disc_slope)
         for name in blurs.keys() & set(names):
-            out[name] = self.grid.sample(intensity, blurs[name])
-        return light, out
+            slopes[name] = self.grid.sample(intensity, blurs[name])
+        return light, slopes
 
     def _lens_rate(
         self,
         x: Array,
         group: AngleGroup,
         name: str,
-        lens: tuple[Array, Array, Array, Array],
+        pupil: tuple[Array, Array, Array, Array],
         phasor: Array,
     ) -> Array | None:
-        """(frames, q, p) derivative of the light on the nodes by one parameter, the
-        window's own move left out; None where it changes none. ``lens``: of
-        :meth:`_pupil`.
+        """(frames, q, p) derivative of the field on the nodes by parameter ``name``.
+
+        The derivative of the kernel is left out. None where the parameter does not act
+        on the lens field.
+
+        Args:
+            pupil: the pupil and its derivatives, of :meth:`_pupil`.
+            phasor: (frames, q, p) exp(i phase).
         """
         if name in WIDENING:
-            rate = lens[1] * group.widening[WIDENING[name]] * phasor
+            slope = pupil[1] * group.widening[WIDENING[name]] * phasor
         elif name in ANSWERING:
-            rate = lens[2][ANSWERING[name]] * phasor
+            slope = pupil[2][ANSWERING[name]] * phasor
         elif (turning := group.turning(name)) is not None:
-            rate = 1j * turning * lens[0] * phasor
+            slope = 1j * turning * pupil[0] * phasor
         elif name in GEOMETRY:
-            rate = self._phase_slope(x, group, name) * (lens[0] * phasor)
+            slope = self._phase_slope(x, group, name) * (pupil[0] * phasor)
             if name == "wavelength_nm":
-                rate = rate + lens[3] * phasor
+                slope = slope + pupil[3] * phasor
         else:
             return None
-        return np.asarray(rate.astype(phasor.dtype))
+        return np.asarray(slope.astype(phasor.dtype))
 
     def _pupil(
         self, x: Array, group: AngleGroup, slopes: bool
     ) -> tuple[Array, Array, Array, Array]:
-        """(q, p) complex lens on the nodes, its derivative by the bias per um, by units
-        of the answering causes, and by
-        the wavelength per nm."""
+        """(q, p) complex pupil on the lens nodes, with its derivatives.
+
+        In order: the pupil; its derivative by the bias per um; by the answering causes
+        (causes, q, p) per unit of the parameter; by the wavelength per nm. Without
+        ``slopes`` the derivatives are the pupil itself and mean nothing.
+        """
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
         inside = np.abs(bias) < reach
@@ -456,70 +510,80 @@ class ForwardModel:
         if not slopes:
             return pupil, pupil, pupil, pupil
         rows = (row for _, row in of_kind(ResponseError))
-        slopes_of = zip(group.pillars.slopes(pillar_change_of(x)), rows, strict=True)
-        by = [group.reduced.combined(weight, c * row.unit) for c, row in slopes_of]
-        up = x.copy()
-        up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
-        by_wave = (
-            group.pillars.coefficients(pillar_change_of(up), self._lean_um) - values
-        ) / _WAVE_STEP_NM
-        rate = group.pillars.rates(bias, weight) * inside
+        rows_of_slopes = zip(
+            group.pillars.slopes(pillar_change_of(x)), rows, strict=True
+        )
+        by_answer = [
+            group.reduced.combined(weight, coefficients * row.unit)
+            for coefficients, row in rows_of_slopes
+        ]
+        longer = x.copy()
+        longer[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
+        shifted = group.pillars.coefficients(pillar_change_of(longer), self._lean_um)
+        by_wave = (shifted - values) / _WAVE_STEP_NM
+        bias_rates = group.pillars.rates(bias, weight) * inside
         return (
             pupil,
-            group.reduced.combined(rate, values),
-            np.stack(by),
+            group.reduced.combined(bias_rates, values),
+            np.stack(by_answer),
             group.reduced.combined(weight, by_wave),
         )
 
     def _phase(self, x: Array, group: AngleGroup) -> Array:
-        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken
-        off, aberrations; light.
+        """(frames, q, p) smooth phase on the lens nodes, rad.
+
+        k (source path + sensor path) less the phase taken off before, plus aberrations,
+        residual modes and, as an imaginary part, the unevenness of the illumination.
         """
         reduced = group.reduced
         index = group.index
         nominal = group.reduced.bench
-        here = reduced.x_um, reduced.y_um
+        places = reduced.x_um, reduced.y_um
         wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
         k = 2 * math.pi / wavelength_um
-        d = nominal.distance_um + x[PLACE["distance_um"]]
-        lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
-        tx = nominal.tangents[0] + lean[0]
-        ty = nominal.tangents[1] + lean[1]
-        held = self.grid.middle_um
-        chief = reduced.films.chief_um(d, (tx, ty))
+        distance_um = nominal.distance_um + x[PLACE["distance_um"]]
+        tilt = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
+        tx = nominal.tangents[0] + tilt[0]
+        ty = nominal.tangents[1] + tilt[1]
+        middle = self.grid.middle_um
+        chief = reduced.films.chief_um(distance_um, (tx, ty))
         centre = (
-            chief[0] + x[PLACE["decentre_x_um"]] - held[0],
-            chief[1] + x[PLACE["decentre_y_um"]] - held[1],
+            chief[0] + x[PLACE["decentre_x_um"]] - middle[0],
+            chief[1] + x[PLACE["decentre_y_um"]] - middle[1],
         )
         films = FilmStack.of(self.lens.layers, wavelength_um)
-        exit_path = films.sensor_path(*here, centre, d)
+        exit_path = films.sensor_path(*places, centre, distance_um)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
-        out = source_paths(
-            *here, depth_um=depth, tangents=(tx, ty), values=x, films=films
+        phase = source_paths(
+            *places, depth_um=depth, tangents=(tx, ty), values=x, films=films
         )
-        out += exit_path
-        out *= k
-        out -= reduced.known
-        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
+        phase += exit_path
+        phase *= k
+        phase -= reduced.known
+        phase += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
         uneven = x[[PLACE[name] for name in LIGHT]]
         light = (
             -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1)
             if uneven.any()
             else 0.0
         )
-        return (
-            out
-            + light
-            + (np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0)
+        residual = (
+            np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0
         )
+        return phase + light + residual
 
     def _phase_slope(self, x: Array, group: AngleGroup, name: str) -> Array:
-        """Derivative of i times :meth:`_phase` by a geometric parameter: central
-        difference of a smooth function.
+        """(frames, q, p) derivative of i times :meth:`_phase` by a geometric parameter.
+
+        Central difference i (phi(x + h) - phi(x - h)) / (2 h) of a smooth function.
         """
         step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
-        way = step * (np.arange(len(x)) == PLACE[name])
-        return 0.5j / step * (self._phase(x + way, group) - self._phase(x - way, group))
+        shift = step * (np.arange(len(x)) == PLACE[name])
+        return (
+            0.5j
+            / step
+            * (self._phase(x + shift, group) - self._phase(x - shift, group))
+        )
 
     def _operators(self, x: Array, group: AngleGroup) -> WindowOperators:
         nominal = group.reduced.bench
@@ -531,28 +595,25 @@ class ForwardModel:
         )
 
     def _growth(self, x: Array, group: AngleGroup) -> dict[str, Array]:
-        """(frames,) relative growth of the source's image with the parameters that
-        change its magnification.
+        """(frames,) d ln(magnification) by distance and stage zero, 1/um, by parameter.
+
+        The source's image is as wide as the source times sensor over source distance.
         """
-        near, far = self._reduced(x, group)
+        sensor_um, source_um = self._reduced(x, group)
         return {
-            "distance_um": 1 / (self.films.filling * near),
-            "stage_zero_um": -1 / far,
+            "distance_um": 1 / (self.films.filling * sensor_um),
+            "stage_zero_um": -1 / source_um,
         }
 
     def _reduced(self, x: Array, group: AngleGroup) -> tuple[Array, Array]:
-        """(frames,) distances to sensor and source in air that bend paraxial light as
-        much.
+        """(frames,) distances to sensor and source, um, reduced to air.
+
+        Paraxial light bends over these in air as over the actual ones through films.
         """
-        far = self.films.apparent_um(
-            true_depth(x, self.setting, self.stage_centre_um)[group.index]
-        )
-        return np.full(
-            len(far),
-            self.films.reduced_um(
-                group.reduced.bench.distance_um + x[PLACE["distance_um"]]
-            ),
-        ), far
+        depth_um = true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        source_um = self.films.apparent_um(depth_um)
+        distance_um = group.reduced.bench.distance_um + x[PLACE["distance_um"]]
+        return np.full(len(source_um), self.films.reduced_um(distance_um)), source_um
 
     def _transfer(
         self,
@@ -561,19 +622,21 @@ class ForwardModel:
         names: list[str],
         grid: detector.DetectorGrid | None = None,
     ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
-        """Transfer of pixel, crosstalk and source disc, and its derivatives; see
-        :func:`detector.transfers`.
+        """Transfer function of pixel, crosstalk and source disc, and its derivatives.
+
+        See :func:`detector.detector_transfers`. The disc is the source's diameter times
+        the magnification of its frame. ``grid``: that of the model without it.
         """
-        near, far = self._reduced(x, group)
-        shrink = near / far
-        blur = x[PLACE["crosstalk_px"]]
-        sizes = x[PLACE["pinhole_um"]] * shrink
+        sensor_um, source_um = self._reduced(x, group)
+        magnification = sensor_um / source_um
+        crosstalk_px = x[PLACE["crosstalk_px"]]
+        sizes_um = x[PLACE["pinhole_um"]] * magnification
         kind = real_of(group.reduced.kind)
         return detector.detector_transfers(
             grid or self.grid,
-            blur,
-            sizes,
-            shrink,
+            crosstalk_px,
+            sizes_um,
+            magnification,
             sized="pinhole_um" in names,
             kind=kind,
         )

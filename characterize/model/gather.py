@@ -1,5 +1,5 @@
-"""Pillars onto even nodes: the functions of every one times its phasor, in a compiled
-loop, and the nodes.
+"""Pillars onto even nodes: the basis functions of each pillar times its phasor, in a
+compiled loop, and the nodes.
 """
 
 import math
@@ -14,11 +14,11 @@ from metalens.optics import Stop
 
 
 def even_nodes(count: int, pull: float, low: float, high: float) -> Array:
-    """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre
-    nodes t (Kosloff and Tal-Ezer 1993).
+    """(count,) nearly even places on [low, high].
 
-    A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at
-    the ends; pulled apart, 0.7 n.
+    arcsin(pull t) / arcsin(pull) of Gauss-Legendre nodes t (Kosloff and Tal-Ezer
+    1993). A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which
+    crowd at the ends; of these about 0.7 n.
     """
     t = np.arcsin(pull * legendre.gauss_legendre_nodes(count)[0]) / math.asin(pull)
     return np.asarray((low + high) / 2 + (high - low) / 2 * t)
@@ -41,22 +41,23 @@ def even_interpolation(
 
 
 def node_stretch(count: int, tolerance: float) -> float:
-    """Of :func:`even_nodes`: how near its branch may come to the ends of the nodes, for
-    a
-    wave as steep as they hold.
+    """Factor ``pull`` of :func:`even_nodes` for a wave as steep as they resolve.
+
+    The nearer to 1, the more even the nodes, and the closer the branch of arcsin
+    comes to their ends.
 
     Args:
-        count: of the nodes.
+        count: number of nodes.
         tolerance: relative error that is allowed.
     """
     return 1 / math.cosh((math.log(1e5 / tolerance) + count / 60) / count)
 
 
 def node_density(count: int, tolerance: float) -> float:
-    """Of :func:`even_nodes` places in the middle over that of Gauss-Legendre nodes.
+    """Density of :func:`even_nodes` in the middle over that of Gauss-Legendre nodes.
 
     Args:
-        count: how many are asked for.
+        count: number of nodes.
         tolerance: relative error that is allowed.
     """
     pulled = node_stretch(count, tolerance)
@@ -66,13 +67,15 @@ def node_density(count: int, tolerance: float) -> float:
 def is_mirror_symmetric(
     diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None
 ) -> bool:
-    """Whether pillars, the path of a chief ray and the shadow of a stop are alike to
-    both sides of both axes: a quarter
-    of them tells all.
+    """Whether the light on the lens is symmetric about both axes.
+
+    Then a quarter of the pillars is enough. Compared are the pillars, the direction
+    of the chief ray and the shadow of the stop.
 
     Args:
         diameters: the pillars of the lens.
         tangents: (x, y) of the chief ray.
+        stop: aperture stop in front of the lens; None for none.
     """
     d = diameters.diameter_um
     plain = (
@@ -89,9 +92,11 @@ def is_mirror_symmetric(
 
 
 def fold_weights(weights: Array, first: int) -> Array:
-    """(n, m) weights of places of which those from ``first``, the middle one, on are
-    asked for: each with its mirror
-    image's. As they are where that is 0."""
+    """Interpolation weights (n, m) of symmetric places, folded onto one half.
+
+    Places from ``first``, the middle one, on remain in use. To each weight of these
+    the weight of its mirror image is added. As they are where ``first`` is 0.
+    """
     if not first:
         return weights
     out = weights.copy()
@@ -100,19 +105,18 @@ def fold_weights(weights: Array, first: int) -> Array:
 
 
 def gather_light(table: Array, place: Array, turns: Array) -> Array:
-    """(columns, rows, 2 r) real parts, then imaginary parts, of table[:, place] times
-    turns.
+    """(columns, rows, 2 r) real, then imaginary parts of table[place] times turns.
 
-    All r numbers of a pillar lie together: one look-up each, where r arrays would be
-    walked through. Columns come
+    The r numbers of a pillar lie next to each other: one look-up each. Columns come
     first, so that a sum along them is one product of matrices.
 
     Args:
-        table: (entries, r) complex. place: (rows, columns) entries. turns: (rows,
-            columns), of the table's kind.
+        table: (entries, r) complex.
+        place: (rows, columns) entries of the table.
+        turns: (rows, columns) phasors, of the table's type.
     """
     out = np.empty((*place.shape[::-1], 2 * table.shape[1]), table.real.dtype)
-    _lit(
+    _multiply_phasors(
         np.ascontiguousarray(table.real),
         np.ascontiguousarray(table.imag),
         place,
@@ -123,14 +127,17 @@ def gather_light(table: Array, place: Array, turns: Array) -> Array:
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def _lit(real: Array, imaginary: Array, place: Array, turns: Array, out: Array) -> None:
-    r = real.shape[1]
+def _multiply_phasors(
+    real: Array, imaginary: Array, place: Array, turns: Array, out: Array
+) -> None:
+    """Fill out[j, i] with (Re, Im) of table[place[i, j]] times turns[i, j]."""
+    count = real.shape[1]
     for j in range(place.shape[1]):
         for i in range(place.shape[0]):
-            a = real[place[i, j]]
-            b = imaginary[place[i, j]]
-            c = turns[i, j].real
-            s = turns[i, j].imag
-            for k in range(r):
-                out[j, i, k] = a[k] * c - b[k] * s
-                out[j, i, r + k] = a[k] * s + b[k] * c
+            real_row = real[place[i, j]]
+            imaginary_row = imaginary[place[i, j]]
+            cosine = turns[i, j].real
+            sine = turns[i, j].imag
+            for k in range(count):
+                out[j, i, k] = real_row[k] * cosine - imaginary_row[k] * sine
+                out[j, i, count + k] = real_row[k] * sine + imaginary_row[k] * cosine

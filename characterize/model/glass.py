@@ -1,6 +1,6 @@
-"""From the source to the lens and on to the sensor: in air, through the films of the
-lens, through a plate of glass,
-tilted or not, that stands before it."""
+"""Optical paths from the source to the lens and on to the sensor: in air, through films
+of the lens, and through a plate of glass, tilted or not, in front of it.
+"""
 
 import functools
 import math
@@ -18,19 +18,17 @@ from metalens.optics.paths import sensor_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
-_TERMS, _ROUNDING = (
-    24,
-    1e-14,
-)  # of a series: reaches as long as the distance leave 1e-15 of it, shorter ones less
+# terms of a series, and its rounding: at reaches up to the distance the error is 1e-15
+_TERMS, _ROUNDING = 24, 1e-14
 Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
 @dataclass(frozen=True, slots=True)
 class BenchGeometry:
-    """Where source, lens and sensor stand for one field angle.
+    """Source, lens and sensor for one field angle.
 
-    tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
-    reference_um: source depth whose phase is taken off before gathering.
+    tangents: (x, y) of the chief ray in air; the window is where it meets the sensor.
+    reference_um: source depth whose phase is removed before gathering.
     """
 
     distance_um: float
@@ -43,9 +41,9 @@ class BenchGeometry:
 class FilmStack:
     """Plane-parallel films of a lens at one wavelength.
 
-    front: between source and lens, air apart. behind: between lens and sensor in the
-    light's order, the gap apart,
-    which is of index ``filling`` and takes all that the distance gains.
+    front: (index, thickness in um) between source and lens, without the air.
+    behind: from lens to sensor in the light's order, without the gap.
+    filling: index of the gap, whose thickness is what the distance leaves.
     """
 
     front: Pairs = ()
@@ -54,7 +52,7 @@ class FilmStack:
 
     @classmethod
     def of(cls, layers: Layers, wavelength_um: float) -> "FilmStack":
-        """Those of a lens file; films of no thickness are left out.
+        """The films of a lens file at a wavelength, without those of no thickness.
 
         Raises:
             PropagationError: one of them is metal.
@@ -81,57 +79,52 @@ class FilmStack:
         return not self.behind and self.filling == 1
 
     def pairs(self, distance_um: float) -> Pairs:
-        """Media from lens to sensor, the gap first: of less than no thickness where
-        films are longer than that.
+        """(index, thickness in um) of the media from lens to sensor, the gap first.
+
+        The gap is negative where films are thicker than the distance.
         """
-        return (
-            self.filling,
-            distance_um - sum(t for _, t in self.behind),
-        ), *self.behind
+        gap_um = distance_um - sum(t for _, t in self.behind)
+        return (self.filling, gap_um), *self.behind
 
     def reduced_um(self, distance_um: float) -> float:
-        """The distance in air that bends paraxial light as much as the way from lens to
-        sensor.
-        """
-        return (
-            distance_um
-            if self.none_behind
-            else sum(t / n for n, t in self.pairs(distance_um))
-        )
+        """Distance in air that bends paraxial light as the way from lens to sensor, um."""
+        if self.none_behind:
+            return distance_um
+        return sum(t / n for n, t in self.pairs(distance_um))
 
     def apparent_um(self, depth_um: Any) -> Any:
-        """Depths in air from which paraxial light spreads as it does from sources at
-        these depths.
-        """
+        """Depths in air of the paraxial images of sources at ``depth_um``, um."""
         return depth_um - sum(t - t / n for n, t in self.front)
 
     def chief_um(
         self, distance_um: float, tangents: tuple[float, float]
     ) -> tuple[float, float]:
-        """(x, y) where the ray of these tangents in air, through the middle of the
-        lens, meets the sensor.
+        """(x, y) where the chief ray through the lens centre meets the sensor, um.
+
+        Args:
+            tangents: (x, y) of the ray in air.
         """
-        steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
-        sine2 = 1 - 1 / steep
-        far = distance_um
+        secant2 = 1 + tangents[0] ** 2 + tangents[1] ** 2
+        sine2 = 1 - 1 / secant2
+        reach_um = distance_um
         if not self.none_behind:
-            far = media.reach_per_direction(self.pairs(distance_um), sine2) / math.sqrt(
-                steep
-            )
-        return far * tangents[0], far * tangents[1]
+            reach_um = media.reach_per_direction(
+                self.pairs(distance_um), sine2
+            ) / math.sqrt(secant2)
+        return reach_um * tangents[0], reach_um * tangents[1]
 
     def drift(self, tangents: tuple[float, float]) -> tuple[float, float]:
         """Change of :meth:`chief_um` by the distance: tangents in the gap."""
-        steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
+        secant2 = 1 + tangents[0] ** 2 + tangents[1] ** 2
         share = (
             1.0
             if self.filling == 1
-            else 1 / math.sqrt((self.filling**2 - 1) * steep + 1)
+            else 1 / math.sqrt((self.filling**2 - 1) * secant2 + 1)
         )
         return share * tangents[0], share * tangents[1]
 
     def rays(self, distance_um: float, reach2_um2: float) -> "RaySeries":
-        """Those from lens to sensor up to this reach²."""
+        """Rays from lens to sensor up to a squared reach, rounded up to share a series."""
         return _rays(
             self,
             distance_um,
@@ -145,15 +138,16 @@ class FilmStack:
         centre_um: tuple[float, float],
         distance_um: float,
     ) -> Array:
-        """(*shape) path from (x, y) on the lens to a place of the sensor, um, less that
-        from the lens centre.
+        """(*shape) path from (x, y) on the lens to ``centre_um`` on the sensor, um.
+
+        Less that from the lens centre.
         """
         if self.none_behind:
             return np.asarray(sensor_path(x_um, y_um, centre_um, distance_um))
-        start = centre_um[0] ** 2 + centre_um[1] ** 2
+        axis2 = centre_um[0] ** 2 + centre_um[1] ** 2
         reach2 = np.asarray((x_um - centre_um[0]) ** 2 + (y_um - centre_um[1]) ** 2)
-        rays = self.rays(distance_um, max(float(reach2.max()), start))
-        return np.asarray(rays.chord(reach2) - rays.chord(start))
+        rays = self.rays(distance_um, max(float(reach2.max()), axis2))
+        return np.asarray(rays.chord(reach2) - rays.chord(axis2))
 
 
 AIR = FilmStack()
@@ -192,6 +186,11 @@ class RaySeries:
 
 @functools.lru_cache(maxsize=256)
 def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
+    """Chebyshev series of rays from lens to sensor up to a squared reach, cached.
+
+    Of path difference, of reach over n sin θ and of √(passed / spread), each cut at
+    rounding.
+    """
     pairs = films.pairs(distance_um)
     order = (films.filling, *(n for n, _ in films.behind))
     node, to_series = _nodes()
@@ -200,16 +199,12 @@ def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
     level = np.sqrt(
         media.passed_at(order, w) / media.area_spreading_of_square(pairs, w)
     )
-    found = to_series @ np.stack(
-        [
-            media.whole_path(pairs, w) - along_um,
-            media.reach_per_direction(pairs, w),
-            level,
-        ],
-        1,
-    )
+    chord = media.whole_path(pairs, w) - along_um
+    bend = media.reach_per_direction(pairs, w)
+    coefficients = to_series @ np.stack([chord, bend, level], 1)
     chord, bend, level = (
-        chebyshev.chebtrim(one, _ROUNDING * np.abs(one).max()) for one in found.T
+        chebyshev.chebtrim(series, _ROUNDING * np.abs(series).max())
+        for series in coefficients.T
     )
     return RaySeries(most_um2, (chord, bend, level), along_um)
 
@@ -230,35 +225,39 @@ def source_paths(
     values: Array,
     films: FilmStack = AIR,
 ) -> Array:
-    """(frames, *shape) path to (x, y) on the lens from sources at ``depth_um``
-    (frames,), um, less that to its centre.
+    """(frames, *shape) path from the sources to (x, y) on the lens, um.
+
+    Less that to its centre. The plate of glass acts as in air alone.
 
     Args:
         x_um: places on the lens along x.
         y_um: places on the lens along y.
+        depth_um: (frames,) of the sources.
         tangents: (x, y) of the chief ray of a source on the axis, in air.
         values: all parameters, of which source_x_um, source_y_um, glass_um and the
             tilts of the glass are used.
-        films: of which those in front are gone through; beside them the plate of glass
-            acts as in air alone.
+        films: of which those in front of the lens are passed.
 
     Raises:
         FitError: the plate does not fit between source and lens.
     """
     lateral = [values[PLACE[f"source_{a}_um"]] for a in "xy"]
     out = np.empty((len(depth_um), *x_um.shape))
-    step = max(1, _TOGETHER // x_um.size)
-    for first in range(0, len(depth_um), step):
-        z = depth_um[first : first + step].reshape(-1, *(1,) * x_um.ndim)
-        seen = films.apparent_um(z)
-        leaning = tangents[0] - lateral[0] / seen, tangents[1] - lateral[1] / seen
-        out[first : first + step] = media.source_path(
-            films.front, x_um, y_um, leaning, 1 / z
+    count = max(1, _TOGETHER // x_um.size)
+    for first in range(0, len(depth_um), count):
+        z = depth_um[first : first + count].reshape(-1, *(1,) * x_um.ndim)
+        apparent_um = films.apparent_um(z)
+        chief = (
+            tangents[0] - lateral[0] / apparent_um,
+            tangents[1] - lateral[1] / apparent_um,
+        )
+        out[first : first + count] = media.source_path(
+            films.front, x_um, y_um, chief, 1 / z
         )
     if values[PLACE["glass_um"]] != 0:
-        for one, z in zip(out, films.apparent_um(depth_um).tolist(), strict=True):
-            leaning = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
-            one += extra_path(x_um, y_um, tangents=leaning, depth_um=z, values=values)
+        for path, z in zip(out, films.apparent_um(depth_um).tolist(), strict=True):
+            chief = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
+            path += extra_path(x_um, y_um, tangents=chief, depth_um=z, values=values)
     return out
 
 
@@ -270,16 +269,15 @@ def extra_path(
     depth_um: float,
     values: Array,
 ) -> Array:
-    """(*shape) path to (x, y) on the lens with the plate less that without it, um, and
-    less that at the lens centre.
+    """(*shape) path added by the plate of glass for (x, y) on the lens, um.
 
-    Along the plate's normal the source lies L away, across it rho. The path is the
-    stationary value over the
-    invariant sine s (Hamilton's characteristic function; Snell's law)
+    Less that added at the lens centre. Along the plate's normal the source lies L
+    away, across it rho. The path is the stationary value over the invariant sine s
+    (Hamilton's characteristic function; Snell's law)
 
         W = rho s + (L - t) sqrt(1 - s²) + t sqrt(n² - s²)
 
-    and three of Newton's steps from the straight ray leave less than 1e-9 um.
+    and three Newton steps from the straight ray are accurate to 1e-9 um.
 
     Args:
         x_um: places on the lens along x.
@@ -292,10 +290,10 @@ def extra_path(
         FitError: the plate does not fit between source and lens.
     """
     t = float(values[PLACE["glass_um"]])
-    lean = [math.tan(math.radians(values[PLACE[f"glass_tilt_{a}_deg"]])) for a in "xy"]
-    normal = np.array([*lean, 1.0]) / math.hypot(*lean, 1.0)
+    tilt = [math.tan(math.radians(values[PLACE[f"glass_tilt_{a}_deg"]])) for a in "xy"]
+    normal = np.array([*tilt, 1.0]) / math.hypot(*tilt, 1.0)
 
-    def longer(x: Array, y: Array) -> Array:
+    def added_path(x: Array, y: Array) -> Array:
         ray = x + depth_um * tangents[0], y + depth_um * tangents[1]
         r2 = ray[0] ** 2 + ray[1] ** 2 + depth_um**2
         along = ray[0] * normal[0] + ray[1] * normal[1] + depth_um * normal[2]
@@ -304,8 +302,8 @@ def extra_path(
                 f"{t:.4g} um of glass between lens and source, which leave {along.min():.4g} um for it"
             )
         across = np.sqrt(np.maximum(r2 - along**2, 0.0))
-        s = across / np.sqrt(r2)
-        for _ in range(3):
+        s = across / np.sqrt(r2)  # sine of the straight ray
+        for _ in range(3):  # Newton on dW/ds = 0
             outside = np.sqrt(1 - s * s)
             inside = np.sqrt(INDEX**2 - s * s)
             missed = across - (along - t) * s / outside - t * s / inside
@@ -314,5 +312,6 @@ def extra_path(
         return np.asarray(across * s + (along - t) * outside + t * inside - np.sqrt(r2))
 
     return np.asarray(
-        longer(np.asarray(x_um), np.asarray(y_um)) - longer(np.zeros(1), np.zeros(1))
+        added_path(np.asarray(x_um), np.asarray(y_um))
+        - added_path(np.zeros(1), np.zeros(1))
     )

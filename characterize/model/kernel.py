@@ -1,5 +1,5 @@
-"""The kernel from a lens to a sensor window, split into factors of two coordinates and
-a rest as smooth as can be.
+"""The propagation kernel from a lens to a sensor window, split into factors of two
+coordinates each and a smooth remainder.
 """
 
 import dataclasses
@@ -15,13 +15,13 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.optics.paths import hypot_minus_length
 
-# least tolerance of a field that single precision holds: :func:`least_tolerance` of
-# 4000 columns is 4e-5
+# least tolerance of a field in single precision: :func:`least_tolerance` of 4000
+# columns is 4e-5
 SINGLE = 1e-4
 _USUAL = 5e-4  # tolerance that the counts of nodes below are written for
-_COARSE = 9  # places a coordinate at which the rest's slopes are sampled
-_BLOCK = 24  # columns by which a range grows
-_STOP = 0.2  # share of the tolerance that may be left outside the range
+_COARSE = 9  # places a coordinate at which slopes of the remainder are sampled
+_BLOCK = 24  # columns a step of the range finder
+_STOP = 0.2  # share of the tolerance that may remain outside the range
 Span = tuple[float, float]
 
 
@@ -51,33 +51,40 @@ class CompressedKernel:
     def path(
         self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float
     ) -> tuple[Array, Array]:
-        """r - r_w, um, to a point of the window and to its centre, without
-        cancellation; and what tells the ray: r in
-        air, its reach² through films."""
-        d, (dx, dy) = self.distance_um, self._across(p, q)
-        more = X * X + Y * Y + 2 * (X * dx + Y * dy)
+        """Path difference r - r_w, um, of a node to (X, Y) and to the window's centre.
+
+        Computed without cancellation. The node is that of direction cosines (p, q).
+
+        Returns:
+            (r - r_w, ray): ``ray`` is r in air, um; through films the squared lateral
+            distance, um².
+        """
+        d = self.distance_um
+        dx, dy = self._across(p, q)
+        change2 = X * X + Y * Y + 2 * (X * dx + Y * dy)
         if self.films.none_behind:
             r_w = np.sqrt(dx**2 + dy**2 + d**2)
-            path = hypot_minus_length(r_w, more)
+            path = hypot_minus_length(r_w, change2)
             return np.asarray(path), np.asarray(r_w + path)
         near2 = np.asarray(dx**2 + dy**2)
-        far2 = near2 + more
+        far2 = near2 + change2
         rays = self.films.rays(d, max(near2.max(), far2.max()))
         return np.asarray(rays.chord(far2) - rays.chord(near2)), far2
 
     def _across(self, p: Array | float, q: Array | float) -> tuple[Any, Any]:
-        """(x, y) from the nodes to the window's centre, um."""
-        off, (tx, ty) = (
-            self.distance_um - self.nominal_um,
-            self.films.drift(self.tangents),
-        )
-        r_0 = (self.nodes_um or self.nominal_um) / np.sqrt(
-            1 - np.square(p) - np.square(q)
-        )
+        """(x, y) from the nodes (p, q) to the window's centre, um."""
+        off = self.distance_um - self.nominal_um
+        tx, ty = self.films.drift(self.tangents)
+        cosine = np.sqrt(1 - np.square(p) - np.square(q))
+        r_0 = (self.nodes_um or self.nominal_um) / cosine
         return off * tx - r_0 * p, off * ty - r_0 * q
 
     def amplitude(self, ray: Array) -> tuple[Array, Array]:
-        """(size, r) of size (1/r - ik) exp(ikr), of a ray as :meth:`path` tells it."""
+        """(size, r) of the amplitude size (1/r - ik) exp(ikr).
+
+        Args:
+            ray: as :meth:`path` returns it.
+        """
         if self.films.none_behind:
             return self.distance_um / (2 * np.pi * ray**2), ray
         rays = self.films.rays(self.distance_um, ray.max())
@@ -86,18 +93,22 @@ class CompressedKernel:
         )
 
     def window(self, X: Array, Y: Array) -> Array:
-        """exp(ik H(X, Y)); arguments broadcast."""
+        """Window factor exp(ik H(X, Y)); arguments broadcast."""
         return np.asarray(np.exp(1j * self.k * self._by_window(X, Y)))
 
     def by_x(self, p: Array | float, X: Array, off_um: float = 0.0) -> Array:
-        """F(p, b, X, 0), um, with the sensor ``off_um`` farther away; arguments
-        broadcast.
+        """Path difference F(p, b, X, 0), um, b the middle of q; arguments broadcast.
+
+        Args:
+            off_um: added to the distance of the sensor.
         """
         return self._off(off_um).path(p, _middle(self.q), X, 0.0)[0]
 
     def by_y(self, q: Array | float, Y: Array, off_um: float = 0.0) -> Array:
-        """F(a, q, 0, Y), um, with the sensor ``off_um`` farther away; arguments
-        broadcast.
+        """Path difference F(a, q, 0, Y), um, a the middle of p; arguments broadcast.
+
+        Args:
+            off_um: added to the distance of the sensor.
         """
         return self._off(off_um).path(_middle(self.p), q, 0.0, Y)[0]
 
@@ -109,31 +120,33 @@ class CompressedKernel:
         )
 
     def bands(self, wy: float, wx: float) -> tuple[float, float]:
-        """(along y, along x) highest frequency, rad/um, on a window of half sides (wy,
-        wx) of the field less the turns
-        of the middle direction (a, b): k times the most by which dF/dX and dF/dY differ
-        from those of it."""
+        """(along y, along x) highest spatial frequency of the field, rad/um.
+
+        On a window of half sides (wy, wx), less the carrier of the middle direction: k
+        times the largest difference of dF/dY and dF/dX from those of (a, b).
+        """
         t = np.linspace(-1, 1, _COARSE)
         Y, X, q, p = np.meshgrid(
             wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True
         )
-        off_x, off_y = self.turning(p, q, X, Y)
-        return self.k * float(np.abs(off_y).max()), self.k * float(np.abs(off_x).max())
+        slope_x, slope_y = self.turning(p, q, X, Y)
+        return self.k * float(np.abs(slope_y).max()), self.k * float(
+            np.abs(slope_x).max()
+        )
 
     def turning(
         self, p: Array, q: Array, X: Array | float, Y: Array | float
     ) -> tuple[Array, Array]:
-        """(dF/dX, dF/dY) less those of the middle direction (a, b) along its own axis:
-        the field's less its carrier.
+        """(dF/dX, dF/dY) less those of the middle direction (a, b) along its own axis.
+
+        Times k: local spatial frequency of the field without its carrier.
         """
         a, b = _middle(self.p), _middle(self.q)
         by_x, by_y = self._steep(p, q, X, Y)
         return by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
 
     def moved(self, name: str, share: float) -> "CompressedKernel":
-        """With the ``distance`` or the wavelength (``wave``) longer by a share of
-        itself.
-        """
+        """The kernel with ``distance`` or ``wave`` (wavelength) longer by a share."""
         if name == "distance":
             return dataclasses.replace(self, distance_um=self.distance_um * (1 + share))
         return dataclasses.replace(self, k=self.k / (1 + share))
@@ -141,20 +154,20 @@ class CompressedKernel:
     def _steep(
         self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float
     ) -> tuple[Array, Array]:
-        """dF/dX and dF/dY: the direction cosines seen from (X, Y)."""
-        (dx, dy), ray = self._across(p, q), self.path(p, q, X, Y)[1]
-        bend = (
-            ray
-            if self.films.none_behind
-            else self.films.rays(self.distance_um, ray.max()).bend(ray)
-        )
+        """dF/dX and dF/dY at (X, Y): direction cosines of the node seen from there."""
+        dx, dy = self._across(p, q)
+        ray = self.path(p, q, X, Y)[1]
+        bend = ray
+        if not self.films.none_behind:
+            bend = self.films.rays(self.distance_um, ray.max()).bend(ray)
         return np.asarray((X + dx) / bend), np.asarray((Y + dy) / bend)
 
     def rest(
         self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64
     ) -> Array:
-        """What the three factors leave, with the amplitude, as ``kind`` complex
-        numbers; arguments broadcast.
+        """The kernel less its three phase factors, as complex numbers of ``kind``.
+
+        Amplitude times exp(ik (F - F_x - F_y - H)); arguments broadcast.
         """
         path, ray = self._left(p, q, X, Y)
         size, r = self.amplitude(ray)
@@ -166,29 +179,31 @@ class CompressedKernel:
     def counts(
         self, wy: float, wx: float, tolerance: float = _USUAL
     ) -> tuple[int, int]:
-        """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx):
-        of the window, of the directions.
+        """Legendre nodes an axis for :meth:`rest`: (of the window, of the directions).
 
-        exp(ist) needs s + O(s^(1/3)) terms, s the slope of the phase a half span. Path
-        and amplitude branch where
-        r = 0, at imaginary X of about the distance, and at p² + q² = 1: there terms
-        fall as exp(-n / branch).
+        exp(ist) needs s + O(s^(1/3)) terms, s the phase over half a span. Path and
+        amplitude have branch points where r = 0, at imaginary X of about the distance,
+        and at p² + q² = 1: there terms fall as exp(-n / branch).
+
+        Args:
+            wy: half side of the window along y, um.
+            wx: the same along x.
         """
-        more = extra_digits(tolerance)
+        digits = extra_digits(tolerance)
         t = np.linspace(-1, 1, _COARSE)
         Y, X, q, p = np.meshgrid(
             wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True
         )
-        turn = self.k * self._left(p, q, X, Y)[0]
+        phase = self.k * self._left(p, q, X, Y)[0]
         slopes = [
-            float(np.abs(np.diff(turn, axis=axis)).max()) / (t[1] - t[0])
+            float(np.abs(np.diff(phase, axis=axis)).max()) / (t[1] - t[0])
             for axis in range(4)
         ]
         branch = 1 / math.asinh(self.films.reduced_um(self.distance_um) / max(wy, wx))
-        beyond = _terms(max(slopes[:2]), tolerance) + (6 + more) * branch
-        window = max(12, math.ceil((14 + more) * branch), math.ceil(beyond))
+        window_terms = _terms(max(slopes[:2]), tolerance) + (6 + digits) * branch
+        window = max(12, math.ceil((14 + digits) * branch), math.ceil(window_terms))
         aperture = int(
-            (10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + more / 8)
+            (10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + digits / 8)
         )
         return window, max(aperture, _terms(max(slopes[2:]), tolerance))
 
@@ -202,25 +217,26 @@ class CompressedKernel:
 
 
 def wrapped_phasors(phase: Array, kind: Any = np.complex64) -> Array:
-    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex
-    one makes light fade.
+    """exp(i phase) as complex numbers of type ``kind``.
+
+    The phase is wrapped in double precision first. A complex phase attenuates.
     """
     if np.iscomplexobj(phase):
         return np.exp(1j * phase).astype(kind)
     out = np.empty(np.shape(phase), kind)
-    whole = phase * (1 / (2 * np.pi))
-    small = (whole - np.rint(whole)).astype(out.real.dtype) * out.real.dtype.type(
+    turns = phase * (1 / (2 * np.pi))
+    wrapped = (turns - np.rint(turns)).astype(out.real.dtype) * out.real.dtype.type(
         2 * np.pi
     )
-    out.real, out.imag = np.cos(small), np.sin(small)
+    out.real, out.imag = np.cos(wrapped), np.sin(wrapped)
     return out
 
 
 def extra_digits(tolerance: float) -> float:
-    """ln of how much more is asked than the usual 5e-4; 0 where less is.
+    """ln(5e-4 / tolerance), the digits beyond the usual accuracy, or 0.
 
     Args:
-        tolerance: relative error that is asked for.
+        tolerance: relative error that is allowed.
     """
     return max(0.0, math.log(_USUAL / tolerance))
 
@@ -248,28 +264,29 @@ def real_of(kind: Any) -> Any:
 
 
 def least_tolerance(table: Array) -> float:
-    """Tolerance that :func:`low_rank_factors` can tell from rounding in the table's own
-    precision.
+    """Least relative tolerance of :func:`low_rank_factors` above rounding.
 
-    A block of the range less what is found of it is a sum over a column, rounded to eps
-    sqrt(rows) of the norm; the
-    search would take that noise for more range, and what is orthogonal to noise is not
-    orthogonal to the range.
+    Projections of a block are sums over a column, rounded to eps sqrt(rows) of the
+    norm. Below that the search would mistake rounding for more range.
     """
     return float(np.finfo(table.dtype).eps) * math.sqrt(max(table.shape)) / _STOP
 
 
 def low_rank_factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
-    """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but
-    for ``tolerance`` of its norm.
+    """Low-rank factors (m, r) and (r, n) of ``table`` (m, n), to a relative tolerance.
 
-    Their number need not be known: the range is found by random blocks (Halko,
-    Martinsson and Tropp 2011) until what
-    is left is a fifth of the tolerance. Third: (r,) share of the norm that is left out
-    before each term.
+    Randomised range finder (Halko, Martinsson and Tropp 2011): random blocks extend an
+    orthonormal basis until a fifth of the tolerance is outside it. A singular value
+    decomposition in that basis then gives the least rank.
+
+    Args:
+        tolerance: of the Frobenius norm, relative.
+
+    Returns:
+        (columns, rows, (r,) share of the norm that is missing before each term).
 
     Raises:
-        FitError: the tolerance is below what the table's precision holds; see
+        FitError: the tolerance is below what the table's precision allows; see
             :func:`least_tolerance`.
     """
     least = least_tolerance(table)
@@ -279,42 +296,38 @@ def low_rank_factors(table: Array, tolerance: float) -> tuple[Array, Array, Arra
         )
     rng = np.random.default_rng(0)
     total = float(np.linalg.norm(table)) ** 2
-    found = np.empty((len(table), 0), table.dtype)
+    basis = np.empty((len(table), 0), table.dtype)
     most = min(table.shape)
-    missing = total
-    while found.shape[1] < most:
-        count = min(_BLOCK, most - found.shape[1])
+    power_outside = total
+    while basis.shape[1] < most:
+        count = min(_BLOCK, most - basis.shape[1])
         block = table @ rng.standard_normal((table.shape[1], count)).astype(
             table.real.dtype
         )
-        block -= found @ (found.conj().T @ block)
-        missing = (
-            float(np.linalg.norm(block)) ** 2 / count
-        )  # its expectation is the power that is left
-        if missing < (_STOP * tolerance) ** 2 * total:
+        block -= basis @ (basis.conj().T @ block)
+        # its expectation is the power outside the range
+        power_outside = float(np.linalg.norm(block)) ** 2 / count
+        if power_outside < (_STOP * tolerance) ** 2 * total:
             break
-        block = np.linalg.qr(block)[
-            0
-        ]  # twice is enough to be orthogonal to what is there
-        found = np.concatenate(
-            [found, np.linalg.qr(block - found @ (found.conj().T @ block))[0]], 1
-        )
-        missing = 0.0
-    rows = found.conj().T @ table
-    # singular values from their own, not from their squares, which would lose half of
-    # the digits
-    size, turn = np.linalg.svd(np.linalg.qr(rows.conj().T.astype(complex))[1].conj().T)[
-        1::-1
-    ]
-    remainder = np.sqrt((np.cumsum(size[::-1] ** 2)[::-1] + missing) / total)
+        # orthogonalised twice: enough against rounding
+        block = np.linalg.qr(block)[0]
+        block = np.linalg.qr(block - basis @ (basis.conj().T @ block))[0]
+        basis = np.concatenate([basis, block], 1)
+        power_outside = 0.0
+    rows = basis.conj().T @ table
+    # not from rows @ rows^H: squares of singular values would lose half the digits
+    triangle = np.linalg.qr(rows.conj().T.astype(complex))[1].conj().T
+    vectors, singular, _ = np.linalg.svd(triangle)
+    remainder = np.sqrt((np.cumsum(singular[::-1] ** 2)[::-1] + power_outside) / total)
     rank = max(1, int((remainder > tolerance).sum()))
-    turn = turn[:, :rank].astype(table.dtype)
-    return found @ turn, turn.conj().T @ rows, remainder[:rank]
+    vectors = vectors[:, :rank].astype(table.dtype)
+    return basis @ vectors, vectors.conj().T @ rows, remainder[:rank]
 
 
 def _terms(slope: float, tolerance: float) -> int:
-    """Legendre terms of exp(i slope t) on [-1, 1] to a fiftieth of ``tolerance``: its
-    modes are (2n+1) j_n(slope)².
+    """Number of Legendre terms of exp(i slope t) on [-1, 1] to ``tolerance`` / 50.
+
+    The power of term n is (2n+1) j_n(slope)².
     """
     n = np.arange(int(slope + 60 + 8 * slope ** (1 / 3)))
     power = (2 * n + 1) * spherical_jn(n, slope) ** 2

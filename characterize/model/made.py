@@ -43,40 +43,39 @@ def as_built_transmission(
     noise_um: Array | float = 0.0,
     angle_rad: float = 0.0,
 ) -> Array:
-    """(y, x) complex transmission of every as-built pillar: diameter, process and
-    wave-front aberrations.
+    """(y, x) complex transmission of every as-built pillar; 0 where there is none.
+
+    Diameter, process and wave-front aberrations enter, and the geometric phase.
+    Accuracy: t is a table over the diameters, linear between its 2^16 entries: 1e-9
+    for 50 rad/um.
 
     Args:
         lens: the design.
         response: what height, index and sidewall do to the pillars.
         x: all parameters, in the order of ``parameters.NAMES``.
-        noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence,
-            where the proxy knows angles.
-
-    Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9
-    for 50 rad/um.
+        noise_um: added to the diameters, pillar by pillar.
+        angle_rad: of incidence, where the proxy is defined at angles.
     """
-    d, made = lens.diameters, process_state_of(x)
-    bias = _on_pillars(d, made.bias_um) + noise_um
+    d = lens.diameters
+    state = process_state_of(x)
+    bias = _on_pillars(d, state.bias_um) + noise_um
     if lens.pairs is not None:
-        t = _of_two_sizes(lens, response, bias, made.answers())
+        t = _of_two_sizes(lens, response, bias, state.answers())
     else:
         t = _of_one_size(lens, response, x, bias, angle_rad)
-    if made.has_wavefront_error():
-        t = t * np.exp(1j * _on_pillars(d, made.phase_rad))
-    return np.asarray(
-        np.where(
-            d.diameter_um > 0,
-            t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))),
-            0,
-        )
-    )
+    if state.has_wavefront_error():
+        t = t * np.exp(1j * _on_pillars(d, state.phase_rad))
+    geometric = np.exp(1j * np.asarray(lens.geometric_rad(slice(None))))
+    return np.asarray(np.where(d.diameter_um > 0, t * geometric, 0))
 
 
 def _of_two_sizes(
     lens: Lens, response: Sensitivity, bias_um: Array, answers: Array
 ) -> Array:
-    """(y, x) t by the table of the lens; what is no pillar is that of some."""
+    """(y, x) t of pillars of two sizes by the table of the lens.
+
+    Sites without a pillar get the t of some pillar; the caller masks them.
+    """
     d = lens.diameters
     kinds = Kinds.of(lens.diameters)
     pairs = response.pairs
@@ -93,15 +92,20 @@ def _of_two_sizes(
 def _of_one_size(
     lens: Lens, response: Sensitivity, x: Array, bias_um: Array, angle_rad: float
 ) -> Array:
-    """(y, x) t by the proxy of the lens; what is no pillar is that of some."""
-    d, made = lens.diameters, process_state_of(x)
+    """(y, x) t by the proxy of the lens under the process in ``x``.
+
+    Sites without a pillar get the t of some pillar; the caller masks them.
+    """
+    d = lens.diameters
+    answers = process_state_of(x).answers()
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
+    # linear interpolation in an even table of t over the diameters
     place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
     diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
     t = perturbed_transmission(
-        lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad
+        lens.proxy, response, diameter, wave, answers, angle_rad=angle_rad
     )
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]
@@ -111,8 +115,10 @@ def _of_one_size(
 def _on_pillars(
     diameters: DiameterMap, low_order: Callable[[Array, Array], Array]
 ) -> Array:
-    """(y, x) values at every pillar of a polynomial in (u, v): exact from one node more
-    than its degree in each.
+    """(y, x) values at every pillar of a polynomial ``low_order`` in (u, v).
+
+    Interpolated from Gauss-Legendre nodes, exact where these are one more than its
+    degree along each axis.
     """
     node = legendre.gauss_legendre_nodes(_NODES)[0]
     axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
@@ -121,12 +127,10 @@ def _on_pillars(
 
 
 def built_lens(design: Lens, x: Array) -> Lens:
-    """The design with the as-built diameters, wavelength and distance; they are clipped
-    to the proxy's domain.
+    """The design with the as-built diameters, wavelength and distance.
 
-    Height, index, sidewall and wave-front errors are no diameters:
-    :func:`as_built_transmission` and
-    :func:`psf_stack` hold them.
+    Diameters are clipped to the proxy's domain. Height, index, sidewall and
+    wave-front errors are in :func:`as_built_transmission` and :func:`psf_stack` only.
 
     Args:
         x: all parameters.
@@ -135,16 +139,16 @@ def built_lens(design: Lens, x: Array) -> Lens:
     bias = _on_pillars(d, process_state_of(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
-    longer = (
-        None
-        if d.length_um is None
-        else np.where(d.diameter_um > 0, np.maximum(d.length_um + bias, 0.0), 0.0)
+    built = d.diameter_um > 0
+    length_um = d.length_um
+    if length_um is not None:
+        length_um = np.where(built, np.maximum(length_um + bias, 0.0), 0.0)
+    diameters = dataclasses.replace(
+        d, diameter_um=np.where(built, grown, 0.0), length_um=length_um
     )
     return dataclasses.replace(
         design,
-        diameters=dataclasses.replace(
-            d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0), length_um=longer
-        ),
+        diameters=diameters,
         wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
         sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
         profile="as-built",
@@ -161,22 +165,22 @@ def psf_stack(
     offset_um: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-4,
 ) -> "PsfStack":
-    """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs:
-    :func:`metalens.psf.psf_stack`.
+    """PSFs (angle, depth, y, x) of the as-built lens: :func:`metalens.psf.psf_stack`.
 
-    Pillars, process, aberrations and distance enter; what belongs to one bench (stage,
-    decentre, source size,
-    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the
-    chief ray, beside that of the
-    view. Accuracy: ``error`` of the record, relative L2.
+    Pillars, process, aberrations and distance enter. What belongs to one bench does
+    not: stage, decentre, source size, crosstalk, gain, background. Accuracy: ``error``
+    of the record, relative L2.
 
     Args:
         response: what height, index and sidewall do to the pillars.
+        x: all parameters.
+        offset_um: (x, y) of the window from the chief ray, added to that of the view.
         tolerance: relative error that is allowed.
     """
     from metalens import psf
 
     parts = []
+    offset = {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())}
     for angle in view.angles_rad:
         t = as_built_transmission(
             lens, response, x, angle_rad=incidence_rad(lens.proxy, angle)
@@ -190,8 +194,7 @@ def psf_stack(
                 sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
                 angle_rad=[list(angle)],
                 tolerance=tolerance,
-                **view.arguments
-                | {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())},
+                **view.arguments | offset,
                 layers=lens.layers,
             )
         )

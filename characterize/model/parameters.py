@@ -33,16 +33,15 @@ from metalens.lens import Lens
 class FitParameter:
     """One number that describes lens or bench.
 
-    scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without
-    any metrology (inf: none).
-    low, high: bounds. free: fitted unless stated otherwise. plausible: standard deviation
-    that is assumed where
-    it is neither fitted nor stated; sigma where 0. effect: as a cause in words, where
-    it
-    is looked for while it is held; probe: so much of it is tried then. extra: fitted
-    too
-    where the usual ones do not explain the frames. reversible: near focus the opposite
-    sign looks alike. measured_by: what settles it beside the frames.
+    scale: typical uncertainty, for steps and plots. sigma: prior standard deviation
+    without any metrology (inf: none). low, high: bounds. free: fitted unless stated
+    otherwise.
+    plausible: standard deviation where it is neither fitted nor stated; 0 for sigma.
+    effect: its name as a cause in score tests while it is not fitted; empty for none.
+    probe: amount of it in these tests.
+    extra: fitted too where the usual parameters do not explain the frames.
+    reversible: near focus the opposite sign gives similar images.
+    measured_by: measurement that determines it independently of the frames.
     """
 
     name: str
@@ -386,10 +385,10 @@ class KnownValue:
 
 
 def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
-    """The rows of some parameters for a lens: what is in nm, and decentre, grow with
-    long waves (``made.coarser``).
+    """Rows of some parameters for a lens, scaled with its wavelength.
 
-    The distance may be wrong by a quarter, so that no search runs into the lens.
+    What is in nm, and decentre, grow for longer waves (:func:`wavelength_scale`). The
+    distance is bounded to a quarter of itself, so that no search runs into the lens.
 
     Args:
         names: of the parameters.
@@ -436,7 +435,7 @@ def _times(row: FitParameter, factor: float) -> FitParameter:
 
 
 def unfitted_sizes(known: dict[str, KnownValue], lens: Lens) -> dict[str, float]:
-    """Stated sizes of what is never fitted, by name; they are taken out of ``known``.
+    """Stated sizes of unfitted effects, by name; they are removed from ``known``.
 
     Raises:
         ConfigError: that of a stop, which the lens does not have.
@@ -474,7 +473,7 @@ def parameter_vector(values: Mapping[str, float] | None = None) -> Array:
 
 
 def process_state_of(x: Array) -> State:
-    """The made lens that all parameters mean; what belongs to the bench is left out.
+    """State of the as-built lens by all parameters, without those of the bench.
 
     Args:
         x: all parameters, in the order of ``PARAMETERS``.

@@ -48,48 +48,45 @@ _KEPT = 64  # lenses whose slopes are kept on disk
 def log_response_slopes(
     lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()
 ) -> Sensitivity:
-    """d ln t by the answering causes of :mod:`metalens.fabrication.perturbations` over
-    the diameters
-    of a lens, or t itself.
+    """d ln t by the answering causes over the diameters of a lens, or a table of t.
 
-    Upright round pillars whose proxy is that of the cell: t by the modal method at
-    every diameter that a bias can lead to and at five heights and seven indices within
-    the bounds of the fit (:class:`metalens.fabrication.Solved`), to 3e-3 there and up
-    to 0.03
-    between them where a resonance moves by. The slopes beside the table are polynomials
-    of the least degree below 15 that meets ``tolerance`` at held-out diameters.
+    The causes are those of :mod:`metalens.fabrication.perturbations`.
 
-    Other round ones: derivatives by RCWA at a fixed truncation
-    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` adds what
-    the
-    truncation leaves. Cells that no solver takes get the effective-index slopes of
-    :func:`metalens.fabrication.proxy_sensitivity`, pillars that are not round those of their
-    own
-    shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
-    lens.
+    Upright round pillars whose proxy is that of the cell: a table of t by the modal
+    method (:class:`metalens.fabrication.Solved`) at every diameter that a bias can
+    reach, five heights and seven indices within the bounds of the fit. Its error is
+    3e-3 there, and up to 0.03 between them where a resonance moves by. The slopes are
+    polynomials of the least degree below 15 that meets ``tolerance`` at held-out
+    diameters.
 
-    What was solved once is kept in the user's cache folder, ``metalens`` in
-    $XDG_CACHE_HOME or ~/.cache.
+    Other round pillars: derivatives by RCWA at a fixed truncation
+    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` includes
+    the truncation. Cells that no solver takes: effective-index slopes of
+    :func:`metalens.fabrication.proxy_sensitivity`; pillars that are not round: those
+    of their own shape. Pillars of two sizes: slopes of up to 24 pairs of sizes, for
+    the light of the lens.
+
+    Results are cached on disk, in ``metalens`` in $XDG_CACHE_HOME or ~/.cache.
 
     Args:
-        lens: its cell, its diameters and its light. tolerance: of the slopes, relative.
-        wanted: names of causes that a table lacks (the sidewall) and that are wanted
-            all the same; zero without.
+        lens: its cell, its diameters and its light.
+        tolerance: of the slopes, relative.
+        wanted: names of causes to include although a table lacks them (the sidewall);
+            their slopes are zero otherwise.
 
     Raises:
-        FitError: a cause is wanted that pillars of this shape cannot have. CellError,
-            MaterialError: pillars that are not round, and that no solver takes.
+        FitError: a cause in ``wanted`` does not exist for pillars of this shape.
+        CellError, MaterialError: pillars that are not round, and that no solver takes.
     """
     for name in inapplicable_names(lens.cell):
         if name in wanted:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
     if lens.pairs is not None:
         return _of_pairs(lens)
-    about = _about(
-        lens, tolerance, [row.name for row in _unknown() if row.name in wanted]
-    )
+    extra = [row.name for row in _unknown() if row.name in wanted]
+    description = _about(lens, tolerance, extra)
     try:
-        return _cached(about, lambda: _solve(lens, tolerance, wanted))
+        return _cached(description, lambda: _solve(lens, tolerance, wanted))
     except (CellError, MaterialError):
         if not lens.cell.round:
             raise
@@ -99,25 +96,17 @@ def log_response_slopes(
 def _of_pairs(lens: Lens) -> Sensitivity:
     """Of pillars of two sizes, for the light of the lens."""
     kinds = Kinds.of(lens.diameters)
-    about = _about(
-        lens,
-        0.0,
-        [
-            "two sizes",
-            lens.light,
-            repr(kinds.width_um.tolist()),
-            repr(kinds.length_um.tolist()),
-        ],
-    )
+    sizes = repr(kinds.width_um.tolist()), repr(kinds.length_um.tolist())
+    description = _about(lens, 0.0, ["two sizes", lens.light, *sizes])
     return _cached(
-        about, lambda: Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
+        description, lambda: Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
     )
 
 
-def _cached(about: str, make: Callable[[], Sensitivity]) -> Sensitivity:
-    """What ``make`` returns, from disk where it was made before of the same ``about``,
-    the same sources and the same libraries; a folder that cannot be written costs time
-    alone.
+def _cached(description: str, make: Callable[[], Sensitivity]) -> Sensitivity:
+    """Result of ``make``, cached on disk by ``description``, sources and libraries.
+
+    Where the folder cannot be written nothing is cached.
     """
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     try:
@@ -125,12 +114,12 @@ def _cached(about: str, make: Callable[[], Sensitivity]) -> Sensitivity:
     except OSError:
         return make()
     call = memory.cache(_call, ignore=["make"])
-    key = f"{about} {_source_digest()} {np.__version__} {scipy.__version__}"
-    known = call.check_call_in_cache(key, make)
-    found: Sensitivity = call(key, make)
-    if not known:
+    key = f"{description} {_source_digest()} {np.__version__} {scipy.__version__}"
+    stored = call.check_call_in_cache(key, make)
+    slopes: Sensitivity = call(key, make)
+    if not stored:
         memory.reduce_size(items_limit=_KEPT)
-    return found
+    return slopes
 
 
 def _call(key: str, make: Callable[[], Sensitivity]) -> Sensitivity:
@@ -149,16 +138,16 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
-    """All that the slopes of a lens come from, as text."""
+def _about(lens: Lens, tolerance: float, extra: Sequence[str]) -> str:
+    """Text of everything that the slopes of a lens depend on: the key of the cache."""
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     cell = lens.cell
     films = [film.material for film in (*cell.under, *cell.over)]
     sections = [
-        one
+        material
         for layer in cell.layers
-        for one in (layer.material, layer.between, layer.coat)
-        if one is not None
+        for material in (layer.material, layer.between, layer.coat)
+        if material is not None
     ]
     media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
     indices = [index(medium, lens.wavelength_um) for medium in media]
@@ -173,13 +162,16 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
             float(d.max()),
             proxy,
             tolerance,
-            wanted,
+            extra,
         )
     )
 
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
-    """:func:`log_response_slopes` by the solvers."""
+    """:func:`log_response_slopes` by the solvers, without the cache.
+
+    Slopes are sampled at Chebyshev nodes of the diameters and fitted by polynomials.
+    """
     if not lens.cell.round:
         return proxy_sensitivity(lens)
     table = solving.solved_transmission(lens) if _upright(lens.cell) else None
@@ -190,8 +182,8 @@ def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
     diameters = (low + high) / 2 + (high - low) / 2 * unit
     truncation = 0.0
     if table is None:
-        found = own_rates(lens, diameters)
-        rows, truncation = found.rates, found.error
+        rates = own_rates(lens, diameters)
+        rows, truncation = rates.rates, rates.error
     else:
         rows = _table_slopes(lens, table, diameters, wanted)
     degree, error = _degree(unit, rows, tolerance)
@@ -207,8 +199,9 @@ def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
 def _table_slopes(
     lens: Lens, table: Solved, diameter_um: Array, wanted: Container[str]
 ) -> Array:
-    """(answering causes, n) d ln t at design by a table, by RCWA where it has none and
-    the cause is wanted.
+    """(answering causes, n) d ln t at the design, from the table.
+
+    By RCWA where the table lacks a cause in ``wanted``; zero for the others.
     """
     series = table.series(diameter_um)
     rows = np.zeros((len(series), len(diameter_um)), complex)
@@ -232,22 +225,24 @@ def _upright(cell: Cell) -> bool:
 
 
 def _degree(unit: Array, rows: Array, tolerance: float) -> tuple[int, float]:
-    """(degree, error): every third node is held out and judged."""
-    judged = np.arange(len(unit)) % 3 == 1
+    """(degree, error) of the polynomial fit of ``rows`` (causes, n) over ``unit`` (n,).
+
+    The least degree whose error at held-out nodes, every third, is below the
+    tolerance; else that of the least error. Errors are relative to the largest
+    deviation from the mean.
+    """
+    held_out = np.arange(len(unit)) % 3 == 1
     size = np.maximum(
         np.abs(rows - rows.mean(1, keepdims=True)).max(1), 1e-9 * np.abs(rows).max()
     )
     errors = []
     for degree in range(1, _MOST + 1):
-        guess = [
-            chebyshev.chebval(
-                unit[judged], chebyshev.chebfit(unit[~judged], row[~judged], degree)
-            )
-            for row in rows
+        fits = [
+            chebyshev.chebfit(unit[~held_out], row[~held_out], degree) for row in rows
         ]
-        errors.append(
-            float((np.abs(np.array(guess) - rows[:, judged]).max(1) / size).max())
-        )
+        predictions = [chebyshev.chebval(unit[held_out], fit) for fit in fits]
+        difference = np.abs(np.array(predictions) - rows[:, held_out]).max(1)
+        errors.append(float((difference / size).max()))
         if errors[-1] <= tolerance:
             break
     best = int(np.argmin(errors))

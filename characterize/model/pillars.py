@@ -70,9 +70,7 @@ class ChangeRange:
 
     @classmethod
     def of(cls, wavelength_um: float) -> "ChangeRange":
-        """Of lenses for a wavelength: lengths are larger where it is longer
-        (``made.coarser``).
-        """
+        """The range for a wavelength: lengths grow with it (:func:`wavelength_scale`)."""
         more = wavelength_scale(wavelength_um)
         rows = zip(_ROWS, cls().answers, strict=True)
         answers = tuple(
@@ -82,21 +80,20 @@ class ChangeRange:
 
     def within(self, cell: Cell) -> "ChangeRange":
         """Without what pillars of this cell cannot have."""
-        none = inapplicable_names(cell)
-        kept = (
-            0.0 if row.name in none else amount
+        absent = inapplicable_names(cell)
+        answers = (
+            0.0 if row.name in absent else amount
             for row, amount in zip(_ROWS, self.answers, strict=True)
         )
-        return dataclasses.replace(self, answers=tuple(kept))
+        return dataclasses.replace(self, answers=tuple(answers))
 
 
 class PillarResponse:
-    """Transmission of pillars under change, exact and in its low-rank basis.
+    """Transmission of pillars under change, exact and in a low-rank basis.
 
     basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,)
-    biases where t is
-    formed. error: largest |t - low-rank| met on random changes inside the range, that
-    the basis was not made from.
+    biases at which t is computed. error: largest |t - low-rank t| over random changes
+    within the range, which the basis was not computed from.
     """
 
     _laid: tuple[int, ...] = (
@@ -114,20 +111,24 @@ class PillarResponse:
         tolerance: float = 3e-5,
         angle_rad: float = 0.0,
     ) -> None:
+        """Compute the basis, with more bias nodes until the error is below ``_MISSED``.
+
+        Args:
+            lens: its cell, proxy and diameters.
+            response: slopes of ln t by the answering causes.
+            span: largest changes; the usual ones without it.
+            tolerance: rms error of t in the basis.
+            angle_rad: of incidence.
+        """
         span = (span or ChangeRange.of(lens.wavelength_um)).within(lens.cell)
-        self.lens, self.response, self.span, self.angle_rad = (
-            lens,
-            response,
-            span,
-            angle_rad,
-        )
+        self.lens = lens
+        self.response = response
+        self.span = span
+        self.angle_rad = angle_rad
         self.diameter_um = self._kinds()
-        b = max(
-            7,
-            2 * math.ceil(span.bias_um / (0.006 * wavelength_scale(lens.wavelength_um)))
-            + 1,
-        )
-        for times in self._laid:  # resonances want more
+        step_um = 0.006 * wavelength_scale(lens.wavelength_um)
+        b = max(7, 2 * math.ceil(span.bias_um / step_um) + 1)
+        for times in self._laid:  # resonances need more nodes
             self._lay(times * (b - 1) + 1, tolerance)
             self.error = self._measure()
             if self.error < _MISSED:
@@ -139,7 +140,10 @@ class PillarResponse:
         return np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
 
     def _lay(self, count: int, tolerance: float) -> None:
-        """Bias nodes, and the basis of what happens there."""
+        """Set ``count`` bias nodes (Chebyshev) and the low-rank basis of t there.
+
+        Left singular vectors of t over the training changes, to rms ``tolerance``.
+        """
         unit = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         self.nodes_um = unit * self.span.bias_um
         share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
@@ -149,17 +153,15 @@ class PillarResponse:
         self._colours = self._through_colours()
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
+        # rms of t outside the first functions
         tail = np.sqrt(
             np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um)
         )
-        self.basis = np.ascontiguousarray(
-            u[:, : max(1, int((tail > tolerance).sum()))].T.conj()
-        )
+        rank = max(1, int((tail > tolerance).sum()))
+        self.basis = np.ascontiguousarray(u[:, :rank].T.conj())
 
     def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
-        """Of the pillars at (b, 1) bias nodes: under the answering causes, and what the
-        edges add to the size.
-        """
+        """Response to the answering causes, and factor of the bias, at (b, 1) nodes."""
         d = self.diameter_um + nodes
         return prepare_response(self.lens.proxy, self.response, d), bias_ratio(
             self.response, d, nodes
@@ -185,9 +187,12 @@ class PillarResponse:
     def coefficients(self, change: PillarChange, lean_um: float = 0.0) -> Array:
         """(b, r) coefficients of t in the basis, as Chebyshev series of the bias.
 
-        lean_um: diameter at the foot of the pillars less that at half height, which is
-            that at half height less that at
-        the top. The mean of ln t over the height, by Gauss's two points.
+        With leaning walls t is that of the mean of ln t over the height, by two Gauss
+        points.
+
+        Args:
+            lean_um: diameter at the foot less that at half height, um; equal to that at
+                half height less that at the top.
         """
         t = self._at_nodes(change)
         if lean_um:
@@ -208,8 +213,10 @@ class PillarResponse:
         return np.asarray(self._to_series @ (rates @ self.basis.T))
 
     def _at_nodes(self, change: PillarChange) -> Array:
-        """:meth:`exact` at the bias nodes; what the last few wavelengths made of the
-        design is kept.
+        """(b, grid) :meth:`exact` at the bias nodes.
+
+        t as designed, cached for eight wavelengths, times the factors of the answering
+        causes and of the bias.
         """
         wave = self.lens.wavelength_um + change.wavelength_um
         if wave not in self._designed:
@@ -225,9 +232,13 @@ class PillarResponse:
         )
 
     def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
-        """(b, grid) t as designed at the bias nodes; between wavelengths that are known
-        where ``share`` of the span is
-        inside it."""
+        """(b, grid) t as designed at the bias nodes, at ``wave_um``.
+
+        Interpolated between sampled wavelengths where |share| <= 1.
+
+        Args:
+            share: offset from the design's wavelength over the span.
+        """
         if abs(share) <= 1 and len(self._colours):
             return np.asarray(
                 np.tensordot(
@@ -242,8 +253,9 @@ class PillarResponse:
         )
 
     def _through_colours(self) -> Array:
-        """(colours, b, grid) :meth:`_designed_at` over the span of wavelengths; none
-        where the proxy ends before.
+        """(colours, b, grid) t as designed at Legendre nodes of the wavelengths.
+
+        Empty where the proxy's range does not contain the span.
         """
         middle, reach = self.lens.wavelength_um, self.span.wavelength_um
         low, high = self.lens.proxy.wavelengths_um
@@ -269,7 +281,7 @@ class PillarResponse:
         return self.place(diameters.diameter_um[rows, columns])
 
     def place(self, diameter_um: Array) -> Array:
-        """Entry of :meth:`table` nearest to designed diameters (any shape)."""
+        """(*shape) entry of :meth:`table` nearest to each designed diameter, um."""
         low, high = self.diameter_um[0], self.diameter_um[-1]
         entry = np.rint(
             (np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))
@@ -288,8 +300,11 @@ class PillarResponse:
         return value
 
     def rates(self, bias_um: Array, weights: Array) -> Array:
-        """(b, *shape) derivatives of :meth:`weights` by the bias, from their values
-        there.
+        """(b, *shape) derivatives of :meth:`weights` by the bias, 1/um.
+
+        Args:
+            bias_um: (*shape).
+            weights: (b, *shape) polynomials at these biases.
         """
         x = np.asarray(bias_um) / self.span.bias_um
         reach = self.span.bias_um
@@ -300,47 +315,42 @@ class PillarResponse:
         return slope / reach
 
     def _training(self) -> list[PillarChange]:
-        s, waves = self.span, self._waves()
+        """Changes that the basis is computed from: none, each extreme, random ones."""
+        s = self.span
+        waves = self._waves()
         single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
-        both = [
-            PillarChange(tuple(sign * one[:-1]), sign * one[-1])
-            for one in single
-            if one.any()
+        extremes = [
+            PillarChange(tuple(sign * change[:-1]), sign * change[-1])
+            for change in single
+            if change.any()
             for sign in (1, -1)
         ]
-        return [
-            PillarChange(),
-            *both,
-            *(_draw(np.random.default_rng(i), s, waves) for i in range(6)),
-        ]
+        random = (_draw(np.random.default_rng(i), s, waves) for i in range(6))
+        return [PillarChange(), *extremes, *random]
 
     def _waves(self) -> bool:
         return bool(np.ptp(self.lens.proxy.wavelengths_um) > 0)
 
     def _measure(self) -> float:
+        """Largest |t - low-rank t| over 40 random changes and biases within the range."""
         random = np.random.default_rng(99)
         worst = 0.0
         for _ in range(40):
             change = _draw(random, self.span, self._waves())
             bias = random.uniform(-0.7, 0.7) * self.span.bias_um
             c = self.weights(np.array(bias)) @ self.coefficients(change)
-            worst = max(
-                worst,
-                float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()),
-            )
+            difference = self.basis.conj().T @ c - self.exact(bias, change)
+            worst = max(worst, float(np.abs(difference).max()))
         return worst
 
 
 class PairedPillars(PillarResponse):
-    """As :class:`PillarResponse`, of two sizes: functions of the kinds of pillars that
-    the
-    lens has, one after the other.
+    """As :class:`PillarResponse`, for pillars of two sizes: one column for each pair.
 
-    A bias moves all edges, so both sizes alike, along the table of the lens; the
-    answers are those of the designed
-    sizes. t is taken to be that of the design's wavelength: the table knows single
-    ones. ``diameter_um``: width of
-    every kind.
+    A bias moves all edges, so it adds to both sizes, along the table of the lens. The
+    slopes by the answering causes are those of the designed sizes. t is that of the
+    design's wavelength, as the table has single ones.
+    ``diameter_um``: width of each pair.
     """
 
     _laid = 3, 6  # rectangles have more resonances than rounds
@@ -425,18 +435,21 @@ def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
 
 
 def _draw(random: np.random.Generator, span: ChangeRange, waves: bool) -> PillarChange:
-    known = np.flatnonzero(span.answers)
-    *some, wave = random.uniform(-0.7, 0.7, len(known) + 1)
+    """Random change within 0.7 of the range; with a wavelength where ``waves``."""
+    possible = np.flatnonzero(span.answers)
+    shares = random.uniform(-0.7, 0.7, len(possible) + 1)
+    wave = shares[-1]
     amounts = np.zeros(len(span.answers))
-    amounts[known] = np.array(some) * np.array(span.answers)[known]
+    amounts[possible] = shares[:-1] * np.array(span.answers)[possible]
     return PillarChange(
         tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves
     )
 
 
 def _cubic(values: Array, place: Array) -> Array:
-    """The cubic through the four samples nearest to each place of an even grid, at its
-    ends through the last four.
+    """Cubic Lagrange interpolation at ``place`` (in samples) of an even grid.
+
+    Through the four nearest samples, at the ends through the outermost four.
     """
     i = np.clip(place.astype(int), 1, len(values) - 3)
     t = place - i

@@ -36,27 +36,22 @@ from metalens.lens import Lens
 from metalens.optics import media
 
 Axes = tuple[Array, Array]
-_KEPT = 12  # operators: of a place that each of some threads is at
-_SPARE, _WIDER = (
-    1.05,
-    1.25,
-)  # of bands over the nominal ones, and from there on: one serves all distances of a fit
-# weight of directions that miss the lens, and of the rim, when the low-rank terms are
-# chosen
+_KEPT = 12  # cached operators: for the places of several threads
+# bands are rounded up to _SPARE * _WIDER**n of the nominal one: one for all distances
+_SPARE, _WIDER = 1.05, 1.25
+# weight of directions off the lens, and of the window's rim, in the low-rank terms
 _BESIDE = 0.1
 
 
 class CompressedLens:
     """A lens on nodes for one field angle.
 
-    nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same
-    over the lens radius.
-    known: (q, p) phase there that was taken off, that of :meth:`path`.
-    gathered: (r, q, p) one field for each function of :class:`Pillars`. kind: of the
-    complex numbers.
-
-    Tables and sums are in single precision where ``tolerance`` lets them be, else in
-    double: see :func:`precision`.
+    p, q: (q, p) direction cosines of the nodes from the window's centre. x_um, y_um:
+    (q, p) their places on the lens; u, v: the same over the lens radius.
+    known: (q, p) phase that was removed at the nodes, rad: k times :meth:`path`.
+    gathered: (r, q, p) one field for each basis function of the pillars.
+    kind: complex number type, single precision where ``tolerance`` allows it, else
+    double; see :func:`complex_precision`.
     """
 
     def __init__(
@@ -69,25 +64,34 @@ class CompressedLens:
         depths_um: Array,
         tolerance: float,
     ) -> None:
-        self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
+        """Choose the nodes and gather the pillars on them.
+
+        Args:
+            lens: the design.
+            pillars: basis functions of its pillars.
+            bench: geometry of one field angle.
+            window_um: side of a square about the chief ray that contains the window.
+            depths_um: range of source depths, whose defocus the nodes resolve.
+            tolerance: relative error of the field.
+        """
+        self.bench = bench
+        self.tolerance = tolerance
+        self.window_um = window_um
         self.kind = complex_precision(tolerance)
-        self._layers, self.films = (
-            lens.layers,
-            FilmStack.of(lens.layers, bench.wavelength_um),
-        )
-        self._near_um = self.films.reduced_um(
-            bench.distance_um
-        )  # that directions are counted at
+        self._layers = lens.layers
+        self.films = FilmStack.of(lens.layers, bench.wavelength_um)
+        # distance in air at which directions are counted
+        self._near_um = self.films.reduced_um(bench.distance_um)
         self.half_um = np.array([lens.diameters.y_um[-1], lens.diameters.x_um[-1]])
-        self.site_um2, self.radius_um = (
-            lens.diameters.site_um2,
-            lens.diameters.radius_um,
-        )
+        self.site_um2 = lens.diameters.site_um2
+        self.radius_um = lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], WindowOperators] = {}
-        self._near, self._usual = False, dict[tuple[float, ...], CouplingTerms]()
-        self._lesser: dict[tuple[float, int], Any] = {}  # both of these, of quick ones
-        self._from_few: dict[int, Array] = {}
+        self._near = False  # whether the nominal terms serve every place: see quick
+        self._usual = dict[tuple[float, ...], CouplingTerms]()
+        # operators and nominal terms of quick copies, by (window, nodes)
+        self._lesser: dict[tuple[float, int], Any] = {}
+        self._from_few: dict[int, Array] = {}  # interpolation matrices: see _to_nodes
         self._changing = threading.Lock()  # several fits may ask at once
         self._blur = self.k * float(
             np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max()
@@ -97,9 +101,7 @@ class CompressedLens:
         self._hold(self._gather(lens, pillars))
 
     def _hold(self, gathered: Array) -> None:
-        """Take the (r, q, p) fields of the lens on the nodes, and what else belongs to
-        these.
-        """
+        """Set the (r, q, p) fields on the nodes, and the coordinates and phase there."""
         self.gathered = gathered.astype(self.kind)
         self._parts = [
             np.ascontiguousarray(part).reshape(len(gathered), -1)
@@ -111,19 +113,19 @@ class CompressedLens:
         )
 
     def quick(self, window_um: float | None = None) -> "CompressedLens":
-        """With terms that belong to the nominal wavelength and distance: what is left
-        of the kernel when its factors
-        are put on hardly changes with either. On fewer nodes, and fewer yet for a
-        window narrower than its own, beside
-        which there is no light: light that lands s off a place of the window turns by s
-        over the nodes, and n of these
-        show it there only where s is 2 n; half of what tells s from all others is
-        enough to keep it off."""
+        """A fast copy whose rest of the kernel is that of the nominal place.
+
+        The rest hardly changes with wavelength and distance, once the factors of the
+        actual ones are applied. The copy has fewer nodes, and fewer still for a
+        narrower window with no light outside. Light at s half turns from a place has
+        a phase of slope s on the nodes; n nodes confuse both only at s = 2 n.
+
+        Args:
+            window_um: half width of the window; its own without it.
+        """
         part = copy.copy(self)
-        part._near, part.window_um = (
-            True,
-            min(window_um or self.window_um, self.window_um),
-        )
+        part._near = True
+        part.window_um = min(window_um or self.window_um, self.window_um)
         part._directions(0.0 if part.window_um < self.window_um else self._blur)
         part._operators, part._usual = self._lesser.setdefault(
             (part.window_um, part.nodes), ({}, {})
@@ -137,34 +139,35 @@ class CompressedLens:
     def shaded(
         self, lens: Lens, pillars: PillarResponse, depth_um: float
     ) -> "CompressedLens":
-        """Lit from a depth through the lens' stop; what does not hang on the pillars is
-        shared with this one.
+        """The lens lit from ``depth_um`` through its stop.
+
+        It shares with this one all that does not depend on the pillars.
         """
         part = copy.copy(self)
         part._hold(self._gather(lens, pillars, depth_um))
         return part
 
     def seen_by(self, other: "CompressedLens", values: Array) -> Array:
-        """(..., q, p) a smooth function on the nodes as it is on those of another one
-        of the same lens.
-        """
+        """(..., q, p) smooth ``values`` interpolated to the nodes of ``other``."""
         to_q, to_p = self._between(self, other)
         return np.asarray(to_q @ values @ to_p.T)
 
     @staticmethod
-    def _between(one: "CompressedLens", other: "CompressedLens") -> list[Array]:
-        """Interpolation along q and along p from the nodes of one to those of the
-        other.
-        """
-        ends = (one._q, other.q[:, 0]), (one._p, other.p[0])
+    def _between(source: "CompressedLens", target: "CompressedLens") -> list[Array]:
+        """Interpolation matrices along q and p from the nodes of one to another."""
+        axes = (source._q, target.q[:, 0]), (source._p, target.p[0])
         return [
-            gather.even_interpolation(one.nodes, one._pull, span, at)
-            for span, at in ends
+            gather.even_interpolation(source.nodes, source._pull, span, places)
+            for span, places in axes
         ]
 
-    def _directions(self, beyond: float) -> None:
-        """Nodes for waves as steep as the window makes them, and ``beyond``: radians a
-        half span.
+    def _directions(self, beyond_rad: float) -> None:
+        """Set nodes of direction cosines (p, q), fine enough for the steepest wave.
+
+        Its phase over half a span is that of the window's edge plus ``beyond_rad``.
+
+        Raises:
+            FitError: more than 600 nodes a side, or an aperture angle that is too wide.
         """
         d, (cx, cy) = self._near_um, self.center_um
         hy, hx = self.half_um
@@ -173,10 +176,11 @@ class CompressedLens:
         r = np.sqrt(x**2 + y**2 + d**2)
         self._p = float((x / r).min()), float((x / r).max())
         self._q = float((y / r).min()), float((y / r).max())
+        # phase over half the span of directions: of the window's edge, then in all
         swing = self.k * self.window_um / 2 * max(np.ptp(self._p), np.ptp(self._q)) / 2
-        bands = (
+        phase_rad = (
             swing
-            + beyond
+            + beyond_rad
             + 8
             + 2 * (swing + 1) ** (1 / 3)
             + 1.5 * extra_digits(self.tolerance)
@@ -184,7 +188,7 @@ class CompressedLens:
         self.nodes = next(
             n
             for n in itertools.count(12)
-            if n * gather.node_density(n, self.tolerance) >= bands
+            if n * gather.node_density(n, self.tolerance) >= phase_rad
         )
         if self.nodes > 600:
             raise FitError(
@@ -204,8 +208,13 @@ class CompressedLens:
         self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
 
     def combined(self, weight: Array, series: Array) -> Array:
-        """(q, p) sum over r of the gathered fields times the series (b, r) in
-        ``weight`` (b, q, p) real functions.
+        """(q, p) field: sum over r of gathered fields times their coefficients.
+
+        The coefficient of field r is the sum over b of weight[b] series[b, r].
+
+        Args:
+            weight: (b, q, p) real functions.
+            series: (b, r) complex.
         """
         flat, (real, imaginary) = weight.reshape(len(weight), -1), self._parts
         c, s = (part.T.astype(weight.dtype) @ flat for part in _pair(series))
@@ -222,19 +231,22 @@ class CompressedLens:
     def _gather(
         self, lens: Lens, pillars: PillarResponse, depth_um: float | None = None
     ) -> Array:
-        """(r, q, p) fields; depth_um: of the source whose light the lens' stop shades,
-        None for all that meets it.
+        """(r, q, p) fields of the lens on the direction nodes, one per pillar function.
+
+        Each block of rows is summed onto (n, n) even nodes of the lens by adjoint
+        interpolation; then follows :meth:`_to_directions`.
+
+        Args:
+            depth_um: of the source whose light the stop shades; None: without stop.
         """
         d, (hy, hx) = lens.diameters, self.half_um
         x, y = d.x_um, d.y_um
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = real_of(self.kind)
         pull = gather.node_stretch(n, self.tolerance)
-        y0, x0 = (
-            (len(y) // 2, len(x) // 2)
-            if gather.is_mirror_symmetric(d, self.bench.tangents, lens.layers.stop)
-            else (0, 0)
-        )
+        y0, x0 = 0, 0  # first row and column to sum
+        if gather.is_mirror_symmetric(d, self.bench.tangents, lens.layers.stop):
+            y0, x0 = len(y) // 2, len(x) // 2  # one quarter, folded
         across, along = (
             gather.fold_weights(
                 gather.even_interpolation(n, pull, (-h, h), t), first
@@ -246,11 +258,11 @@ class CompressedLens:
         parts = [slice(start, start + block) for start in range(y0, len(y), block)]
         sums = np.zeros((len(parts), n, n, 2 * r), real_kind)
 
-        def some(first: int, last: int) -> None:
+        def sum_blocks(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
-                some = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
-                built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
+                filled = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
+                built = slice(filled[0], filled[-1] + 1) if len(filled) else slice(0)
                 light = gather.gather_light(
                     table,
                     pillars.entries(d, rows, built),
@@ -260,38 +272,46 @@ class CompressedLens:
                 sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
         with threads.one_blas_thread():
-            threads.run_split(len(parts), some)
+            threads.run_split(len(parts), sum_blocks)
         whole = sums.sum(0, dtype=float).T
         return self._to_directions(whole[:r] + 1j * whole[r:], n)
 
     def _met(
         self, lens: Lens, rows: slice, built: slice, depth_um: float | None
     ) -> Array:
-        """(rows, columns) phasors that a block of pillars meets: of the path taken off,
-        of how they are turned, and
-        behind a stop its shadow."""
+        """(rows, columns) phasors that multiply a block of pillars.
+
+        exp(i (k path + geometric phase)), times the shadow of the stop for a source at
+        ``depth_um``.
+
+        Args:
+            rows: of the block.
+            built: columns of the block.
+        """
         d = lens.diameters
         places = d.x_um[None, built], d.y_um[rows, None]
-        turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[
-            :, built
-        ]
-        found = wrapped_phasors(
-            self.k * self.path(*places, self.bench.distance_um, self.bench) + turn,
+        geometric_rad = np.broadcast_to(
+            lens.geometric_rad(rows), d.diameter_um[rows].shape
+        )[:, built]
+        phasors = wrapped_phasors(
+            self.k * self.path(*places, self.bench.distance_um, self.bench)
+            + geometric_rad,
             self.kind,
         )
         if depth_um is None:
-            return found
-        about = self.bench.tangents, depth_um, self.bench.wavelength_um
+            return phasors
+        source = self.bench.tangents, depth_um, self.bench.wavelength_um
         return np.asarray(
-            found
-            * lens.layers.shadow(*about, places, math.sqrt(d.site_um2)).astype(
+            phasors
+            * lens.layers.shadow(*source, places, math.sqrt(d.site_um2)).astype(
                 self.kind
             )
         )
 
     def _to_directions(self, fields: Array, n: int) -> Array:
-        """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first
-        along x, then along y.
+        """(r, n, n) fields on lens nodes (y, x) to (r, q, p) on direction nodes.
+
+        Adjoint interpolation, first along x, then along y.
         """
         hy, hx = self.half_um
         x, y = (
@@ -302,27 +322,28 @@ class CompressedLens:
         p = (x[None] - cx) / np.sqrt(
             (x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2
         )
-        at = functools.partial(gather.even_interpolation, m, self._pull)
-        turned = np.stack([fields[:, j] @ at(self._p, p[j]) for j in range(n)], 1)
+        matrix = functools.partial(gather.even_interpolation, m, self._pull)
+        turned = np.stack([fields[:, j] @ matrix(self._p, p[j]) for j in range(n)], 1)
         q = (
             (y - cy)[None]
             * np.sqrt(1 - self.p[0][:, None] ** 2)
             / np.sqrt((y - cy)[None] ** 2 + d**2)
         )
-        out = np.stack([turned[:, :, a] @ at(self._q, q[a]) for a in range(m)], 2)
+        out = np.stack([turned[:, :, a] @ matrix(self._q, q[a]) for a in range(m)], 2)
         return np.asarray(out)
 
     def path(
         self, x: Array, y: Array, distance_um: float, bench: BenchGeometry
     ) -> Array:
-        """Path from the reference source by (x, y) on the lens to the window's centre,
-        um, less that by the axis.
+        """Path from the reference source by (x, y) to the window's centre, um.
+
+        (x, y) lie on the lens. Less the path along the axis.
         """
         centre = self.films.chief_um(distance_um, bench.tangents)
-        come = media.source_path(
+        before = media.source_path(
             self.films.front, x, y, bench.tangents, 1 / bench.reference_um
         )
-        return np.asarray(come + self.films.sensor_path(x, y, centre, distance_um))
+        return np.asarray(before + self.films.sensor_path(x, y, centre, distance_um))
 
     def operators(
         self,
@@ -332,34 +353,41 @@ class CompressedLens:
         axes_um: tuple[Array, Array],
         edge_um: float = 0.0,
     ) -> WindowOperators:
-        """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x)
-        of the window's samples.
+        """Operators from lens nodes to the window, cached.
 
-        edge_um: width of a rim of the window where a tenfold error is allowed, since
-            only its blur is seen.
-        The last few are kept: an image is often followed by its derivatives.
+        Wavelength and distance are exact, not expanded.
+
+        Args:
+            axes_um: (y, x) samples of the window.
+            edge_um: width of a rim of the window in which ten times the error is
+                allowed, since only its blur enters the image.
         """
         key = wavelength_um, distance_um, *_named(axes_um)
-        found = self._operators.get(key)
-        if found is None:
-            found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
+        operators = self._operators.get(key)
+        if operators is None:
+            operators = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
             with self._changing:
-                self._operators[key] = found
+                self._operators[key] = operators
                 while len(self._operators) > _KEPT:
                     self._operators.pop(next(iter(self._operators)))
-        return found
+        return operators
 
     def _operators_of(
         self, wavelength_um: float, distance_um: float, axes_um: Axes, edge_um: float
     ) -> WindowOperators:
-        usual_um = self.bench.distance_um
+        """Operators of :meth:`operators`, computed.
+
+        Both axes take the samples that their bands need. The rest is of the nominal
+        kernel in a quick copy, else of the actual one.
+        """
+        nominal_um = self.bench.distance_um
         films = FilmStack.of(self._layers, wavelength_um)
         nominal = CompressedKernel(
             self.k,
             self._p,
             self._q,
-            usual_um,
-            usual_um,
+            nominal_um,
+            nominal_um,
             self.bench.tangents,
             self.films,
             self._near_um,
@@ -367,64 +395,69 @@ class CompressedLens:
         kernel = dataclasses.replace(
             nominal, k=2 * math.pi / wavelength_um, distance_um=distance_um, films=films
         )
-        reach = [float(np.abs(axis).max()) for axis in axes_um]
+        half_um = [float(np.abs(axis).max()) for axis in axes_um]
         pairs = zip(
-            nominal.bands(reach[0], reach[1]),
-            kernel.bands(reach[0], reach[1]),
+            nominal.bands(half_um[0], half_um[1]),
+            kernel.bands(half_um[0], half_um[1]),
             strict=True,
         )
+        # bands, rad/um, along y and x: the actual ones rounded up
         bands = [
             _SPARE
             * usual
             * _WIDER ** math.ceil(math.log(band / usual / _SPARE, _WIDER))
             for usual, band in pairs
         ]
-        about: dict[str, Any] = {
+        options: dict[str, Any] = {
             "k": kernel.k,
             "tolerance": self.tolerance,
             "step_um": STEP * distance_um,
+            "rim_um": edge_um,
         }
-        about["rim_um"] = edge_um
-        y, down = axis_operators(
-            kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about
+        y, along_y = axis_operators(
+            kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **options
         )
-        x, across = axis_operators(
-            kernel.by_x, self.p[0], axes_um[1], bands[1], **about
+        x, along_x = axis_operators(
+            kernel.by_x, self.p[0], axes_um[1], bands[1], **options
         )
         kind = self.kind
-        parts = [one.of_kind(kind) for one in (down, across)]
-        inner = reach[0] - edge_um, reach[1] - edge_um
+        parts = [along.of_kind(kind) for along in (along_y, along_x)]
+        inner_um = half_um[0] - edge_um, half_um[1] - edge_um
 
         def moved(name: str) -> CouplingTerms:
             ends = [kernel.moved(name, sign * STEP) for sign in (1, -1)]
             step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
-            return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
+            return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner_um)
 
-        rest = (
-            self._from(nominal, kernel, (y, x), inner)
+        terms = (
+            self._from(nominal, kernel, (y, x), inner_um)
             if self._near
-            else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
+            else self._terms(kernel, [kernel], (1.0,), (y, x), inner_um)
         )
-        return WindowOperators(parts[0], parts[1], rest, moved)
+        return WindowOperators(parts[0], parts[1], terms, moved)
 
     def _from(
         self,
-        usual: CompressedKernel,
+        nominal: CompressedKernel,
         kernel: CompressedKernel,
         axes_um: tuple[Array, Array],
         inner_um: tuple[float, float],
     ) -> CouplingTerms:
-        """As :meth:`_terms` of the kernel alone, from those of the usual one: turned
-        and as bright as its own are.
+        """As :meth:`_terms` of ``kernel`` alone, from the terms of the nominal one.
+
+        The window functions take the ratio of both window factors and of k / distance.
         """
-        key, (y, x) = (*inner_um, *_named(axes_um)), axes_um
+        y, x = axes_um
+        key = *inner_um, *_named(axes_um)
         if key not in self._usual:
-            self._usual[key] = self._terms(usual, [usual], (1.0,), axes_um, inner_um)
-        brighter = kernel.k / usual.k * usual.distance_um / kernel.distance_um
-        turn = brighter * kernel.window(x, y[:, None]) / usual.window(x, y[:, None])
-        found = self._usual[key]
+            self._usual[key] = self._terms(
+                nominal, [nominal], (1.0,), axes_um, inner_um
+            )
+        brighter = kernel.k / nominal.k * nominal.distance_um / kernel.distance_um
+        ratio = brighter * kernel.window(x, y[:, None]) / nominal.window(x, y[:, None])
+        terms = self._usual[key]
         return dataclasses.replace(
-            found, window=found.window * turn[:, None].astype(self.kind)
+            terms, window=terms.window * ratio[:, None].astype(self.kind)
         )
 
     def _terms(
@@ -435,8 +468,18 @@ class CompressedLens:
         axes_um: tuple[Array, Array],
         inner_um: tuple[float, float],
     ) -> CouplingTerms:
-        """Terms of a sum of rests by shares, on coarse axes (y, x), turned as the
-        window of ``kernel`` is.
+        """Low-rank terms of the sum of ``rests`` weighted by ``shares``.
+
+        The rest R(Y, X; q, p) is tabulated on Legendre nodes, (w², m²), and factored:
+        R = sum over r, b of W_r(Y, X) a_rb(q) g_b(p). Window functions W include the
+        window factor of ``kernel``.
+
+        Args:
+            kernel: whose window factor is applied.
+            rests: kernels (k,) whose rests are summed.
+            shares: their factors (k,).
+            axes_um: coarse samples (y, x) of the window.
+            inner_um: (y, x) half sides without the rim, which counts ``_BESIDE``.
         """
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
@@ -445,31 +488,33 @@ class CompressedLens:
         X = legendre.mapped_nodes(w, -wx, wx)
         P = legendre.mapped_nodes(m, *self._p)
         Q = legendre.mapped_nodes(m, *self._q)[:, None]
+        # weights of directions and window places in the low-rank error
         weight = np.where(
             np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE
         )
-        seen = np.where(
+        inside = np.where(
             (np.abs(Y)[:, None] <= inner_um[0]) & (np.abs(X) <= inner_um[1]),
             1.0,
             _BESIDE,
         )
         table = np.empty((w, w, m, m), self.kind)
         kind = self.kind if len(rests) == 1 else complex
-        for layer, height, share in zip(table, Y, seen, strict=True):
+        for table_row, place_y, row_weight in zip(table, Y, inside, strict=True):
             parts = [
-                s * of.rest(P, Q, X[:, None, None], height, kind)
-                for of, s in zip(rests, shares, strict=True)
+                factor * each.rest(P, Q, X[:, None, None], place_y, kind)
+                for each, factor in zip(rests, shares, strict=True)
             ]
-            layer[:] = share[:, None, None] * weight * sum(parts)
+            table_row[:] = row_weight[:, None, None] * weight * sum(parts)
         columns, rows, remainder = low_rank_factors(
             table.reshape(w * w, m * m), self.tolerance
         )
-        left, size, across = np.linalg.svd(
+        # functions of p in the rows: one more singular value decomposition
+        mixing, size, across = np.linalg.svd(
             (rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
         )
         mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
-        some = int((mixed > MIXED * self.tolerance).sum())
-        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(
+        count = int((mixed > MIXED * self.tolerance).sum())
+        amounts = (mixing * size)[:, :count].reshape(-1, m, count).transpose(
             1, 0, 2
         ) * self.site_um2
         iy, ix = (
@@ -477,22 +522,26 @@ class CompressedLens:
             for a, r in ((y, wy), (x, wx))
         )
         to_p = self._to_nodes(m)
-        shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)
-        spread = (iy @ shown.reshape(w, -1)).reshape(len(y), w, -1).transpose(
-            0, 2, 1
-        ) @ ix.T
+        columns_on_nodes = (columns / inside.reshape(-1, 1)).reshape(w, w, -1)
+        spread = (iy @ columns_on_nodes.reshape(w, -1)).reshape(
+            len(y), w, -1
+        ).transpose(0, 2, 1) @ ix.T
         window = spread * kernel.window(x, y[:, None])[:, None]
         arrays = [
-            one.astype(self.kind)
-            for one in (across[:some] @ to_p.T, np.tensordot(to_p, amounts, 1), window)
+            part.astype(self.kind)
+            for part in (
+                across[:count] @ to_p.T,
+                np.tensordot(to_p, amounts, 1),
+                window,
+            )
         ]
-        whole = float(np.linalg.norm(table)) / math.sqrt(table.size)
+        whole = float(np.linalg.norm(table)) / math.sqrt(table.size)  # rms
         return CouplingTerms(
-            arrays[0], arrays[1], arrays[2], remainder, mixed[:some], whole
+            arrays[0], arrays[1], arrays[2], remainder, mixed[:count], whole
         )
 
     def _to_nodes(self, count: int) -> Array:
-        """(nodes, count) from Legendre nodes of the directions; kept."""
+        """(nodes, count) interpolation from Legendre to direction nodes, cached."""
         if count not in self._from_few:
             self._from_few[count] = legendre.interpolation_matrix(
                 count, gather.even_nodes(self.nodes, self._pull, -1.0, 1.0)
@@ -514,7 +563,7 @@ def _on_even(count: int, first: float, last: float, samples: int) -> Array:
 
 
 def _named(axes_um: tuple[Array, Array]) -> tuple[float, ...]:
-    """What tells even axes apart, as they are kept by: counts and first places."""
+    """Cache key of even axes (y, x): count and first place of each."""
     return tuple(float(part) for axis in axes_um for part in (len(axis), axis[0]))
 
 

@@ -75,8 +75,9 @@ class FrameSetting:
 
 
 def true_depth(x: Array, setting: FrameSetting, centre_um: float) -> Array:
-    """(n,) source depths after stage zero and scale; the scale acts about the middle of
-    the stage.
+    """(n,) source depths after stage zero and scale, um.
+
+    stated + zero + scale (stated - centre), at least 0.2 of the stated depth.
 
     Args:
         x: all parameters.
@@ -100,13 +101,15 @@ def pixel_brightness(
     reference_um: float,
     films: FilmStack = AIR,
 ) -> Array:
-    """(n,) electrons in a pixel for light of unit density from ``reference_um``, by
-    gain, exposure and depth.
+    """(n,) electrons in a pixel for light of unit density from ``reference_um``.
+
+    gain * exposure * pixel area * (reference depth / depth)², depths in air.
 
     Args:
         x: all parameters, in the order of ``PARAMETERS``.
         setting: depths, angles and window of the frames.
         centre_um: middle of the stage, um.
+        reference_um: depth of the reference source, um.
         films: media before and behind the lens.
     """
     depth = films.apparent_um(true_depth(x, setting, centre_um))
@@ -162,12 +165,12 @@ def light_maps(u: Array, v: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AngleGroup:
-    """Frames of one field angle, by their ``index``, and the lens as they see it.
+    """Frames of one field angle, and the lens on nodes for it.
 
-    bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the
-    diameters, of a residual phase.
-    apart: the same frames behind a stop, depth by depth where it stands before the
-    pillars: others of them are lit.
+    index: of the frames. bending, widening, residual: (m, q, p) on the nodes: phase by
+    wave-front parameters, diameter by CD parameters, residual phase modes.
+    apart: behind a stop the same frames in parts of equal shadow; where the stop is not
+    at the pillars, one part for each depth.
     """
 
     index: Array
@@ -197,11 +200,16 @@ class AngleGroup:
         )
 
     def shaded(self, lens: Lens, depth_um: Array) -> "AngleGroup":
-        """The same behind the lens' stop; (frames,) depths of all."""
+        """The group behind the lens' stop, in parts of frames with equal shadows.
+
+        Args:
+            depth_um: (frames,) source depths of all frames of the model.
+        """
         if lens.layers.stop is None:
             return self
         at = depth_um[self.index]
-        alike = (
+        # frames with equal shadows: all, where the stop is at the pillars
+        equal = (
             [at == z for z in np.unique(at)]
             if lens.layers.stop.distance_um
             else [slice(None)]
@@ -213,32 +221,29 @@ class AngleGroup:
                 reduced=self.reduced.shaded(lens, self.pillars, float(at[some][0])),
                 apart=(),
             )
-            for some in alike
+            for some in equal
         )
         return dataclasses.replace(self, apart=apart)
 
     def only(self, frames: Array) -> "AngleGroup | None":
-        """Of some frames, in rising order of their index, which are counted anew; None
-        without any.
-        """
+        """The group of some frames, renumbered in rising order; None without any."""
         place = np.flatnonzero(np.isin(frames, self.index))
-        apart = tuple(
-            one for one in (part.only(frames) for part in self.apart) if one is not None
-        )
-        return (
-            dataclasses.replace(self, index=place, apart=apart) if len(place) else None
-        )
+        if not len(place):
+            return None
+        parts = [part.only(frames) for part in self.apart]
+        apart = tuple(part for part in parts if part is not None)
+        return dataclasses.replace(self, index=place, apart=apart)
 
     def bent(self, residual: Array) -> "AngleGroup":
         """With the shapes of a residual phase; groups apart have the same nodes."""
-        apart = tuple(dataclasses.replace(one, residual=residual) for one in self.apart)
+        apart = tuple(dataclasses.replace(g, residual=residual) for g in self.apart)
         return dataclasses.replace(self, residual=residual, apart=apart)
 
     def quick(self, window_um: float | None) -> "AngleGroup":
-        """See :meth:`Reduced.quick`."""
+        """The group on the fast lens; see :meth:`CompressedLens.quick`."""
         reduced = self.reduced.quick(window_um)
         residual = self.reduced.seen_by(reduced, self.residual)
-        apart = tuple(one.quick(window_um) for one in self.apart)
+        apart = tuple(group.quick(window_um) for group in self.apart)
         return dataclasses.replace(
             AngleGroup.of(self.index, self.pillars, reduced),
             residual=residual,
@@ -246,8 +251,9 @@ class AngleGroup:
         )
 
     def turning(self, name: str) -> Array | None:
-        """Phase on the nodes for one unit of a wave-front parameter, imaginary of
-        uneven light; None for any other.
+        """(q, p) phase on the nodes for one unit of a wave-front parameter, rad.
+
+        Imaginary for uneven illumination; None for any other parameter.
         """
         if name.startswith("residual_"):
             return np.asarray(self.residual[int(name.removeprefix("residual_"))])
@@ -279,12 +285,15 @@ class SpectralLine:
     def of(
         cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float
     ) -> "SpectralLine":
-        """Paths from axis and rim to sources and chief ray's places, through films as
-        through as much air as bends
-        light like them; a wavelength more for the pillars.
+        """The line's largest path difference through a lens.
+
+        Paths from the sources by axis and rim to the chief rays' places, through films
+        as through equivalent air. One wavelength is added for the pillars.
 
         Args:
-            depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
+            depth_um: (n,) of the sources.
+            angle_rad: (n, 2) their field angles.
+            tolerance: of the mean of phasors over the line.
         """
         turn = np.linspace(0, 2 * math.pi, _RIM, endpoint=False)
         x, y = (
@@ -292,7 +301,8 @@ class SpectralLine:
             for part in (np.cos(turn), np.sin(turn))
         )
         z = FilmStack.of(lens.layers, lens.wavelength_um).apparent_um(depth_um[:, None])
-        d, (tx, ty) = lens.reduced_um, np.tan(angle_rad.T)[..., None]
+        d = lens.reduced_um
+        tx, ty = np.tan(angle_rad.T)[..., None]
         paths = np.sqrt((x + z * tx) ** 2 + (y + z * ty) ** 2 + z**2)
         paths = paths + np.sqrt((x - d * tx) ** 2 + (y - d * ty) ** 2 + d**2)
         return cls(
@@ -304,14 +314,14 @@ class SpectralLine:
     def colours(
         self, bandwidth_nm: float, like_nm: float | None = None
     ) -> list[tuple[float, float]]:
-        """(offset in nm, weight) of a line of this standard deviation; one for no
-        width.
+        """(offset in nm, weight) of the samples of a line; one for no width.
 
-        Gauss-Hermite nodes, or even ones of Gaussian weight, of which fewer do where t
-        is above 2.
+        Gauss-Hermite nodes, or even ones of Gaussian weight, which are fewer where the
+        phase in one standard deviation is above 2 rad.
 
         Args:
-            like_nm: another width, by which they are chosen: for differences.
+            bandwidth_nm: standard deviation of the line.
+            like_nm: another width by which the number is chosen: for differences.
 
         Raises:
             FitError: more than 64 colours would be needed.
@@ -320,15 +330,21 @@ class SpectralLine:
             return [(0.0, 1.0)]
         wide_nm = max(bandwidth_nm if like_nm is None else like_nm, LEAST_NM)
         turn = 2 * math.pi * self.path_um * wide_nm * 1e-3 / self.wavelength_um**2
-        place, weight = _colours(
-            math.ceil(turn / _TURN_STEP) * _TURN_STEP, self.tolerance
-        )
+        turn = math.ceil(turn / _TURN_STEP) * _TURN_STEP
+        place, weight = _colours(turn, self.tolerance)
         return list(zip((bandwidth_nm * place).tolist(), weight.tolist(), strict=True))
 
 
 @functools.lru_cache(maxsize=64)
 def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
-    """(n,) places in standard deviations and weights of sum 1."""
+    """(n,) offsets in standard deviations, and weights of sum 1, of the fewest samples.
+
+    Their mean of cos(s x) is exp(-s²/2), that of the Gaussian line, to ``tolerance``
+    for every s up to ``turn``, rad.
+
+    Raises:
+        FitError: more than ``_MOST_COLOURS`` would be needed.
+    """
     s = np.linspace(0, turn, 129)
     for count in range(2, _MOST_COLOURS + 1):
         for place, weight in (
@@ -336,10 +352,8 @@ def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
             _even(count, turn),
         ):
             weight = weight / weight.sum()
-            if (
-                np.abs(weight @ np.cos(place[:, None] * s) - np.exp(-(s**2) / 2)).max()
-                <= tolerance
-            ):
+            mean = weight @ np.cos(place[:, None] * s)
+            if np.abs(mean - np.exp(-(s**2) / 2)).max() <= tolerance:
                 return place, weight
     raise FitError(
         f"a spectrum so wide that light turns by {turn:.0f} rad against itself in one standard deviation needs more "
@@ -348,9 +362,11 @@ def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
 
 
 def _even(count: int, turn: float) -> tuple[Array, Array]:
-    """What is cut off at the ends, exp(-r²/2), and what the steps h leave of the
-    fastest turn, which is of size
-    exp(-(2 pi / h - t)² / 2), are alike where the reach r is 2 pi / h - t."""
+    """(count,) even offsets in standard deviations, and their Gaussian weights.
+
+    The error of truncation at the ends r, exp(-r²/2), equals that of the steps h,
+    exp(-(2 pi / h - t)² / 2) at t = ``turn``, where r = 2 pi / h - t.
+    """
     step = (math.hypot(turn, math.sqrt(4 * math.pi * (count - 1))) - turn) / (count - 1)
     place = step * (np.arange(count) - (count - 1) / 2)
     return place, np.exp(-(place**2) / 2)

@@ -29,13 +29,11 @@ from metalens.library import curve, engines
 # waves
 REACH_UM = 0.031
 TOLERANCE = 3e-3  # of t
-_SAME, _JUDGED = (
-    0.05,
-    7,
-)  # relative deviation from the proxy up to which it is of this cell, at so many diameters
-_FINE_UM = 5e-4  # between the diameters at which the curves are sampled, likewise
-_FIT_SHARE = 0.4  # of the tolerance, for the rational functions
-_ROOM = 1.07  # of the amounts over the bounds of a fit
+# largest relative deviation of a cell's own proxy; number of diameters compared
+_SAME, _JUDGED = 0.05, 7
+_FINE_UM = 5e-4  # step of the sampled diameters, for 0.85 um and shorter waves
+_FIT_SHARE = 0.4  # share of the tolerance for the rational functions
+_ROOM = 1.07  # largest amounts over the bounds of a fit
 _AMOUNTS = {
     "height_um": (-1.0, -0.5, 0.0, 0.5, 1.0),
     "n": (-1.0, -0.67, -0.33, 0.0, 0.33, 0.67, 1.0),
@@ -43,19 +41,17 @@ _AMOUNTS = {
 
 
 def solved_transmission(lens: Lens) -> Solved | None:
-    """t by the modal solver; None where the lens's proxy is not of its cell (a measured
-    one, say).
+    """Table of t by the modal solver over diameter, height and index of the pillars.
 
-    Polynomials through five heights over +-30 nm (more of longer waves,
-    ``made.coarser``), and through seven indices.
+    Polynomials through five heights over +-30 nm, scaled for longer waves
+    (:func:`wavelength_scale`), and through seven indices. None where the lens's proxy
+    is not of its cell, as a measured one.
 
-    Accuracy: 3e-3 of t by the solver's bar, half of it on average, at these amounts.
-    Between them polynomials miss
-    resonances that move: of random pillars and amounts (two cells of silicon, all that
-    the bounds allow) t was off by
-    0.025 at most in the height and 6e-3 in the index, and beside the resonance of the
-    default cell at 0.23 um by up to
-    0.03 in the index (through three indices by 0.29).
+    Accuracy: 3e-3 of t by the solver's tolerance, half of it on average, at these
+    amounts. Between them polynomials miss resonances that move. Of random pillars and
+    amounts (two cells of silicon, over all bounds) t was off by 0.025 at most in the
+    height and 6e-3 in the index. Next to the resonance of the default cell at 0.23 um
+    it was off by up to 0.03 in the index (through three indices by 0.29).
 
     Raises:
         CellError, MaterialError: cells that the solver does not take.
@@ -64,14 +60,14 @@ def solved_transmission(lens: Lens) -> Solved | None:
     least = float(d.min())
     most = float(d.max())
     pitch = lens.cell.pitch_um
-    some = np.clip(np.linspace(least, most, _JUDGED), *lens.proxy.domain_um)
+    diameters = np.clip(np.linspace(least, most, _JUDGED), *lens.proxy.domain_um)
     exact = [
-        modal.solve(lens.cell, one, lens.wavelength_um, tolerance=TOLERANCE).t
-        for one in some.tolist()
+        modal.solve(lens.cell, diameter, lens.wavelength_um, tolerance=TOLERANCE).t
+        for diameter in diameters.tolist()
     ]
-    ratio = np.array(exact) / designed_transmission(
-        lens.proxy, some, lens.wavelength_um
-    )
+    proxy = designed_transmission(lens.proxy, diameters, lens.wavelength_um)
+    ratio = np.array(exact) / proxy
+    # up to a common phase
     if np.abs(ratio * np.exp(-1j * np.angle(ratio.mean())) - 1).max() > _SAME:
         return None
     reach = REACH_UM * wavelength_scale(lens.wavelength_um)
@@ -82,11 +78,15 @@ def solved_transmission(lens: Lens) -> Solved | None:
 
 @functools.lru_cache(maxsize=8)
 def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> Solved:
-    """One rational curve over the diameter for every amount of every cause, sampled
-    finely.
+    """:func:`solved_transmission` of a cell on an even grid of diameters, cached.
+
+    One rational curve over the diameter for every amount of every cause; cells that
+    occur twice are solved once.
     """
-    fine = _FINE_UM * wavelength_scale(wavelength_um)
-    diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / fine) + 1)
+    step_um = _FINE_UM * wavelength_scale(wavelength_um)
+    diameters = np.linspace(
+        low_um, high_um, math.ceil((high_um - low_um) / step_um) + 1
+    )
     changes = _changes(wavelength_um)
     cells = [
         changed_pillar(cell, 0.0, acts.numbers(cell, 0.0), amount, wavelength_um)[0]
@@ -95,36 +95,31 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
         for _, acts, amounts in changes
         for amount in amounts
     ]
-    apart = list(dict.fromkeys(cells))
-    found: dict[Cell, Array] = {}
+    distinct = list(dict.fromkeys(cells))
+    curves: dict[Cell, Array] = {}
 
-    def some(start: int, stop: int) -> None:
-        for one in apart[start:stop]:
-            found[one] = _along(one, wavelength_um, diameters)
+    def solve_cells(start: int, stop: int) -> None:
+        for changed in distinct[start:stop]:
+            curves[changed] = _along(changed, wavelength_um, diameters)
 
     with threads.one_blas_thread():
-        threads.run_split(len(apart), some)
-    return Solved(
-        wavelength_um,
-        diameters,
-        _powers(np.array([found[one] for one in cells]).T, changes),
-    )
+        threads.run_split(len(distinct), solve_cells)
+    columns = np.array([curves[changed] for changed in cells]).T
+    return Solved(wavelength_um, diameters, _powers(columns, changes))
 
 
 def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
-    """(diameters,) t of a cell: a few dozen solves on one mesh, and the rational
-    function through them.
+    """(diameters,) t of a cell: a rational function through a few dozen modal solves.
+
+    All solves share one mesh, so that the curve is smooth.
     """
     span = float(diameters[0]), float(diameters[-1])
     solve = engines.solver_at_fixed_discretization(
         cell, Incidence(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
     )
     nodes = curve.sample_adaptively(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
-    return np.asarray(
-        curve.fit_response_curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(
-            diameters
-        )[:, 0]
-    )
+    fit = curve.fit_response_curve(nodes, tolerance=_FIT_SHARE * TOLERANCE)
+    return np.asarray(fit.best(diameters)[:, 0])
 
 
 _Change = tuple[int, ResponseError, tuple[float, ...]]
@@ -141,15 +136,19 @@ def _changes(wavelength_um: float) -> list[_Change]:
 
 
 def _powers(columns: Array, changes: Sequence[_Change]) -> Array:
-    """(causes, orders, diameters) power series through the amounts of each cause."""
+    """(causes, orders, diameters) power series through the amounts of each cause.
+
+    Args:
+        columns: (diameters, amounts of all causes) t.
+    """
     orders = max(len(amounts) for *_, amounts in changes)
     out = np.zeros((len(response_errors()), orders, len(columns)), complex)
-    first = 0
+    start = 0
     for n, _, amounts in changes:
-        values = columns[:, first : first + len(amounts)].T
+        values = columns[:, start : start + len(amounts)].T
         out[n, : len(amounts)] = np.linalg.solve(
             polynomial.polyvander(amounts, len(amounts) - 1), values
         )
-        first += len(amounts)
+        start += len(amounts)
     out[:, 0] = out[changes[0][0], 0]
     return out

@@ -23,16 +23,16 @@ def thin_plate_basis(u: Array, v: Array, count: int = MODES) -> Array:
         v: y on the lens over its radius.
     """
     weights, taken, _ = _modes()
-    splines, known = _splines(u, v), _known(u, v)
     return np.asarray(
-        np.tensordot(weights[:count], splines, 1)
-        - np.tensordot(taken[:count], known, 1)
+        np.tensordot(weights[:count], _splines(u, v), 1)
+        - np.tensordot(taken[:count], _known(u, v), 1)
     )
 
 
 def prior_rad() -> Array:
-    """(modes,) expected size of every mode: EXPECTED_RAD for the smoothest, then as its
-    bending energy to the -1/2.
+    """(modes,) prior standard deviation of every mode, rad.
+
+    EXPECTED_RAD for the smoothest, then falling as its bending energy to the -1/2.
     """
     energy = _modes()[2]
     return np.asarray(EXPECTED_RAD * np.sqrt(energy[0] / energy))
@@ -56,8 +56,9 @@ def _splines(u: Array, v: Array) -> Array:
 
 
 def _known(u: Array, v: Array) -> Array:
-    """(4 + wave-front causes, *shape) what parameters already do: piston, tilt,
-    defocus, aberrations.
+    """(4 + wave-front causes, *shape) shapes that parameters already describe.
+
+    Piston, tilts, defocus, and aberrations.
     """
     return np.concatenate(
         [
@@ -69,25 +70,30 @@ def _known(u: Array, v: Array) -> Array:
 
 @functools.lru_cache
 def _modes() -> tuple[Array, Array, Array]:
-    """Least bending energy at unit rms, in the span of splines less the known shapes.
+    """Smooth modes of least bending energy at unit rms, orthogonal to described shapes.
 
-    ((MODES, splines), (MODES, known), (MODES,) energy): a mode is the first @ splines -
-    the second @ known.
+    Splines less their least-squares fit by the shapes of :func:`_known`, on a grid.
+
+    Returns:
+        ((MODES, splines) weights, (MODES, shapes) weights, (MODES,) energy): a mode is
+        the first @ splines - the second @ shapes.
     """
     t = np.linspace(-1, 1, _GRID)
     u, v = np.meshgrid(t, t)
     inside = np.hypot(u, v) <= 1
     splines = _splines(u, v).reshape(KNOTS**2, -1)
-    known = _known(u, v).reshape(-1, _GRID**2)
+    described = _known(u, v).reshape(-1, _GRID**2)
     disc = inside.ravel()
-    taken = np.linalg.lstsq(known[:, disc].T, splines[:, disc].T, rcond=None)[0].T
-    rest = (splines - taken @ known).reshape(-1, _GRID, _GRID)
-    mass = rest[:, inside] @ rest[:, inside].T / inside.sum()
+    taken = np.linalg.lstsq(described[:, disc].T, splines[:, disc].T, rcond=None)[0].T
+    remainder = (splines - taken @ described).reshape(-1, _GRID, _GRID)
+    mass = remainder[:, inside] @ remainder[:, inside].T / inside.sum()
     size, vectors = np.linalg.eigh(mass)
-    some = vectors[:, size > 1e-5 * size[-1]] / np.sqrt(size[size > 1e-5 * size[-1]])
-    bend = _bending(rest, inside, t[1] - t[0])
-    energy, turn = np.linalg.eigh(some.T @ bend @ some)
-    weights = (some @ turn[:, :MODES]).T
+    # generalised eigenvectors: least bending energy over mean square
+    span = size > 1e-5 * size[-1]
+    unit = vectors[:, span] / np.sqrt(size[span])
+    bend = _bending(remainder, inside, t[1] - t[0])
+    energy, turn = np.linalg.eigh(unit.T @ bend @ unit)
+    weights = (unit @ turn[:, :MODES]).T
     return weights, weights @ taken, energy[:MODES]
 
 

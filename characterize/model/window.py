@@ -14,24 +14,24 @@ from characterize.model.kernel import real_of
 from metalens.core import threads
 from metalens.core.arrays import Array
 
-MIXED = 0.1  # of the tolerance, for functions of p in the terms
-# the same where terms are left out: beside these it adds an eighth to what is missed
+MIXED = 0.1  # share of the tolerance for the functions of p in the terms
+# the same where terms are left out too: it adds an eighth to their error
 _MIXED_FEW = 0.5
 ROOM = 1.3  # samples over those of the sampling theorem
-_SHARE = 0.1  # of the tolerance, for the interpolation
-_COARSEST = 0.2  # tolerance of a small part of a derivative
+_SHARE = 0.1  # share of the tolerance for the interpolation
+_COARSEST = 0.2  # largest tolerance of a small part of a derivative
 _TAPS = range(6, 42, 2)
-# of distance and wavelength, for derivatives: paths bend over as much as they are long
+# relative step of distance and wavelength for derivatives
 STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AxisOperators:
-    """Along one axis: nodes to coarse samples, ``to`` (coarse, nodes); coarse to fine
-    samples, ``fine`` (fine, coarse).
+    """Operators along one axis, from nodes to coarse to fine samples.
 
-    Fields on coarse samples are less their carrier, which no intensity sees, so that
-    ``fine`` is real. moved: derivative of ``to`` by ``wave`` or ``distance``, per um, the carrier held.
+    to: (coarse, nodes). fine: (fine, coarse), real: fields on coarse samples lack
+    their carrier, which no intensity depends on. moved: derivative of ``to`` per um
+    of ``wave`` or ``distance`` at fixed carrier.
     """
 
     to: Array
@@ -48,13 +48,14 @@ class AxisOperators:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CouplingTerms:
-    """What is no product of both axes, as few terms: functions of p (b, p), their
-    amounts in every term (q, r, b), and
-    every term on coarse samples (Y, r, X).
+    """Low-rank terms of the part of the kernel that is no product of both axes.
 
-    remainder, mixed: (r,), (b,) relative size of what is left out before each term,
-    each function of p.
-    size: root mean square of the whole where the lens is seen.
+    R(Y, X; q, p) = sum over r, b of window[Y, r, X] amounts[q, r, b] across[b, p].
+
+    across: (b, p) functions of p. amounts: (q, r, b). window: (Y, r, X) on the coarse
+    samples.
+    remainder: (r,) relative size of the terms from each on; mixed: (b,) the same of
+    the functions of p. size: root mean square of R over the lens.
     """
 
     across: Array
@@ -85,98 +86,97 @@ class WindowOperators:
     moved: Callable[[str], CouplingTerms]
 
     def coarse(self, light: Array, tolerance: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) on the coarse samples, by all terms or with some
-        left out.
+        """(..., q, p) ``light`` to (..., Y, X) on the coarse samples.
+
+        Terms below the relative ``tolerance`` are left out.
         """
         return self._sum(light, ((self.y.to, self.x.to, self.rest, tolerance),))
 
     def envelope(self, coarse: Array) -> Array:
-        """(..., Y, X) on the window's samples of a field on the coarse ones, less the
-        turns of the middle direction, which no intensity sees.
+        """(..., Y, X) field on the window's samples from that on the coarse ones.
+
+        Less the carrier of the middle direction, which no intensity depends on.
         """
         flat = coarse.reshape(-1, *coarse.shape[-2:])
         out = np.empty((len(flat), len(self.y.fine), len(self.x.fine)), coarse.dtype)
 
-        def some(first: int, last: int) -> None:
+        def fill(first: int, last: int) -> None:
             for i in range(first, last):
                 out[i] = real_complex_product(
                     self.y.fine, real_complex_product(self.x.fine, flat[i].T).T
                 )
 
         with threads.one_blas_thread():
-            threads.run_split(len(flat), some)
+            threads.run_split(len(flat), fill)
         return out.reshape(*coarse.shape[:-2], *out.shape[-2:])
 
     def rates(
         self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0
     ) -> Array:
-        """(..., q, p) -> (..., Y, X) derivative of the field by ``wave`` or
-        ``distance`` per um, as an envelope.
+        """(..., Y, X) derivative of the field per um of ``wave`` or ``distance``.
 
-        Less what turns places of the window by themselves, which no intensity sees.
-        ``tolerance`` is shared among the
-        parts by their size, and by that of what is added to them: ``beside`` times the
-        field.
+        Phases of window places alone are left out: no intensity depends on them.
+
+        Args:
+            light: (..., q, p) field on the nodes.
+            name: ``wave`` (wavelength) or ``distance``.
+            tolerance: relative error, shared among the three parts by their size.
+            beside: size of what is added to this derivative, over that of the field.
         """
-        y, x = (way.moved(name) for way in (self.y, self.x))
-        moved = self.moved(name)
-        pairs = (y, self.y.to), (x, self.x.to)
+        y_rate = self.y.moved(name)
+        x_rate = self.x.moved(name)
+        rest_rate = self.moved(name)
+        # product rule: one factor differentiated at a time, and its relative size
+        ways = (
+            (y_rate, self.x.to, self.rest),
+            (self.y.to, x_rate, self.rest),
+            (self.y.to, self.x.to, rest_rate),
+        )
+        pairs = (y_rate, self.y.to), (x_rate, self.x.to)
         sizes = [
-            *(float(np.linalg.norm(by) / np.linalg.norm(to)) for by, to in pairs),
-            moved.size / self.rest.size,
+            *(float(np.linalg.norm(rate) / np.linalg.norm(to)) for rate, to in pairs),
+            rest_rate.size / self.rest.size,
         ]
         whole = tolerance * math.hypot(*sizes, beside) / math.sqrt(len(sizes))
-        some = [min(whole / max(size, 1e-300), _COARSEST) for size in sizes]
-        ways = (
-            (y, self.x.to, self.rest),
-            (self.y.to, x, self.rest),
-            (self.y.to, self.x.to, moved),
-        )
-        return self.envelope(
-            self._sum(
-                light, tuple((*way, one) for way, one in zip(ways, some, strict=True))
-            )
-        )
+        shares = [min(whole / max(size, 1e-300), _COARSEST) for size in sizes]
+        summands = tuple((*way, share) for way, share in zip(ways, shares, strict=True))
+        return self.envelope(self._sum(light, summands))
 
     def _sum(
         self, light: Array, ways: tuple[tuple[Array, Array, CouplingTerms, float], ...]
     ) -> Array:
-        """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X),
-        for several (Fy, Fx, terms).
+        """(..., Y, X) sum over ``ways`` (Fy, Fx, terms, tolerance) of ``light``.
+
+        Each is the sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p)
+        Fx(p, X), with L = ``light`` (..., q, p).
         """
         ny, nx, kind = len(self.y.to), len(self.x.to), self.y.to.dtype
         products = []
         for y, x, terms, tolerance in ways:
             across, amounts, window = terms.some(tolerance)
-            products.append(
-                (
-                    y,
-                    (across[:, None] * x).reshape(len(across) * nx, -1).T,
-                    amounts,
-                    window,
-                )
-            )
+            # g_b(p) Fx(p, X) as a matrix (p, b X)
+            by_x = (across[:, None] * x).reshape(len(across) * nx, -1).T
+            products.append((y, by_x, amounts, window))
         light = light.astype(kind, copy=False)
         out = np.zeros((*light.shape[:-2], ny, nx), kind)
         flat = light.reshape(-1, *light.shape[-2:])
         result = out.reshape(-1, *out.shape[-2:])
 
-        def some(first: int, last: int) -> None:
+        def sum_frames(first: int, last: int) -> None:
             frames = flat[first:last].reshape(-1, flat.shape[-1])
-            for y, x, amounts, window in products:
-                mixed = amounts @ (frames @ x).reshape(
+            for y, by_x, amounts, window in products:
+                mixed = amounts @ (frames @ by_x).reshape(
                     last - first, len(amounts), -1, nx
                 )
-                for i, one in enumerate(
+                for i, of_frame in enumerate(
                     mixed.reshape(last - first, len(amounts), -1), first
                 ):
-                    seen = (y @ one).reshape(ny, -1, nx)
-                    result[i] += np.multiply(seen, window, out=seen).sum(
-                        1
-                    )  # five times as quick as einsum
+                    terms = (y @ of_frame).reshape(ny, -1, nx)
+                    # five times as fast as einsum
+                    result[i] += np.multiply(terms, window, out=terms).sum(1)
 
         with threads.one_blas_thread():
-            threads.run_split(len(flat), some)
+            threads.run_split(len(flat), sum_frames)
         return out
 
 
@@ -204,42 +204,43 @@ def axis_operators(
     step_um: float,
     rim_um: float = 0.0,
 ) -> tuple[Array, AxisOperators]:
-    """(coarse samples, the way there from nodes and from there to the window's samples)
-    along one axis.
+    """Coarse samples along one axis, and operators from nodes to them and on.
+
+    Fields on the coarse samples are exp(i k (F - F_middle)), less their carrier.
 
     Args:
+        by: path to a place of the window, :meth:`CompressedKernel.by_x` or ``by_y``.
+        nodes: (n,) direction cosines.
+        at_um: (m,) even samples of the window.
+        band: of the field, rad/um.
         k: wave number, rad/um.
         tolerance: relative error of the field.
-        by: path to a place of the window, :meth:`Kernel.by_x` or :meth:`Kernel.by_y`.
-        nodes: (n,) direction cosines. at_um: (m,) even samples of the window. band: of
-            the field, rad/um.
-        step_um: of the distance, for derivatives. rim_um: at either end, where a
-            tenfold error is allowed.
+        step_um: of the distance, for derivatives.
+        rim_um: at either end, where a tenfold error is allowed.
     """
     coarse, weights = _resampled(
         float(at_um[0]), float(at_um[-1]), len(at_um), band, tolerance, rim_um
     )
     middle = (nodes[0] + nodes[-1]) / 2
-    turn = k * by(nodes, coarse[:, None])
+    phase = k * by(nodes, coarse[:, None])
     carrier = k * by(middle, coarse[:, None])
-    value = np.exp(1j * (turn - carrier))
+    to_coarse = np.exp(1j * (phase - carrier))
 
     def moved(name: str) -> Array:
-        if (
-            name == "wave"
-        ):  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
-            return np.asarray(-1j * turn * k / (2 * np.pi) * value)
+        if name == "wave":
+            # d(kF)/d(wavelength) = F dk/d(wavelength) = -k² F / (2 pi)
+            return np.asarray(-1j * phase * k / (2 * np.pi) * to_coarse)
         ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
-        return np.asarray(1j * k * (ends[0] - ends[1]) / (2 * step_um) * value)
+        return np.asarray(1j * k * (ends[0] - ends[1]) / (2 * step_um) * to_coarse)
 
-    return coarse, AxisOperators(value, weights, moved)
+    return coarse, AxisOperators(to_coarse, weights, moved)
 
 
 def _nearby(
     at_um: Array, coarse_um: Array, band: float, taps: int
 ) -> tuple[Array, Array]:
-    """(fine, taps) nearest coarse samples of every place, and what each of them tells
-    of another: (taps, taps).
+    """(fine, taps) indices of the nearest coarse samples of every place, and (taps,
+    taps) correlations sinc(band distance / pi) among them.
     """
     step = coarse_um[1] - coarse_um[0]
     first = np.clip(
@@ -247,8 +248,8 @@ def _nearby(
         0,
         len(coarse_um) - taps,
     )
-    apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
-    return first[:, None] + np.arange(taps), apart
+    gram = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
+    return first[:, None] + np.arange(taps), gram
 
 
 @functools.lru_cache(maxsize=32)
@@ -260,19 +261,27 @@ def _resampled(
     tolerance: float,
     rim_um: float = 0.0,
 ) -> tuple[Array, Array]:
-    """(coarse even samples, (fine, coarse) weights) for functions of up to ``band``
-    rad/um; treat as read-only.
+    """Coarse even samples of an axis and their interpolation weights (fine, coarse).
 
-    The window's own samples where they are no finer than that needs. With the fewest
-    taps that are close enough, found
-    by halves: their error falls with their number. Taps reach beyond the window only
-    where its rim is narrower.
+    For functions of up to ``band`` rad/um. The window's own samples where coarse ones
+    are no fewer. Bisection chooses the fewest taps that are accurate enough: the error
+    falls with their number. Taps reach beyond the window where its rim is narrower.
+    Cached; treat as read-only.
+
+    Args:
+        first: first of the window's even samples, um.
+        last: last of them, um.
+        count: their number.
+        tolerance: relative error of the field.
+        rim_um: at either end, where ten times the error is allowed.
     """
-    at_um, step = np.linspace(first, last, count), np.pi / band / ROOM
-    width, fine = last - first, (last - first) / (count - 1)
+    at_um = np.linspace(first, last, count)
+    step = np.pi / band / ROOM
+    width = last - first
+    fine = (last - first) / (count - 1)
     inner = np.abs(at_um - (first + last) / 2) <= width / 2 - rim_um
 
-    def of(taps: int) -> tuple[Array, Array, float]:
+    def with_taps(taps: int) -> tuple[Array, Array, float]:
         least = int(np.ceil(width / step)) + 1
         coarse_count = max(
             least, taps, int(np.ceil((width - 2 * rim_um) / step)) + taps
@@ -283,31 +292,40 @@ def _resampled(
         weights, missed = _weights(at_um, coarse, band, taps)
         return coarse, weights, float(np.where(inner, missed, missed / 10).max())
 
-    found = None
+    best = None
     low, high = (0, len(_TAPS)) if step > 1.1 * fine else (0, 0)
-    while low < high:
+    while low < high:  # bisection of the number of taps
         middle = (low + high) // 2
-        one = of(_TAPS[middle])
-        close = one[2] < _SHARE * tolerance
-        found = one if close else found
-        low, high = (low, middle) if close else (middle + 1, high)
-    if found is None or len(found[0]) >= len(at_um):
+        trial = with_taps(_TAPS[middle])
+        if trial[2] < _SHARE * tolerance:
+            best = trial
+            high = middle
+        else:
+            low = middle + 1
+    if best is None or len(best[0]) >= len(at_um):
         return at_um, np.eye(len(at_um))
-    return found[0], found[1]
+    return best[0], best[1]
 
 
 def _weights(
     at_um: Array, coarse_um: Array, band: float, taps: int
 ) -> tuple[Array, Array]:
-    """(fine, coarse) weights of the nearest ``taps`` samples, least squares over an
-    evenly filled band; (fine,) errors,
-    rms over it."""
-    index, apart = _nearby(at_um, coarse_um, band, taps)
-    seen = np.sinc(band / np.pi * (at_um[:, None] - coarse_um[index]))
-    found = np.linalg.solve(apart, seen.T).T
+    """Least-squares interpolation weights, and their errors, over an even band.
+
+    With sinc correlations G among the taps and s to the place: weights G⁻¹ s, mean
+    square error 1 - 2 wᵀs + wᵀG w.
+
+    Returns:
+        (fine, coarse) weights of the nearest ``taps`` samples; (fine,) rms errors.
+    """
+    index, gram = _nearby(at_um, coarse_um, band, taps)
+    target = np.sinc(band / np.pi * (at_um[:, None] - coarse_um[index]))
+    weights = np.linalg.solve(gram, target.T).T
     missed = (
-        1 - 2 * (found * seen).sum(1) + np.einsum("ni,ij,nj->n", found, apart, found)
+        1
+        - 2 * (weights * target).sum(1)
+        + np.einsum("ni,ij,nj->n", weights, gram, weights)
     )
     out = np.zeros((len(at_um), len(coarse_um)))
-    np.put_along_axis(out, index, found, 1)
+    np.put_along_axis(out, index, weights, 1)
     return out, np.sqrt(np.maximum(missed, 0.0))
