@@ -659,10 +659,8 @@ class Trainer:
             sensor=replace(self.sensor, pitch_um=float(self.model.pitch_um.detach())),
             sample_um=self.optics.sample_um,
         )
-        return (
-            imager,
-            every * separability.loss.value,
-        )  # of weight optics_weight on average
+        # weight optics_weight on average over the steps
+        return imager, every * separability.loss.value
 
     def _lens_error(self, step: int) -> DrawnLensErrors | None:
         """Assembly and process error of one lens, drawn by step number; None for no
