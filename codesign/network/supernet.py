@@ -233,8 +233,7 @@ class ElasticBlock(nn.Module):
 
 class PerceptionHead(nn.Module):
     """Pupil mask and landmark maps from the features of every stride, summed from
-    coarse to
-    fine.
+    coarse to fine.
 
     ``forward(features) -> (mask, maps, decoded)``: the last is what both are decoded
     from.
