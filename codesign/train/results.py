@@ -206,7 +206,7 @@ def _errors(
     prefix: str, predictions: Predictions, seen: SensorFrames
 ) -> dict[str, float | None]:
     """Mean axial and lateral slippage error in mm, and mask IoU; keys begin with
-    ``name``.
+    ``prefix``.
     """
     error = (predictions.slip_mm - seen.slip_mm).abs().mean(0)
     iou = float(predictions.iou.mean())
