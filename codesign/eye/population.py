@@ -374,9 +374,7 @@ def model_parameters(
         model.HALF: half_width, model.GAIN: gain, model.AMBIENT: t["ambient"] / (depth.clamp_min(3000.0) / 20e3) ** 2,
         model.CARUNCLE: t["fissure_middle_um"] - 0.93 * half_width,
     }  # fmt: skip
-    return _join_columns(
-        parameters | _copied_traits(t) | _texture_parameters(states.textures)
-    )
+    return _row(parameters | _copied_traits(t) | _texture_parameters(states.textures))
 
 
 BLEND_UM = 1600.0  # over which lid shell and face plane run into each other
@@ -412,7 +410,7 @@ def _texture_parameters(textures: Tensor) -> dict[int, Tensor]:
     return turn | {index: columns[name] for index, name in PICTURES.items()}
 
 
-def _join_columns(places: Mapping[int, Tensor]) -> Tensor:
+def _row(places: Mapping[int, Tensor]) -> Tensor:
     """(n, COUNT) parameters of frames from their values by first column index.
 
     Each value is (n,) or (n, columns).
