@@ -161,10 +161,8 @@ CAUSES: Mapping[str, FrameAugmentation] = {
 VIEWS = ("tilt", "side", "roll", "wide")  # of the view that frames are rendered from
 BEFORE = (*VIEWS, "iris")  # what frames are rendered with; all else is put on them
 RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
-WHITE, BLACK = (
-    0.99,
-    1e-3,
-)  # of a tone curve: share of the pixels below its white, and the least level of it
+# of a tone curve: fraction of the pixels below white, and the least relative level
+WHITE, BLACK = 0.99, 1e-3
 TAPS = 15  # of the kernel of a movement, at most its length
 
 
