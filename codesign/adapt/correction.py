@@ -27,12 +27,11 @@ from metalens.fabrication import (
 )
 from metalens.lens import DiameterMap, Lens
 
-_RAYS = 8  # of the places where the corrected map is judged
+_ANGLES = 8  # along a circle of points where the corrected map is judged
 DRAWS = 24
-# standard deviation of the table's entries beyond which it is no table: the step of
-# drawn diameters
+# largest standard deviation of usable table entries: the step of drawn diameters
 WIDE_NM = 2.0
-_SETTLED = (  # word of a cause, and what states it
+_REMEDIES = (  # word in the name of a cause, and the measurement that removes it
     ("side wall", "the side wall by a cross-section ([[known]] sidewall_deg)"),
     ("refractive index", "the index by ellipsometry ([[known]] index)"),
     (
@@ -112,34 +111,34 @@ class CorrectionTable:
 def propose_correction(
     design: Lens, x: Array, *, response: Sensitivity, old: Bias
 ) -> MaskCorrection:
-    """The correction that fitted parameters ask for.
+    """Bias table and corrected diameter map for fitted process parameters.
 
     Args:
-        x: all parameters of the fit. old: bias that the present mask was drawn with.
-        design: as designed. response: of the pillars to height, index and side wall.
+        design: as designed. x: all parameters of the fit.
+        response: of the pillars to height, index and side wall.
+        old: bias that the present mask was drawn with.
 
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
     """
-    made = correction_table(
+    table = correction_table(
         design, x, response=response, old=old, range_um=printed_um(design)
     )
     return MaskCorrection(
-        made.drawn_nm,
-        made.bias_nm,
-        old.at(made.drawn_nm),
-        made.designed_um,
-        made.wanted_um,
-        _evened(design, x),
+        table.drawn_nm,
+        table.bias_nm,
+        old.at(table.drawn_nm),
+        table.designed_um,
+        table.wanted_um,
+        _with_even_bias(design, x),
     )
 
 
 def printed_um(design: Lens) -> tuple[float, float]:
-    """(least, largest) diameter of the design's pillars."""
+    """(least, largest) diameter of the design's pillars, um."""
     diameter = design.diameters.diameter_um
-    return float(diameter.min(where=diameter > 0, initial=np.inf)), float(
-        diameter.max()
-    )
+    least = float(diameter.min(where=diameter > 0, initial=np.inf))
+    return least, float(diameter.max())
 
 
 def correction_table(
@@ -151,8 +150,10 @@ def correction_table(
     range_um: tuple[float, float],
     knots: int = 13,
 ) -> CorrectionTable:
-    """The bias table alone, without a look at the pillars: what many draws of a
-    posterior are asked for.
+    """Bias table over drawn diameter that gives the designed phases in a process.
+
+    Drawn diameter = mask rule at (corrected diameter - bias of the process); the table
+    is designed minus drawn, at ``knots`` evenly spaced designed diameters.
 
     Args:
         design: as designed. x: all parameters of a lens, in the fit's order.
@@ -163,53 +164,51 @@ def correction_table(
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
     """
-    designed = np.linspace(*range_um, knots)
-    wanted = _wanted_um(design, designed, x, response)
-    drawn = old.drawn_nm(wanted * 1e3 - process_state_of(x)["bias_nm"])
-    bias = designed * 1e3 - drawn
-    slope = np.diff(bias) / np.diff(drawn)
+    designed_um = np.linspace(*range_um, knots)
+    corrected_um = _corrected_diameters_um(design, designed_um, x, response)
+    drawn_nm = old.drawn_nm(corrected_um * 1e3 - process_state_of(x)["bias_nm"])
+    bias_nm = designed_um * 1e3 - drawn_nm
+    slope = np.diff(bias_nm) / np.diff(drawn_nm)
     if np.abs(slope).max() > STEEPEST:
         raise ConfigError(
             f"the table would change by {np.abs(slope).max():.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
             "lens is too far from its design for a table; correct height or index in the process instead"
         )
-    return CorrectionTable(drawn, bias, designed, wanted)
+    return CorrectionTable(drawn_nm, bias_nm, designed_um, corrected_um)
 
 
 def next_lenses(
     made: MadeLens, plan: MaskCorrection, x_fit: Array, x_true: Array
 ) -> list[LensProposal]:
-    """The lens as made, with the new table, with the corrected map too, and at the
-    corrected distance besides.
+    """Simulated lenses of each step of a correction: PSFs, Strehl ratio, relative
+    light.
+
+    The lens as made, then with the new table, then with the corrected map too, and last
+    at the corrected sensor distance.
 
     Args:
-        x_fit: what the correction was made from. x_true: what the process really does;
-            both all parameters.
-        plan: proposed correction of the next mask.
+        made: the design with its settings. plan: proposed correction of the next mask.
+        x_fit: parameters that the correction was computed from.
+        x_true: parameters of the real process. Both hold all parameters.
     """
-    tabled = _drawn_with(made.design, plan, x_fit)
-    full = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
-    placed = x_true.copy()
-    placed[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
+    with_table = made.redrawn(_drawn_with(made.design, plan, x_fit))
+    with_map = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
+    x_spacer = x_true.copy()
+    x_spacer[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
     cases = (
         ("as made", made, x_true),
-        ("new bias table", made.redrawn(tabled), x_true),
-        ("table and corrected map", full, x_true),
-        ("and the spacer set right", full, placed),
+        ("new bias table", with_table, x_true),
+        ("table and corrected map", with_map, x_true),
+        ("and the spacer set right", with_map, x_spacer),
     )
     goal = made.wave()
-    out = []
+    proposals = []
     for name, lens, x in cases:
         wave = lens.wave(x)
-        out.append(
-            LensProposal(
-                name,
-                lens.stack(x),
-                wavefront_overlap(wave, goal),
-                float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum()),
-            )
-        )
-    return out
+        light = float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum())
+        strehl = wavefront_overlap(wave, goal)
+        proposals.append(LensProposal(name, lens.stack(x), strehl, light))
+    return proposals
 
 
 def loss_reason(before: LensProposal, after: LensProposal) -> str:
@@ -228,47 +227,47 @@ def loss_reason(before: LensProposal, after: LensProposal) -> str:
 
 
 def wavefront_overlap(one: Array, other: Array) -> float:
-    """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a>
-    <b, b>), best piston.
+    """Strehl ratio |<a, b>|² / (<a, a> <b, b>) of one wave against another, best
+    piston.
 
     Args:
-        other: the one it is compared with.
+        one: wave. other: reference wave on the same nodes.
     """
     cross = abs(np.vdot(one, other)) ** 2
     return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
 
 
 def uneven_nm(x: Array) -> Array:
-    """(places,) nm that the corrected map takes off at the axis, half-way and along the
-    rim, of all parameters.
+    """(points,) deviation of the bias from its mean, nm: what the corrected map
+    subtracts.
+
+    At the axis, at half the radius and along the rim.
 
     Args:
         x: all parameters of a lens, in the fit's order.
     """
-    turn = 2 * np.pi * np.arange(_RAYS) / _RAYS
-    rho = np.repeat([0.5, 1.0], _RAYS)
-    u, v = (np.append(0.0, rho * np.tile(way(turn), 2)) for way in (np.cos, np.sin))
-    return np.asarray(
-        process_state_of(x).bias_um(u, v) * 1e3 - process_state_of(x)["bias_nm"]
-    )
+    angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    rho = np.repeat([0.5, 1.0], _ANGLES)
+    u = np.append(0.0, rho * np.tile(np.cos(angle), 2))
+    v = np.append(0.0, rho * np.tile(np.sin(angle), 2))
+    state = process_state_of(x)
+    return np.asarray(state.bias_um(u, v) * 1e3 - state["bias_nm"])
 
 
 def write_correction(
     folder: Path, plan: MaskCorrection, *, evened: bool = True
 ) -> None:
-    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5
-    where it is ``evened``.
+    """Write bias.csv, bias.toml (the [bias] table of PROCESS.toml) and
+    lens_corrected.h5.
 
     Args:
         folder: of the files. plan: proposed correction of the next mask.
+        evened: write the lens file too.
     """
-    rows = [
-        f"{d:.3f},{b:.3f}" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)
-    ]
+    knots = list(zip(plan.drawn_nm, plan.bias_nm, strict=True))
+    rows = [f"{drawn:.3f},{bias:.3f}" for drawn, bias in knots]
     store.write_text(folder / "bias.csv", "\n".join(["drawn_nm,bias_nm", *rows]) + "\n")
-    pairs = ", ".join(
-        f"[{d:.3f}, {b:.3f}]" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)
-    )
+    pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias in knots)
     store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     if evened:
         lenses.save(folder / "lens_corrected.h5", plan.lens)
@@ -286,86 +285,105 @@ def present_bias(path: Path | None) -> Bias:
     return Bias() if path is None else of_process(path).bias
 
 
-def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -> Array:
-    """Made diameters whose phase in the process as it is equals the designed one, up to
-    a piston.
+def _corrected_diameters_um(
+    design: Lens, designed: Array, x: Array, response: Sensitivity
+) -> Array:
+    """(knots,) diameters whose phase in the process is the designed one, up to a
+    piston.
 
-    Of pillars that lose their form as their edges move: by the phase of the designed
-    ones with all edges moved so far.
+    The phase over 4001 diameters is inverted by interpolation. For pillars that change
+    form as their edges move, it is that of the designed pillar with all edges moved.
+
+    Args:
+        designed: (knots,) um. x: all parameters of a lens, in the fit's order.
     """
     low, high = design.proxy.domain_um
     fine = np.linspace(low, min(high, 0.999 * design.diameters.pitch_um), 4001)
     wave = design.wavelength_um
-    now, meant = (
+    process_phase, design_phase = (
         np.unwrap(
             np.angle(
                 perturbed_transmission(
-                    design.proxy, response, fine, wave, made.answers()
+                    design.proxy, response, fine, wave, state.answers()
                 )
             )
         )
-        for made in (process_state_of(x), State.of())
+        for state in (process_state_of(x), State.of())
     )
     inside = (fine >= designed[0]) & (fine <= designed[-1])
-    piston = float((now - meant)[inside].mean())
-    goal = np.interp(designed, fine, meant) + piston
+    piston = float((process_phase - design_phase)[inside].mean())
+    goal = np.interp(designed, fine, design_phase) + piston
 
-    def made(size: float) -> Array:
+    def phase_of_moved_edges(size: float) -> Array:
         rate = response.by_edges((fine + size) / 2)
-        return np.maximum.accumulate(
-            now if rate is None else now + (fine - size) * rate.imag
-        )
+        if rate is None:
+            return np.maximum.accumulate(process_phase)
+        return np.maximum.accumulate(process_phase + (fine - size) * rate.imag)
 
     return np.array(
         [
-            np.interp(g, made(size), fine)
-            for size, g in zip(designed.tolist(), goal.tolist(), strict=True)
+            np.interp(phase, phase_of_moved_edges(size), fine)
+            for size, phase in zip(designed.tolist(), goal.tolist(), strict=True)
         ]
     )
 
 
-def _evened(design: Lens, x: Array) -> Lens:
-    d = design.diameters
-    constant = process_state_of(x)["bias_nm"] * 1e-3
-    change = np.empty(d.diameter_um.shape, np.float32)
-    for first in range(0, len(change), 256):
-        rows = slice(first, first + 256)
-        u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um[rows] / d.radius_um)
-        change[rows] = process_state_of(x).bias_um(u, v) - constant
-    return _with_diameters(design, d.diameter_um - change, d.diameter_um > 0)
+def _with_even_bias(design: Lens, x: Array) -> Lens:
+    """The design with the bias's deviation from its mean subtracted from every
+    diameter.
+    """
+    diameters = design.diameters
+    state = process_state_of(x)
+    constant = state["bias_nm"] * 1e-3
+    change = np.empty(diameters.diameter_um.shape, np.float32)
+    for start in range(0, len(change), 256):
+        rows = slice(start, start + 256)
+        u, v = np.meshgrid(
+            diameters.x_um / diameters.radius_um,
+            diameters.y_um[rows] / diameters.radius_um,
+        )
+        change[rows] = state.bias_um(u, v) - constant
+    return _with_diameters(
+        design, diameters.diameter_um - change, diameters.diameter_um > 0
+    )
 
 
 def _drawn_with(design: Lens, plan: MaskCorrection, x_fit: Array) -> Lens:
-    """The lens whose diameters, made by a process of that bias, are those that the new
-    table aims at.
+    """The design with diameters that its process turns into those of the new table.
+
+    D + (corrected - designed)(D) - fitted bias, um; the corrected diameters are
+    interpolated between the knots of the table.
     """
     d = design.diameters.diameter_um
-    aim = (
+    change = (
         np.interp(d, plan.designed_um, plan.wanted_um - plan.designed_um)
         - process_state_of(x_fit)["bias_nm"] * 1e-3
     )
-    return _with_diameters(design, d + aim, d > 0, keep=False)
+    return _with_diameters(design, d + change, d > 0, limit=False)
 
 
 def _with_diameters(
-    design: Lens, diameter_um: Array, there: Array, *, keep: bool = True
+    design: Lens, diameter_um: Array, printed: Array, *, limit: bool = True
 ) -> Lens:
-    """The lens with other diameters, kept within the proxy's domain unless a bias will
-    bring them back into it.
+    """The lens with other diameters, clipped to the proxy's domain and the pitch.
+
+    Args:
+        printed: (y, x) where there is a pillar; elsewhere the diameter is 0.
+        limit: clip to the domain; False where a bias will return them into it.
     """
-    low, high = design.proxy.domain_um if keep else (1e-3, np.inf)
+    low, high = design.proxy.domain_um if limit else (1e-3, np.inf)
     top = min(high, 0.999 * design.diameters.pitch_um)
-    inside = np.where(there, np.clip(diameter_um, low, top), 0).astype(np.float32)
+    clipped = np.where(printed, np.clip(diameter_um, low, top), 0).astype(np.float32)
     return dataclasses.replace(
         design,
-        diameters=DiameterMap(inside, design.diameters.pitch_um),
+        diameters=DiameterMap(clipped, design.diameters.pitch_um),
         profile=f"{design.profile}, corrected",
     )
 
 
 def table_rows(plan: MaskCorrection) -> list[tuple[Any, ...]]:
-    """Rows of the table for people: drawn diameter, present bias, new bias, designed
-    and aimed diameter, nm.
+    """Rows of the printed table: drawn diameter, present bias, new bias, designed and
+    corrected diameter, all in nm.
 
     Args:
         plan: proposed correction of the next mask.
@@ -399,11 +417,11 @@ MAP = CorrectionPart(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CorrectionSpread:
-    """How the posterior spreads a correction.
+    """Spread of a correction over the posterior.
 
-    table_nm: (draws, knots) that of every draw. sigma_nm: (knots,) its standard
-    deviation. words: why it is
-    refused, and what to capture or measure; empty where it may be used.
+    table_nm: (draws, knots) table of every draw. sigma_nm: (knots,) its standard
+    deviation.
+    words: why it is refused, and what to capture or measure; empty where it is usable.
     """
 
     table_nm: Array
@@ -424,17 +442,20 @@ def judge_correction(
     wide_nm: float = WIDE_NM,
     seed: int = 5,
 ) -> CorrectionSpread:
-    """What every draw of the posterior would ask for, and whether they agree.
+    """Spread of a correction over draws of the posterior, and whether it is usable.
+
+    Usable where the standard deviation over DRAWS draws is at most ``wide_nm``
+    everywhere.
 
     Args:
-        table: (knots,) of the bias table, or of what is taken off at some places of the
-            lens, nm, of all parameters of
-            one lens. part: which of them.
-        result: of the fit. wide_nm: largest standard deviation of a usable correction.
+        result: of the fit.
+        table: (knots,) nm from all parameters of one lens: the bias table, or the
+            deviation that the map subtracts.
+        part: which of them. wide_nm: largest standard deviation of a usable correction.
         seed: of the random generator.
     """
     try:
-        drawn = np.array(
+        tables = np.array(
             [table(result.parameters(row)) for row in result.samples(DRAWS, seed=seed)]
         )
     except ConfigError as refusal:
@@ -443,9 +464,9 @@ def judge_correction(
             np.empty(0),
             f"no correction: for lenses of the posterior {refusal}",
         )
-    sigma = drawn.std(axis=0, ddof=1)
+    sigma = tables.std(axis=0, ddof=1)
     if sigma.max() <= wide_nm:
-        return CorrectionSpread(drawn, sigma, "")
+        return CorrectionSpread(tables, sigma, "")
     ranges = [
         (name, *result.interval(name)) for name in part.names if name in result.names
     ]
@@ -453,49 +474,54 @@ def judge_correction(
         f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges
     )
     return CorrectionSpread(
-        drawn,
+        tables,
         sigma,
         f"no correction: the posterior leaves {part.words} open by {sigma.max():.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {intervals}). Settle it by {_settled(result, table, sigma, (part, wide_nm))}",
+        f"{wide_nm:g} allowed; {intervals}). Settle it by {_remedies(result, table, sigma, (part, wide_nm))}",
     )
 
 
-def _settled(
+def _remedies(
     result: AsBuilt,
     table: Callable[[Array], Array],
     sigma: Array,
-    wanted: tuple[CorrectionPart, float],
+    limits: tuple[CorrectionPart, float],
 ) -> str:
-    """What would make the table narrow, the most telling first: causes to state, and
-    frames where these say too little.
+    """Measurements that would narrow the table, in words, the most effective first.
 
-    By the table's slopes along every parameter that it follows; a cause moves all of
-    them together, at most by the sum.
+    Finite-difference slopes of the widest knot propagate the covariance of the fit. A
+    cause moves all parameters together, so its part is at most the sum of the absolute
+    parts.
+
+    Args:
+        sigma: (knots,) standard deviation of the table, nm.
+        limits: part of the correction, and its largest standard deviation in nm.
     """
-    (part, wide_nm), best, place = (
-        wanted,
-        table(result.parameters()),
-        int(np.argmax(sigma)),
-    )
+    part, wide_nm = limits
+    best = table(result.parameters())
+    knot = int(np.argmax(sigma))
     slopes = np.zeros(len(result.names))
     for i, name in enumerate(result.names):
         if name in part.names:
             moved = result.value.copy()
             moved[i] += 0.1 * result.sigma[i]
-            slopes[i] = (table(result.parameters(moved)) - best)[place] / (
-                0.1 * result.sigma[i]
-            )
-    own = float(np.sqrt(slopes @ result.within_covariance @ slopes))
-    by_cause = result.by_cause @ np.abs(slopes) if len(result.causes) else np.empty(0)
-    worst = [
+            change = table(result.parameters(moved)) - best
+            slopes[i] = change[knot] / (0.1 * result.sigma[i])
+    own_sigma = float(np.sqrt(slopes @ result.within_covariance @ slopes))
+    cause_sigma = (
+        result.by_cause @ np.abs(slopes) if len(result.causes) else np.empty(0)
+    )
+    large = [
         k
-        for k in np.argsort(-by_cause)
-        if by_cause[k] > max(by_cause.max() / 4, 0.2 * wide_nm)
+        for k in np.argsort(-cause_sigma)
+        if cause_sigma[k] > max(cause_sigma.max() / 4, 0.2 * wide_nm)
     ]
-    ways = [way for k in worst for word, way in _SETTLED if word in result.causes[k]]
-    more = (
+    measurements = [
+        remedy for k in large for word, remedy in _REMEDIES if word in result.causes[k]
+    ]
+    captures = (
         [_FRAMES]
-        if own > 0.7 * wide_nm or not ways
+        if own_sigma > 0.7 * wide_nm or not measurements
         else ["the diameters themselves by micrographs (metalens measure)"]
     )
-    return "; ".join([*dict.fromkeys(ways), *more])
+    return "; ".join([*dict.fromkeys(measurements), *captures])

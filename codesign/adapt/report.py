@@ -25,13 +25,13 @@ CASES = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrainingResults:
-    """Everything that the page shows.
+    """Content of the page.
 
-    apart: PSF errors against the nominal lens of the fitted lens and of the lens that
-    judges. curves: {job: (step,
-    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions:
-    in words. refused: why the
-    correction is not written; uneven: why the table alone is; empty where they are.
+    apart: PSF errors of the fitted lens and of the judging lens, relative to the
+    nominal one. curves: {job: (step, loss)}. proposals: states of the next lens with
+    their PSF and slippage errors, mm. cautions: in words.
+    refused: why the correction is not written; uneven: why the map is not; empty where
+    they are.
     """
 
     outcome: RetrainingOutcome
@@ -51,15 +51,15 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     Args:
         path: of the file. story: everything that the page shows.
     """
-    o = story.outcome
+    outcome = story.outcome
     keys = [
-        KeyFigure("slippage error, nominal lens", f"{o.nominal.slip_mm:.3f} mm"),
-        KeyFigure("made lens, before", f"{o.before.slip_mm:.3f} mm"),
-        KeyFigure("made lens, after", f"{o.after.slip_mm:.3f} mm"),
+        KeyFigure("slippage error, nominal lens", f"{outcome.nominal.slip_mm:.3f} mm"),
+        KeyFigure("made lens, before", f"{outcome.before.slip_mm:.3f} mm"),
+        KeyFigure("made lens, after", f"{outcome.after.slip_mm:.3f} mm"),
         KeyFigure(
             "share of the gap won back",
-            _share(o),
-            None if o.recovered is None else o.recovered >= 0.9,
+            _recovered_text(outcome),
+            None if outcome.recovered is None else outcome.recovered >= 0.9,
         ),
     ]
     judge = (
@@ -68,7 +68,7 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
         else "lenses of the posterior not seen before"
     )
     lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
-    sections = [_accuracy(story), _light(story), _mask(story)]
+    sections = [_accuracy_section(story), _psf_section(story), _mask_section(story)]
     if story.cautions:
         sections.append(Section("Read with care", "\n\n".join(story.cautions)))
     report.write_report(
@@ -76,12 +76,12 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     )
 
 
-def _share(o: RetrainingOutcome) -> str:
+def _recovered_text(o: RetrainingOutcome) -> str:
     return "no gap beyond chance" if o.recovered is None else f"{o.recovered:.0%}"
 
 
 def accuracy_table(outcome: RetrainingOutcome) -> Table:
-    """A row a case.
+    """Table of slippage errors with intervals, and mask IoU, a row a case.
 
     Args:
         outcome: accuracy of all cases.
@@ -114,7 +114,8 @@ def accuracy_table(outcome: RetrainingOutcome) -> Table:
     return Table(head, rows, digits=3)
 
 
-def _accuracy(story: RetrainingResults) -> Section:
+def _accuracy_section(story: RetrainingResults) -> Section:
+    """Accuracy of all cases as bars and table, and training curves."""
     text = (
         "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
         "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
@@ -129,87 +130,94 @@ def _accuracy(story: RetrainingResults) -> Section:
                 "Slippage error, with its 95 % interval.",
             ),
             accuracy_table(story.outcome),
-            Figure(_curves(story), "Loss while training on."),
+            Figure(_loss_picture(story), "Loss while training on."),
         ],
     )
 
 
 def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
-    """Slippage error of every case as PNG.
+    """PNG of a bar chart: slippage error of every case with its 95 % interval.
 
     Args:
         outcome: accuracy of all cases.
     """
     rows = outcome.rows()
     figure, axes = report.make_figure(size=(6.4, 2.6))
-    place = np.arange(len(rows))[::-1]
+    position = np.arange(len(rows))[::-1]
     values = [v["slip_mm"] for v in rows.values()]
-    reach = [
+    intervals = [
         [v["slip_mm"] - v["slip_low_mm"] for v in rows.values()],
         [v["slip_high_mm"] - v["slip_mm"] for v in rows.values()],
     ]
     colours = {"before": "#d1495b", "after": "#2a9d8f"}
     axes.barh(
-        place,
+        position,
         values,
-        xerr=reach,
+        xerr=intervals,
         color=[colours.get(n, "#9db4d8") for n in rows],
         height=0.62,
         ecolor="#444",
     )
-    axes.set_yticks(place, [CASES[n] for n in rows])
+    axes.set_yticks(position, [CASES[n] for n in rows])
     axes.set(xlabel="slippage error / mm")
     axes.grid(axis="y", visible=False)
     return report.figure_png(figure)
 
 
-def _curves(story: RetrainingResults) -> bytes:
+def _loss_picture(story: RetrainingResults) -> bytes:
+    """PNG of the task loss of every job over the step, moving average of a
+    twentieth.
+    """
+    labels = {
+        "nominal": "nominal lens",
+        "retrained": "as built",
+        "known": "truth known",
+    }
     figure, axes = report.make_figure(size=(6.4, 2.4))
     for name, (step, loss) in story.curves.items():
         width = max(1, len(loss) // 20)
         smooth = np.convolve(loss, np.ones(width) / width, mode="valid")
-        axes.plot(
-            step[width - 1 :],
-            smooth,
-            label={
-                "nominal": "nominal lens",
-                "retrained": "as built",
-                "known": "truth known",
-            }[name],
-        )
+        axes.plot(step[width - 1 :], smooth, label=labels[name])
     axes.set(xlabel="step", ylabel="task loss")
     axes.legend()
     return report.figure_png(figure)
 
 
-def _light(story: RetrainingResults) -> Section:
+def _psf_section(story: RetrainingResults) -> Section:
+    """PSF differences of fitted and judging lens, and their pictures."""
     fitted, judged = story.apart
     text = (
         f"PSFs of the fitted lens differ from the nominal ones by {fitted:.1%} (relative L2 over all depths), those of "
         f"the lens that judges by {judged:.1%}. Training drew {len(story.lenses.drawn)} lenses from the posterior."
     )
     caption = "Square root of the PSFs on the samples of training, by depth: nominal, fitted, and the lens that judges."
-    return Section("Light", text, [Figure(_psfs(story), caption, wide=True)])
+    return Section("Light", text, [Figure(_psf_picture(story), caption, wide=True)])
 
 
-def _psfs(story: RetrainingResults) -> bytes:
+def _psf_picture(story: RetrainingResults) -> bytes:
+    """PNG of PSFs (square root) at seven depths: nominal, fitted and judging lens."""
     lenses = story.lenses
     rows = (
         ("nominal", lenses.nominal),
         ("as built", lenses.best),
         ("true" if lenses.known else "a draw", lenses.judges[0]),
     )
-    chosen = np.unique(
+    depth_indices = np.unique(
         np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int)
     )
     figure, axes = report.make_figure(
-        len(rows), len(chosen), size=(1.15 * len(chosen), 3.6), squeeze=False
+        len(rows),
+        len(depth_indices),
+        size=(1.15 * len(depth_indices), 3.6),
+        squeeze=False,
     )
-    for column, depth in enumerate(chosen):
-        top = max(float(s.intensity[depth].max()) for _, s in rows)
-        for row, (label, made) in enumerate(rows):
+    for column, depth in enumerate(depth_indices):
+        peak = max(float(s.intensity[depth].max()) for _, s in rows)
+        for row, (label, stack) in enumerate(rows):
             axes[row, column].imshow(
-                made.intensity[depth].clamp_min(0).sqrt().numpy(), vmin=0, vmax=top**0.5
+                stack.intensity[depth].clamp_min(0).sqrt().numpy(),
+                vmin=0,
+                vmax=peak**0.5,
             )
             axes[row, column].set(xticks=[], yticks=[])
             axes[row, column].grid(visible=False)
@@ -220,8 +228,9 @@ def _psfs(story: RetrainingResults) -> bytes:
     return report.figure_png(figure)
 
 
-def _mask(story: RetrainingResults) -> Section:
-    head = (
+def _mask_section(story: RetrainingResults) -> Section:
+    """Gain of each step of the next mask, and its bias table; or why there is none."""
+    gain_columns = (
         "next lens",
         "PSF error",
         "Strehl ratio",
@@ -232,7 +241,7 @@ def _mask(story: RetrainingResults) -> Section:
         (p.name, error, p.strehl, p.light, slip) for p, error, slip in story.proposals
     ]
     gain = Table(
-        head,
+        gain_columns,
         rows,
         "Simulated with the lens that judges as the truth; Strehl and light against the design.",
         digits=3,
@@ -244,11 +253,11 @@ def _mask(story: RetrainingResults) -> Section:
         "designed / nm",
         "aimed at / nm",
     )
-    held = "bias.toml holds the new table for PROCESS.toml."
+    note = "bias.toml holds the new table for PROCESS.toml."
     table = Table(
         columns,
         table_rows(story.plan),
-        "Written to no file: see above." if story.refused else held,
+        "Written to no file: see above." if story.refused else note,
     )
     text = (
         "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
@@ -265,13 +274,14 @@ def _mask(story: RetrainingResults) -> Section:
         text,
         [
             gain,
-            Figure(_table_plot(story.plan), "Bias: made less drawn diameter."),
+            Figure(_bias_picture(story.plan), "Bias: made less drawn diameter."),
             table,
         ],
     )
 
 
-def _table_plot(plan: MaskCorrection) -> bytes:
+def _bias_picture(plan: MaskCorrection) -> bytes:
+    """PNG of present and new bias over drawn diameter."""
     figure, axes = report.make_figure(size=(5.2, 2.6))
     axes.plot(plan.drawn_nm, plan.old_nm, "--", color="#888", label="present table")
     axes.plot(plan.drawn_nm, plan.bias_nm, "o-", label="new table")

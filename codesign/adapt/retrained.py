@@ -29,7 +29,7 @@ RECIPE, RESULT = "retrain.toml", "result.json"
 
 @dataclass(frozen=True, slots=True)
 class RetrainingRecipe:
-    """What a retraining was made of, and a resume must find unchanged.
+    """Inputs of a retraining, which must be unchanged for a resume.
 
     asbuilt, weights, truth: SHA-256 of the files; '' without one.
     """
@@ -44,26 +44,26 @@ class RetrainingRecipe:
 def relative_inputs(
     folder: Path, run: Path, built: Path, truth: Path | None
 ) -> dict[str, str | None]:
-    """Where a retraining's run, fit and truth lie, as seen from its folder, for its
+    """Paths of a retraining's run, fit and truth relative to its folder, for its
     result.
 
     Args:
-        built: asbuilt.h5.
+        folder: of the retraining. run: folder of its run. built: asbuilt.h5.
+        truth: of the virtual bench, or None.
     """
     paths = {"run": run, "asbuilt": built, "truth": truth}
     return {
-        name: None if path is None else _from(folder, path)
+        name: None if path is None else _relative_path(folder, path)
         for name, path in paths.items()
     }
 
 
 def run_of(path: Path) -> Path:
-    """The folder of the run: of a retraining the one that it went on from, else the
-    path itself.
-    """
-    return (
-        _places(_folder(path))["run"] or path if is_retraining(_folder(path)) else path
-    )
+    """The folder of a run: for a retraining that of its run, else the path itself."""
+    folder = _folder(path)
+    if not is_retraining(folder):
+        return path
+    return _input_paths(folder)["run"] or path
 
 
 def lens_of(path: Path) -> str:
@@ -76,26 +76,24 @@ def lens_of(path: Path) -> str:
     folder = _folder(path)
     if not is_retraining(folder):
         return "as designed"
-    return "as made" if _places(folder)["truth"] else "as fitted"
+    return "as made" if _input_paths(folder)["truth"] else "as fitted"
 
 
 def load_retrained(path: Path) -> FinishedRun:
-    """A finished run as :func:`codesign.adapt.source.load_finished_run` has it; of a
-    retraining its
-    network and the made lens.
+    """A finished run, or a retraining as one: its network with the PSFs of the made
+    lens.
+
+    The lens is the true one where the bench was virtual, else that of the fitted
+    values.
 
     Args:
         path: of a run, of a retraining, or a checkpoint in that:
-            ``nominal.safetensors`` is the network that nobody
-            warned of the made lens, ``known.safetensors`` the one that was trained with
-            the truth known.
-
-    The lens is the true one where the bench was virtual, else the one of the fitted
-    values.
+            ``nominal.safetensors`` is the network trained on the designed lens,
+            ``known.safetensors`` that trained on the true lens.
 
     Raises:
-        TrainingError: no finished run or retraining, or one whose run, fit or truth is
-            no longer what it was.
+        TrainingError: no finished run or retraining, or one whose run, fit or truth has
+            changed.
     """
     folder = _folder(path)
     if not is_retraining(folder):
@@ -103,45 +101,50 @@ def load_retrained(path: Path) -> FinishedRun:
     job = "retrained" if path == folder else path.stem
     transaction.check_manifest(folder)
     recipe = config.load(folder / RECIPE, RetrainingRecipe)
-    places = _places(folder)
+    paths = _input_paths(folder)
     for name, sha in (
         ("run", recipe.weights),
         ("asbuilt", recipe.asbuilt),
         ("truth", recipe.truth),
     ):
-        _unchanged(folder, name, places[name], sha)
+        _check_unchanged(folder, name, paths[name], sha)
     source = load_finished_run(
-        _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
+        _existing(paths["run"]), budget_mmacs=recipe.settings.budget_mmacs
     )
-    built = asbuilt.load(_known(places["asbuilt"]))
-    truth = (
-        None if places["truth"] is None else config.load(places["truth"], HiddenLens)
-    )
-    run_dir, budget = _known(places["run"]), source.row["budget_mmacs"]
+    built = asbuilt.load(_existing(paths["asbuilt"]))
+    truth = None if paths["truth"] is None else config.load(paths["truth"], HiddenLens)
+    run_dir = _existing(paths["run"])
+    budget = source.row["budget_mmacs"]
     design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
     made = MadeLens(design, source.settings.optics, response=built.response)
-    found = retraining.lens_psfs(made, built, recipe.settings, truth)
+    psfs = retraining.lens_psfs(made, built, recipe.settings, truth)
     if (
-        job not in retraining.available_jobs(found)
+        job not in retraining.available_jobs(psfs)
         or not (folder / f"{job}.safetensors").is_file()
     ):
-        have = ", ".join(
-            f"{name}.safetensors" for name in retraining.available_jobs(found)
+        available = ", ".join(
+            f"{name}.safetensors" for name in retraining.available_jobs(psfs)
         )
-        raise TrainingError(f"{path}: no network of this retraining; it holds {have}")
-    going = retraining.make_job(source, recipe.settings, found, job)
-    going.restore(
-        checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"]
-    )
-    shown = found.judges[0] if found.known else found.best
-    return replace(source, run=replace(source.run, trainer=going), made=shown)
+        raise TrainingError(
+            f"{path}: no network of this retraining; it holds {available}"
+        )
+    trainer = retraining.make_job(source, recipe.settings, psfs, job)
+    state = checkpoint.load(folder / f"{job}.safetensors", settings=recipe)
+    trainer.restore(state["trainer"])
+    stack = psfs.judges[0] if psfs.known else psfs.best
+    return replace(source, run=replace(source.run, trainer=trainer), made=stack)
 
 
 def _folder(path: Path) -> Path:
     return path.parent if path.suffix == ".safetensors" else path
 
 
-def _known(path: Path | None) -> Path:
+def _existing(path: Path | None) -> Path:
+    """The path itself.
+
+    Raises:
+        TrainingError: None.
+    """
     if path is None:
         raise TrainingError(
             "a retraining without a run or a fit: made by another version; retrain again"
@@ -149,14 +152,15 @@ def _known(path: Path | None) -> Path:
     return path
 
 
-def _from(folder: Path, path: Path) -> str:
+def _relative_path(folder: Path, path: Path) -> str:
+    """Path relative to a folder; absolute where they are on different drives."""
     try:
         return os.path.relpath(path.resolve(), folder.resolve())
     except ValueError:  # on another drive
         return str(path.resolve())
 
 
-def _places(folder: Path) -> dict[str, Path | None]:
+def _input_paths(folder: Path) -> dict[str, Path | None]:
     """Run, fit and truth of a retraining.
 
     Raises:
@@ -177,8 +181,12 @@ def _places(folder: Path) -> dict[str, Path | None]:
     }
 
 
-def _unchanged(folder: Path, name: str, path: Path | None, sha: str) -> None:
-    """Refuse what has moved away or become another."""
+def _check_unchanged(folder: Path, name: str, path: Path | None, sha: str) -> None:
+    """Refuse an input that is missing or whose SHA-256 differs.
+
+    Raises:
+        TrainingError: with its name and path.
+    """
     file = (
         path / "checkpoint.safetensors" if path is not None and name == "run" else path
     )

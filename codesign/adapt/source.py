@@ -41,12 +41,15 @@ class FinishedRun:
 
 
 def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun:
-    """A finished run and its network of this budget, as result.json judged it.
+    """A finished run with the network of one budget, as it was evaluated in
+    result.json.
 
     The weights are those of the network's own file, fine-tuned where the run did so.
 
     Args:
-        budget_mmacs: compute budget, million multiply-accumulates a frame.
+        folder: of the run.
+        budget_mmacs: compute budget, million multiply-accumulates a frame; 0 for the
+            largest.
 
     Raises:
         TrainingError: no run folder, half written, unfinished, of another version, or
@@ -67,25 +70,25 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         )
     transaction.check_manifest(folder)
     settings = runs.load_run_settings(folder / "run.toml")
-    made = runs.resume_run(folder / "checkpoint.safetensors", settings)
+    run = runs.resume_run(folder / "checkpoint.safetensors", settings)
     rows = rows_of(folder)
-    found = (
+    selected = (
         [r for r in rows if r["budget_mmacs"] == budget_mmacs]
         if budget_mmacs
         else rows[-1:]
     )
-    if not found:
-        have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
+    if not selected:
+        budgets = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
         raise TrainingError(
-            f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
+            f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {budgets}"
         )
-    architecture = architecture_of(found[0]["architecture"], made, folder)
-    restore_network(made, found[0], folder)
-    return FinishedRun(made, architecture, found[0])
+    architecture = architecture_of(selected[0]["architecture"], run, folder)
+    restore_network(run, selected[0], folder)
+    return FinishedRun(run, architecture, selected[0])
 
 
 def weights_file(folder: Path, budget_mmacs: float) -> Path:
-    """Where the weights of one network of a run lie.
+    """Path of the weights of one network of a run.
 
     Args:
         folder: of the files.
@@ -106,13 +109,14 @@ def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
 
 
 def restore_network(run: CodesignRun, row: dict[str, Any], folder: Path) -> None:
-    """Give the run's network the weights that a row of result.json was judged with.
+    """Load the weights that a row of result.json was evaluated with into a run's
+    network.
 
-    Without fine-tuning those are the checkpoint's own; networks with optics of their
+    Without fine-tuning those are the checkpoint's own. Networks with optics of their
     own (``search.inner_steps``) bring lens and pitch.
 
     Args:
-        folder: of the files.
+        run: run with its model. row: of result.json. folder: of the files.
 
     Raises:
         TrainingError: the file is missing, cut short, or of another space.
@@ -181,10 +185,9 @@ def architecture_of(
     Raises:
         TrainingError: of another version, or outside the run's space.
     """
-    named = (entry or {}).items()
     values: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v
-        for k, v in named
+        for k, v in (entry or {}).items()
         if k not in ("error", "macs")
     }
     try:
@@ -206,19 +209,19 @@ def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
     Raises:
         FitError: either of the two, with what to do.
     """
-    mine, other = design.diameters, result.design.diameters
+    own, other = design.diameters, result.design.diameters
     if (
-        mine.diameter_um.shape != other.diameter_um.shape
-        or mine.pitch_um != other.pitch_um
+        own.diameter_um.shape != other.diameter_um.shape
+        or own.pitch_um != other.pitch_um
     ):
         raise FitError(
             f"the as-built record is of another lens: {other.diameter_um.shape} pillars of pitch {other.pitch_um} um, "
-            f"the run's lens has {mine.diameter_um.shape} of {mine.pitch_um} um; fit captures of the run's own lens.h5"
+            f"the run's lens has {own.diameter_um.shape} of {own.pitch_um} um; fit captures of the run's own lens.h5"
         )
-    apart = float(np.abs(mine.diameter_um - other.diameter_um).max())
-    if apart > 1e-6 or design.sensor_distance_um != result.design.sensor_distance_um:
+    gap_um = float(np.abs(own.diameter_um - other.diameter_um).max())
+    if gap_um > 1e-6 or design.sensor_distance_um != result.design.sensor_distance_um:
         raise FitError(
-            f"the as-built record is of another lens: designed diameters differ by up to {apart * 1e3:.1f} nm, sensor "
+            f"the as-built record is of another lens: designed diameters differ by up to {gap_um * 1e3:.1f} nm, sensor "
             f"distances are {design.sensor_distance_um} and {result.design.sensor_distance_um} um; "
             "fit captures of the run's own lens.h5"
         )

@@ -29,7 +29,7 @@ from codesign.train import (
 )
 from metalens import lens as lenses
 
-APART = 7919  # between the seeds of retrainings: no step of one is a step of another
+APART = 7919  # difference of the seeds of retrainings, so that their steps differ
 JOBS = (
     "nominal",
     "retrained",
@@ -39,13 +39,12 @@ JOBS = (
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NetworkAccuracy:
-    """Errors of one network on one lens: (n,) absolute errors of the slippage, mean
-    over axes and along each, in mm.
+    """Errors of one network on one lens over n test frames.
 
-    The error that the studies speak of is ``slip_mm``, the mean over the three axes.
-
-    above: why the error of the images that were read is above what their run asks for;
-    empty where it is not.
+    error_mm: (n, 3) absolute errors of the slippage along each axis. iou: (n,) of the
+    pupil's mask. The error that the studies report is ``slip_mm``, the mean over axes.
+    above: why the error of the images is above what their run requires; empty where it
+    is not.
     finer: the same on images formed at a quarter of the tolerance; None where they are
     not known.
     """
@@ -81,7 +80,8 @@ class NetworkAccuracy:
         )
         return low, high
 
-    def _beside(self, fine: "NetworkAccuracy") -> dict[str, float]:
+    def _finer_values(self, fine: "NetworkAccuracy") -> dict[str, float]:
+        """Errors on the finer images, and their ratio to those on the usual ones."""
         return {
             "finer_slip_mm": fine.slip_mm,
             "finer_axial_mm": fine.axial_mm,
@@ -91,7 +91,7 @@ class NetworkAccuracy:
     def values(self) -> dict[str, float]:
         """The numbers by name, for tables and JSON."""
         low, high = self.interval_mm()
-        fine = {} if self.finer is None else self._beside(self.finer)
+        fine = {} if self.finer is None else self._finer_values(self.finer)
         return fine | {
             "slip_mm": self.slip_mm,
             "slip_low_mm": low,
@@ -107,8 +107,8 @@ class LensPsfs:
     """PSFs of the lens in question.
 
     nominal: as designed. best: of the fitted values. drawn: from the posterior, for
-    training. judges: those that
-    judge: the truth where it is known, else further draws. known: whether it is.
+    training. judges: for testing: the truth where it is known, else further draws.
+    known: whether it is.
     """
 
     nominal: PixelPsfStack
@@ -119,25 +119,24 @@ class LensPsfs:
 
 
 def gap_sigma_mm(worse: NetworkAccuracy, better: NetworkAccuracy) -> float:
-    """Standard error of the difference of two mean slippage errors over the frames,
-    which both cases share.
+    """Standard error of the difference of two mean slippage errors, mm, over shared
+    frames.
 
     Args:
         worse: case with the larger error. better: case with the smaller error.
     """
-    apart = (worse.error_mm - better.error_mm).mean(1)
-    return float(apart.std()) / math.sqrt(len(apart))
+    difference = (worse.error_mm - better.error_mm).mean(1)
+    return float(difference.std()) / math.sqrt(len(difference))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrainingOutcome:
-    """Accuracy in the order of the story.
+    """Accuracy of every case of a retraining.
 
-    designed: the run's network on the nominal lens, as it was. nominal: trained on for
-    the nominal lens just as long,
-    so that the others are not credited with more training. before: that network on the
-    made lens. after: retrained on
-    the fit. known: trained on with the truth known; None on a real bench.
+    designed: the run's network on the nominal lens, unchanged. nominal: trained further
+    on the nominal lens for the same number of steps as the others. before: that network
+    on the made lens. after: retrained on the fit. known: retrained on the true lens;
+    None on a real bench.
     """
 
     designed: NetworkAccuracy
@@ -148,7 +147,7 @@ class RetrainingOutcome:
 
     @property
     def gap_mm(self) -> float:
-        """What the made lens costs an unwarned network."""
+        """Additional error of the nominal network on the made lens, mm."""
         return self.before.slip_mm - self.nominal.slip_mm
 
     @property
@@ -158,8 +157,9 @@ class RetrainingOutcome:
 
     @property
     def recovered(self) -> float | None:
-        """Share of the gap that retraining wins back; None where the gap is within two
-        of its standard errors.
+        """Fraction of the gap that retraining removes.
+
+        None where the gap is within two of its standard errors.
         """
         if self.gap_mm <= 2 * self.gap_sigma_mm:
             return None
@@ -167,9 +167,10 @@ class RetrainingOutcome:
 
     @property
     def above(self) -> str:
-        """Why the error of some case's images is above what the run asks for, of the
-        made lens first; empty where none
-        is."""
+        """Why the error of the images of some case is too large, the made lens first;
+        else
+        empty.
+        """
         return self.after.above or self.designed.above
 
     def rows(self) -> dict[str, dict[str, float]]:
@@ -191,7 +192,8 @@ def lens_psfs(
 
     Args:
         made: lens ready for perturbations. result: of the fit.
-        config: of the retraining. truth: lens of a virtual bench; None of a real one.
+        config: of the retraining; numbers of posterior draws.
+        truth: lens of a virtual bench; None of a real one.
     """
     rows = list(
         built.posterior_parameters(
@@ -199,13 +201,13 @@ def lens_psfs(
         )
     )
     drawn = tuple(made.stack(x) for x in rows[: config.draws])
-    judging = rows[config.draws :] if truth is None else [truth.vector()]
+    judge_rows = rows[config.draws :] if truth is None else [truth.vector()]
     best = made.stack(result.parameters())
     return LensPsfs(
         made.stack(),
         best,
         drawn,
-        tuple(made.stack(x) for x in judging),
+        tuple(made.stack(x) for x in judge_rows),
         truth is not None,
     )
 
@@ -213,58 +215,59 @@ def lens_psfs(
 def make_trainer(
     source: FinishedRun, config: RetrainConfig, stacks: Sequence[PixelPsfStack]
 ) -> Trainer:
-    """The inner loop of the run, from its trained weights and where it is placed, on
-    given PSFs; only weights move.
+    """Trainer with copies of a run's weights, lens and pitch, on PSFs of made lenses.
+
+    On the run's device; only the weights are trained.
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
         stacks: PSFs of made lenses.
     """
-    settings, origin = source.settings, source.run.trainer
-    fresh = make_model(
+    settings = source.settings
+    origin = source.run.trainer
+    model = make_model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
     )  # fmt: skip
-    fresh.net.load_state_dict(origin.model.net.state_dict())
+    model.net.load_state_dict(origin.model.net.state_dict())
     with torch.no_grad():
-        fresh.coefficients_rad.copy_(origin.model.coefficients_rad)
-        fresh.log_pitch.copy_(origin.model.log_pitch)
-    made = Trainer(
-        fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, fresh,
+        model.coefficients_rad.copy_(origin.model.coefficients_rad)
+        model.log_pitch.copy_(origin.model.log_pitch)
+    trainer = Trainer(
+        fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, model,
         architecture=source.architecture, stacks=stacks,
     )  # fmt: skip
-    place_on_device(made, origin.light.device)
-    return made
+    place_on_device(trainer, origin.light.device)
+    return trainer
 
 
 def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
-    """The inner loop's settings for training on.
+    """The inner loop's settings for retraining: weights alone, over the whole run.
 
     Args:
-        config: of the retraining.
+        inner: of the run. config: of the retraining.
     """
-    still = LearningRateSchedule(0.0)
+    fixed = LearningRateSchedule(0.0)
     return replace(
         inner, steps=config.steps, seed=inner.seed + APART * (config.seed + 1),
-        weights=replace(inner.weights, rate=config.rate, start=0.0, end=1.0), optics=still, pitch=still,
+        weights=replace(inner.weights, rate=config.rate, start=0.0, end=1.0), optics=fixed, pitch=fixed,
     )  # fmt: skip
 
 
 def make_job(
     source: FinishedRun, config: RetrainConfig, found: LensPsfs, name: str
 ) -> Trainer:
-    """The training of one of :data:`JOBS`.
+    """Trainer of one of :data:`JOBS`, on the PSFs that belong to it.
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
         found: PSFs of the lenses in question. name: of the job.
     """
-    return make_trainer(
-        source,
-        config,
-        {"nominal": (found.nominal,), "retrained": found.drawn, "known": found.judges}[
-            name
-        ],
-    )
+    stacks = {
+        "nominal": (found.nominal,),
+        "retrained": found.drawn,
+        "known": found.judges,
+    }
+    return make_trainer(source, config, stacks[name])
 
 
 def available_jobs(found: LensPsfs) -> tuple[str, ...]:
@@ -279,12 +282,13 @@ def available_jobs(found: LensPsfs) -> tuple[str, ...]:
 def run_job(
     going: Trainer, path: Path, settings: object, *, every: int = 50
 ) -> Iterator[LogRecord]:
-    """Run one job to its end, from where it stands, with checkpoints in ``path``; a
-    record a step.
+    """Train one job from its present step to its end, yielding a record a step.
+
+    A checkpoint is written to ``path`` after every ``every`` steps and at the end.
 
     Args:
-        going: training with its network. settings: record that a resume compares.
-        every: steps from checkpoint to checkpoint.
+        going: training with its network. path: of the checkpoint.
+        settings: record that a resume compares. every: steps between checkpoints.
     """
     for record in going.run():
         yield record
@@ -329,36 +333,43 @@ def judge_network(
     frames: TestFrames | None = None,
     finer: bool = True,
 ) -> NetworkAccuracy:
-    """Errors on test frames, each the mean over these lenses: the frames are what all
-    cases share.
+    """Errors of a network on test frames, frame by frame the mean over lenses.
+
+    Its batch statistics are measured first. All cases share the frames.
 
     Args:
-        frames: of :func:`render_test_frames`, where several cases are judged.
-        finer: judge on images formed at a quarter of the tolerance too.
         going: training with its network.
         source: finished run: its network, lens and sensor. config: of the retraining.
-        stacks: PSFs of made lenses.
+        stacks: PSFs of made lenses; at most ``config.judge`` are used.
+        frames: of :func:`render_test_frames`, where several cases are judged.
+        finer: judge on images formed at a quarter of the tolerance too.
     """
     assess.recalibrate_network(going, source.architecture)
     frames = frames or render_test_frames(source, config)
-    own, fine = [], []
+    own = []
+    fine = []
     for made in stacks[: config.judge]:
         seen = assess.sensor_frames(going, frames, config.test_batches, stack=made)
-        own.append(_read(going, source, seen))
-        more = (going, frames, config.test_batches) if finer else None
-        exact = more and assess.finer_frames(*more, stack=made)
-        if exact is not None:
-            fine.append(_read(going, source, exact))
-    whole = _mean(own)
-    return replace(whole, finer=_mean(fine)) if len(fine) == len(own) else whole
+        own.append(_frame_errors(going, source, seen))
+        if finer:
+            exact = assess.finer_frames(going, frames, config.test_batches, stack=made)
+            if exact is not None:
+                fine.append(_frame_errors(going, source, exact))
+    accuracy = _mean(own)
+    if len(fine) < len(own):
+        return accuracy
+    return replace(accuracy, finer=_mean(fine))
 
 
-def _read(going: Trainer, source: FinishedRun, seen: SensorFrames) -> NetworkAccuracy:
-    answers = assess.predict_frames(
+def _frame_errors(
+    going: Trainer, source: FinishedRun, seen: SensorFrames
+) -> NetworkAccuracy:
+    """Errors of a trainer's network on each of the sensor frames."""
+    predictions = assess.predict_frames(
         going.model.net, source.architecture, seen, going.inner
     )
-    error = (answers.slip_mm - seen.slip_mm).abs()
-    return NetworkAccuracy(error, answers.iou, seen.above)
+    error = (predictions.slip_mm - seen.slip_mm).abs()
+    return NetworkAccuracy(error, predictions.iou, seen.above)
 
 
 def _mean(parts: Sequence[NetworkAccuracy]) -> NetworkAccuracy:
@@ -380,21 +391,21 @@ def retraining_outcome(
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
-        found: PSFs of the lenses in question. trained: trainings by name of the job.
+        found: PSFs of the lenses in question. trained: trainers by name of the job.
     """
     nominal = (found.nominal,)
     frames = render_test_frames(source, config)
     untouched = make_trainer(source, config, nominal)
 
-    def of(going: Trainer, stacks: Sequence[PixelPsfStack]) -> NetworkAccuracy:
-        return judge_network(going, source, config, stacks, frames=frames)
+    def judge(trainer: Trainer, stacks: Sequence[PixelPsfStack]) -> NetworkAccuracy:
+        return judge_network(trainer, source, config, stacks, frames=frames)
 
     return RetrainingOutcome(
-        designed=of(untouched, nominal),
-        nominal=of(trained["nominal"], nominal),
-        before=of(trained["nominal"], found.judges),
-        after=of(trained["retrained"], found.judges),
-        known=of(trained["known"], found.judges) if found.known else None,
+        designed=judge(untouched, nominal),
+        nominal=judge(trained["nominal"], nominal),
+        before=judge(trained["nominal"], found.judges),
+        after=judge(trained["retrained"], found.judges),
+        known=judge(trained["known"], found.judges) if found.known else None,
     )
 
 
@@ -405,14 +416,16 @@ def retrain(
     config: RetrainConfig | None = None,
     truth: HiddenLens | None = None,
 ) -> RetrainingOutcome:
-    """A finished run's network trained on for the lens that was made, in one call;
-    ``metalens retrain`` keeps files.
+    """Retrain a finished run's network for the lens that was made; accuracy of all
+    cases.
+
+    In one call and without files; ``metalens retrain`` writes them.
 
     Args:
-        folder: of ``metalens codesign``. result: of ``metalens fit`` for that run's
-            lens.h5.
-        truth: of the virtual bench, where there is one.
+        folder: of ``metalens codesign``.
+        result: of ``metalens fit`` for that run's lens.h5.
         config: of the retraining; its defaults without it.
+        truth: of the virtual bench, where there is one.
 
     Raises:
         TrainingError: the run is missing, half written or of another version.
@@ -422,16 +435,16 @@ def retrain(
     source = load_finished_run(folder, budget_mmacs=config.budget_mmacs)
     design = lenses.load(lens_file(folder, source.settings, source.row["budget_mmacs"]))
     check_lens(design, result)
-    found = lens_psfs(
+    psfs = lens_psfs(
         MadeLens(design, source.settings.optics, response=result.response),
         result,
         config,
         truth,
     )
     trained = {
-        name: make_job(source, config, found, name) for name in available_jobs(found)
+        name: make_job(source, config, psfs, name) for name in available_jobs(psfs)
     }
-    for going in trained.values():
-        for _ in going.run():
+    for trainer in trained.values():
+        for _ in trainer.run():
             pass
-    return retraining_outcome(source, config, found, trained)
+    return retraining_outcome(source, config, psfs, trained)

@@ -39,12 +39,11 @@ class SingleSurfaceFrames:
 
 
 def flatten_layers(frames: Frames, scale: Tensor) -> SingleSurfaceFrames:
-    """Both sheets as one: their light added, the depth of the sheet that covers more of
-    the pixel.
+    """Both sheets as one: their radiance added, the depth of the sheet that covers
+    more.
 
     Args:
-        frames: with depths that hold the scale already. scale: (n,) that they hold; it
-            is kept apart.
+        frames: with scaled depths. scale: (n,) their factor; it is stored separately.
 
     Accuracy: light to 1/510 of radiance 1, above which it is cut; depth to 0.5 um below
     65 mm.
@@ -53,9 +52,11 @@ def flatten_layers(frames: Frames, scale: Tensor) -> SingleSurfaceFrames:
     depth = torch.where(
         frames.coverage[:, 1] > 0.5, frames.depth_um[:, 1], frames.depth_um[:, 0]
     )
-    plain = (depth / scale.to(depth)[:, None, None]).clamp(0, 65535).round()
+    unscaled = (depth / scale.to(depth)[:, None, None]).clamp(0, 65535).round()
     return SingleSurfaceFrames(
-        light.numpy(), plain.numpy().astype(np.uint16), scale.numpy().astype(np.float32)
+        light.numpy(),
+        unscaled.numpy().astype(np.uint16),
+        scale.numpy().astype(np.float32),
     )
 
 
@@ -78,27 +79,27 @@ def depth_um(
     margin: int = 0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """(n, y, x) depth of the visible surface at each sample without the margin: that of
-    the layer with more coverage.
+    """(n, y, x) depth in um of the visible surface at each sample without the margin.
+
+    That of the layer with more coverage; at least 1 um.
 
     Args:
-        frames: rendered frames of two layers or of one.
-        device: where the depth is wanted.
+        frames: rendered frames of two layers or of one. margin: samples cut off.
+        device: of the result.
     """
-    if isinstance(
-        frames, SingleSurfaceFrames
-    ):  # no more than the frames' own bytes travel to a device
+    if isinstance(frames, SingleSurfaceFrames):
+        # the stored 16 bits are transferred, then converted on the device
         scale = torch.from_numpy(frames.scale.astype(np.float32)).to(device)
-        whole = (
+        stored = (
             torch.from_numpy(frames.depth_um.view(np.int16)).to(device).int() & 0xFFFF
         )
-        made = whole.float() * scale[:, None, None]
+        depth = stored.float() * scale[:, None, None]
     else:
-        few = frames.to(device)
-        made = torch.where(
-            few.coverage[:, 1] > 0.5, few.depth_um[:, 1], few.depth_um[:, 0]
+        moved = frames.to(device)
+        depth = torch.where(
+            moved.coverage[:, 1] > 0.5, moved.depth_um[:, 1], moved.depth_um[:, 0]
         )
-    return made[:, *_inside(made.shape[-2:], margin)].clamp_min(1.0)
+    return depth[:, *_inside(depth.shape[-2:], margin)].clamp_min(1.0)
 
 
 def _inside(shape: tuple[int, ...], margin: int) -> list[slice]:

@@ -19,8 +19,10 @@ from metalens.image import Frames
 
 
 def join_processes(device: torch.device | None = None) -> None:
-    """Join the other processes of ``torchrun``, if it started this one; ``device``:
-    where this one computes.
+    """Join the process group of ``torchrun``, if it started this process.
+
+    Args:
+        device: where this process computes; a GPU uses NCCL.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
         if device is not None and device.type == "cuda":
@@ -31,7 +33,7 @@ def join_processes(device: torch.device | None = None) -> None:
 
 
 def leave_processes() -> None:
-    """Part from the others: what follows is done by process 0 alone."""
+    """Leave the process group: process 0 continues alone."""
     if dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
@@ -42,7 +44,7 @@ _alone = False
 
 @contextlib.contextmanager
 def single_process() -> Iterator[None]:
-    """Work that this process does by itself, though others train along with it."""
+    """Context in which this process works alone, though others train with it."""
     global _alone
     before, _alone = _alone, True
     try:
@@ -62,45 +64,47 @@ def process_count() -> int:
 
 
 def wait_for_all() -> None:
-    """Until all are here."""
+    """Barrier: returns when every process has reached it."""
     if process_count() > 1:
         dist.barrier()
 
 
 def batch_share(batch: FrameBatch) -> FrameBatch:
-    """The frames of a batch that this process takes.
+    """The frames of a batch that this process trains on: an equal, contiguous part.
 
     Raises:
-        TrainingError: the processes do not share the batch evenly.
+        TrainingError: the number of processes does not divide the batch.
     """
     if process_count() == 1:
         return batch
-    size, odd = divmod(len(batch.slip_mm), process_count())
-    if odd:
+    size, remainder = divmod(len(batch.slip_mm), process_count())
+    if remainder:
         raise TrainingError(
             f"a batch of {len(batch.slip_mm)} frames on {process_count()} processes: need a multiple of them"
         )
-    mine = slice(process_rank() * size, (process_rank() + 1) * size)
-    frames: Frames | SingleSurfaceFrames = _rows(batch.frames, mine)
-    pose = None if batch.pose is None else _rows(batch.pose, mine)
+    rows = slice(process_rank() * size, (process_rank() + 1) * size)
+    frames: Frames | SingleSurfaceFrames = _rows(batch.frames, rows)
+    pose = None if batch.pose is None else _rows(batch.pose, rows)
     return replace(
         batch,
         frames=frames,
-        mask=batch.mask[mine],
-        slip_mm=batch.slip_mm[mine],
+        mask=batch.mask[rows],
+        slip_mm=batch.slip_mm[rows],
         pose=pose,
     )
 
 
 def _rows(record: Any, rows: slice) -> Any:
-    """Some of the frames of a record of tensors."""
+    """The selected frames of a record of tensors."""
     return type(record)(
         *(getattr(record, name)[rows] for name in type(record).__slots__)
     )
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replace every gradient by its mean over the processes.
+    """Replace every gradient by its mean over the processes, in place.
+
+    One reduction for each dtype and device, in the same order in every process.
 
     Args:
         parameters: with gradients.
@@ -108,15 +112,15 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     if process_count() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
-    for kind in sorted(
-        {(g.dtype, g.device) for g in grads}, key=str
-    ):  # in the same order everywhere
-        mine = [g for g in grads if (g.dtype, g.device) == kind]
-        joined = _reduced(torch.cat([g.flatten() for g in mine])) / process_count()
-        start = 0
-        for grad in mine:
-            grad.copy_(joined[start : start + grad.numel()].view_as(grad))
-            start += grad.numel()
+    for kind in sorted({(g.dtype, g.device) for g in grads}, key=str):
+        same_kind = [g for g in grads if (g.dtype, g.device) == kind]
+        mean = (
+            _sum_in_place(torch.cat([g.flatten() for g in same_kind])) / process_count()
+        )
+        offset = 0
+        for grad in same_kind:
+            grad.copy_(mean[offset : offset + grad.numel()].view_as(grad))
+            offset += grad.numel()
 
 
 def shared_rows(count: int) -> Tensor:
@@ -125,16 +129,17 @@ def shared_rows(count: int) -> Tensor:
 
 
 def gather_rows(part: Tensor, rows: Tensor, count: int) -> Tensor:
-    """(count, ...) rows of all processes from those of each (:func:`shared_rows`);
-    differentiable: every process's loss depends on every process's rows.
+    """(count, ...) rows of all processes from those of each (:func:`shared_rows`).
+
+    Differentiable: every process's loss depends on every process's rows.
 
     Args:
-        part: (rows, ...) of this process.
+        part: (rows, ...) of this process. rows: their numbers. count: of all rows.
     """
     if process_count() == 1:
         return part
     whole = part.new_zeros((count, *part.shape[1:]))
-    return _summed(whole.index_copy(0, rows.to(part.device), part))
+    return _differentiable_sum(whole.index_copy(0, rows.to(part.device), part))
 
 
 def mean_of(values: list[float]) -> list[float]:
@@ -147,20 +152,24 @@ def mean_of(values: list[float]) -> list[float]:
         return values
     return [
         float(v)
-        for v in _reduced(torch.tensor(values, dtype=torch.float64)) / process_count()
+        for v in _sum_in_place(torch.tensor(values, dtype=torch.float64))
+        / process_count()
     ]
 
 
 def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
-    """``work`` of every item, done by one process each; all get all answers, in order.
+    """``work`` of every item, each computed by one process; all processes get all
+    results.
 
     Args:
-        items: to work on.
+        work: of one item. items: to work on.
     """
-    found = torch.zeros(len(items), dtype=torch.float64)
+    results = torch.zeros(len(items), dtype=torch.float64)
     for i in range(process_rank(), len(items), process_count()):
-        found[i] = work(items[i])
-    return [float(v) for v in (_reduced(found) if process_count() > 1 else found)]
+        results[i] = work(items[i])
+    return [
+        float(v) for v in (_sum_in_place(results) if process_count() > 1 else results)
+    ]
 
 
 def batch_norm(
@@ -173,41 +182,43 @@ def batch_norm(
         bias: (channels,) offset. epsilon: added to the variance.
     """
     count = x.numel() // x.shape[1] * process_count()
-    mean = _summed(x.sum((0, 2, 3))) / count
+    mean = _differentiable_sum(x.sum((0, 2, 3))) / count
     centred = x - mean[:, None, None]
-    variance = _summed(centred.square().sum((0, 2, 3))) / count
+    variance = _differentiable_sum(centred.square().sum((0, 2, 3))) / count
     scale = weight * torch.rsqrt(variance + epsilon)
     return centred * scale[:, None, None] + bias[:, None, None]
 
 
-class _Sum(torch.autograd.Function):
+class _SumOverProcesses(torch.autograd.Function):
     """Sum over processes; every process's loss depends on every process's part, so
     gradients are summed too.
     """
 
     @staticmethod
     def forward(context: Any, value: Tensor) -> Tensor:
-        return _reduced(value.clone())
+        return _sum_in_place(value.clone())
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> Tensor:
-        return _reduced(gradients[0].clone())
+        return _sum_in_place(gradients[0].clone())
 
 
-def _summed(value: Tensor) -> Tensor:
-    total: Tensor = _Sum.apply(value)  # type: ignore[no-untyped-call]
+def _differentiable_sum(value: Tensor) -> Tensor:
+    """Sum over processes, differentiable."""
+    total: Tensor = _SumOverProcesses.apply(value)  # type: ignore[no-untyped-call]
     return total
 
 
-def _reduced(value: Tensor) -> Tensor:
+def _sum_in_place(value: Tensor) -> Tensor:
+    """Sum a tensor over processes in place."""
     try:
         dist.all_reduce(value)
     except RuntimeError as error:
-        raise _lost(error) from error
+        raise _process_lost(error) from error
     return value
 
 
-def _lost(error: RuntimeError) -> TrainingError:
+def _process_lost(error: RuntimeError) -> TrainingError:
     return TrainingError(
         f"another process of this run was lost ({error}); start it again with --resume to go on from the checkpoint"
     )

@@ -25,12 +25,10 @@ class FramePool:
 
     light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil
     coverage without the margin.
-    place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3)
-    the same as the camera sees it.
+    place_um: (n, 3) nominal position and slippage together, at unit scale.
+    seen_um: (n, 3) the same as the camera sees it.
     axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.EyePose`.
-    here_um:
-    (3,) nominal place.
-    depths_um: (2,) range of the depth.
+    here_um: (3,) nominal position. depths_um: (2,) range of the depth.
     """
 
     light: Array
@@ -48,43 +46,54 @@ class FramePool:
 
 
 def render_pool(scenes: EyeScenes, count: int) -> FramePool:
-    """Render ``count`` frames of a stream of scenes."""
+    """Pool of ``count`` frames of a stream of scenes, rendered CHUNK at a time."""
     parts = []
     for number, start in enumerate(range(0, count, CHUNK)):
-        parts.append(_part(scenes, number, min(CHUNK, count - start)))
-    here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
-    light, depth, mask, place, seen, axis, points = (
+        parts.append(_render_part(scenes, number, min(CHUNK, count - start)))
+    nominal_um = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
+    light, depth, mask, place_um, seen_um, axis, points = (
         np.concatenate(rows) for rows in zip(*parts, strict=True)
     )
     return FramePool(
-        light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um)
+        light,
+        depth,
+        mask,
+        place_um,
+        seen_um,
+        axis,
+        points,
+        nominal_um,
+        np.array(scenes.depths_um),
     )
 
 
-def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
-    """The first seven arrays of a :class:`FramePool`."""
-    made = scenes.rendered(number, count)
+def _render_part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
+    """The first seven arrays of a :class:`FramePool`, of one chunk of frames.
+
+    Masks are averaged to MASK pixels along a side where that divides theirs.
+    """
+    rendered = scenes.rendered(number, count)
     states = scenes.states(number, count)
-    flat = flatten_layers(made.frames, states.scale)
-    inside = slice(scenes.margin, made.pupil.shape[-1] - scenes.margin)
-    mask = made.pupil[:, None, inside, inside]
+    flat = flatten_layers(rendered.frames, states.scale)
+    inside = slice(scenes.margin, rendered.pupil.shape[-1] - scenes.margin)
+    mask = rendered.pupil[:, None, inside, inside]
     if mask.shape[-1] % MASK == 0:
         mask = F.avg_pool2d(mask, mask.shape[-1] // MASK)
     coverage = (mask[:, 0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    here = torch.tensor(
+    nominal_um = torch.tensor(
         [*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64
     )
-    place, seen = (
-        ((here + moved) / states.scale[:, None]).numpy()
-        for moved in (made.labels.slip_um, made.labels.shift_um)
+    place_um, seen_um = (
+        ((nominal_um + moved) / states.scale[:, None]).numpy()
+        for moved in (rendered.labels.slip_um, rendered.labels.shift_um)
     )
-    pose = pose_of(made, scenes.margin)
+    pose = pose_of(rendered, scenes.margin)
     return (
         flat.light,
         flat.depth_um,
         coverage,
-        place,
-        seen,
+        place_um,
+        seen_um,
         pose.axis.numpy(),
         pose.points.numpy(),
     )
@@ -114,40 +123,42 @@ class PoolScenes:
         return self.pool if isinstance(self.pool, FramePool) else self.pool()
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """``size`` frames of a step.
+        """``size`` frames of a step, without repetition within a pass over the pool.
 
         Raises:
-            TrainingError: the pool holds less than a batch.
+            TrainingError: the pool is smaller than a batch.
         """
         count = len(self.held)
-        a_pass = count // size
-        if a_pass == 0:
+        batches_per_pass = count // size
+        if batches_per_pass == 0:
             raise TrainingError(
                 f"a pool of {count} frames is smaller than a batch of {size}: raise the pool"
             )
-        order = np.random.default_rng([self.seed, step // a_pass, 5]).permutation(count)
-        first = step % a_pass * size
+        order = np.random.default_rng(
+            [self.seed, step // batches_per_pass, 5]
+        ).permutation(count)
+        first = step % batches_per_pass * size
         return self.rows(
             np.sort(order[first : first + size]),
             np.random.default_rng([self.seed, step, 6]),
         )
 
     def rows(self, rows: Array, generator: np.random.Generator) -> FrameBatch:
-        """The frames of these numbers, at scales drawn from ``generator``.
+        """The frames of these numbers, each at a random scale, with labels in mm.
 
         Args:
-            rows: numbers of the frames.
+            rows: numbers of the frames. generator: of the scales.
         """
         pool = self.held
-        here = torch.from_numpy(pool.here_um)
-        place = torch.from_numpy(pool.place_um[rows])
+        nominal_um = torch.from_numpy(pool.here_um)
+        place_um = torch.from_numpy(pool.place_um[rows])
         low, high = pool.depths_um
         scale = draw_depth_scales(
-            place[:, 2], (float(low), float(high)), self.spread, generator
+            place_um[:, 2], (float(low), float(high)), self.spread, generator
         )
         slip, shift = (
-            (scale[:, None] * p - here) * 1e-3
-            for p in (place, torch.from_numpy(pool.seen_um[rows]))
+            (scale[:, None] * p - nominal_um) * 1e-3
+            for p in (place_um, torch.from_numpy(pool.seen_um[rows]))
         )
         pose = EyePose(
             shift.float(),

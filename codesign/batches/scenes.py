@@ -104,8 +104,9 @@ class SceneConfig:
 
     @property
     def pupil_depths_um(self) -> tuple[float, float]:
-        """Least and largest depth of the pupils before the lens, whoever they are of
-        (two standard deviations).
+        """Least and largest depth of the pupils before the lens, um.
+
+        Largest slippage, and two standard deviations between people.
         """
         reach = self.slip_mm[2] * 1e3 + 2e3 * self.depth_sd_mm
         return CameraRig().distance_um - reach, CameraRig().distance_um + reach
@@ -163,10 +164,10 @@ class EyeScenes:
         return PinholeCamera(self.settings.pixels + 2 * self.margin, self.sample_um)
 
     def states(self, step: int, size: int) -> EyeStates:
-        """Subjects and states of a step.
+        """Subjects and states of a step, with scales that decouple depth from size.
 
         Args:
-            size: frames of a step.
+            step: its number. size: frames of a step.
         """
         plain = eye.draw_states(
             size, (self.seed, self.stream, step), motion=self.settings.motion
@@ -181,11 +182,11 @@ class EyeScenes:
         )
 
     def rendered(self, step: int, size: int) -> RenderedFrames:
-        """Frames of a step with all labels, and with what the scenes' variety lets them
-        wear.
+        """Frames of a step with all labels and the augmentations of the scenes'
+        variety.
 
         Args:
-            size: frames of a step.
+            step: its number. size: frames of a step.
         """
         seed = (self.seed, self.stream, step, 3)
         return augmented_frames(
@@ -203,7 +204,7 @@ class EyeScenes:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StateScenes:
-    """Frames of given states, batch after batch, with what each of them has.
+    """Frames of given states with their augmentations, batch after batch.
 
     scenes: rig, camera and margin. stream: of the noise.
     """
@@ -226,10 +227,10 @@ class StateScenes:
         """
         rows = slice(step * size, (step + 1) * size)
         rig, camera = self.scenes.rig, self.scenes.camera
-        made = render_dressed(
+        rendered = render_dressed(
             self.states[rows], self.worn[rows], rig=rig, camera=camera
         )
-        return as_batch(made, self.margin)
+        return as_batch(rendered, self.margin)
 
 
 def augmented_frames(
@@ -239,48 +240,58 @@ def augmented_frames(
     variety: float,
     seed: tuple[int, ...],
 ) -> RenderedFrames:
-    """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1.
+    """Rendered frames with random augmentations of :mod:`codesign.eye.worn`.
+
+    Without any up to variety 1.
 
     Args:
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
-        camera: pixel grid of the frames. seed: of the random generator.
+        camera: pixel grid of the frames. variety: factor on the spread of looks.
+        seed: of the random generator.
     """
-    found = draw_augmentations(len(states), variety, np.random.default_rng(seed))
-    return render_dressed(states, found, rig=rig, camera=camera)
+    augmentations = draw_augmentations(
+        len(states), variety, np.random.default_rng(seed)
+    )
+    return render_dressed(states, augmentations, rig=rig, camera=camera)
 
 
 def widen_motion(variety: float) -> MotionRanges:
-    """The usual ranges with looks and opening of the lids spread by a factor about the
-    mean.
+    """The default ranges with the spread of looks and lid aperture multiplied by a
+    factor.
 
     Args:
         variety: factor on the spread of looks; above 1 with augmentations.
     """
-    usual = MotionRanges()
-    widest = max(1 - (1 - usual.aperture[0]) * variety, 0.1), usual.aperture[1]
+    default = MotionRanges()
+    aperture = max(1 - (1 - default.aperture[0]) * variety, 0.1), default.aperture[1]
     return replace(
-        usual, population={**POPULATION, **widen_traits(variety)}, aperture=widest
+        default, population={**POPULATION, **widen_traits(variety)}, aperture=aperture
     )
 
 
 def widen_traits(variety: float) -> dict[str, SubjectTrait]:
-    """Traits of :data:`LOOKS`, spread and limits widened about the mean, between
-    :data:`LEAST` and :data:`MOST`.
+    """Traits of :data:`LOOKS` with deviation and limits multiplied by a factor.
+
+    Limits are scaled about the mean, and kept between :data:`LEAST` and :data:`MOST`.
 
     Args:
         variety: factor on the spread of looks; above 1 with augmentations.
     """
-    found = {}
+    traits = {}
     for name in LOOKS:
-        t = POPULATION[name]
-        top = min(t.mean + (t.high - t.mean) * variety, MOST.get(name, math.inf))
-        found[name] = replace(
-            t,
-            sd=t.sd * variety,
-            low=max(t.mean - (t.mean - t.low) * variety, LEAST.get(name, 0.0)),
-            high=top,
+        trait = POPULATION[name]
+        high = min(
+            trait.mean + (trait.high - trait.mean) * variety, MOST.get(name, math.inf)
         )
-    return found
+        traits[name] = replace(
+            trait,
+            sd=trait.sd * variety,
+            low=max(
+                trait.mean - (trait.mean - trait.low) * variety, LEAST.get(name, 0.0)
+            ),
+            high=high,
+        )
+    return traits
 
 
 def draw_depth_scales(
@@ -289,27 +300,26 @@ def draw_depth_scales(
     spread: float,
     generator: np.random.Generator,
 ) -> Tensor:
-    """(n,) factors that bring depths to others, drawn evenly from ``range_um`` whatever
-    the depth was.
+    """(n,) scale factors that bring depths to random targets, uniform over
+    ``range_um``.
 
-    So the scaled depth has nothing to do with the size of what is seen: the geometric
-    cue is removed, as far as a
-    factor of 1 +- ``spread`` reaches. A factor drawn on its own would leave most of the
-    cue.
+    The target does not depend on the depth, so the scaled depth is independent of
+    apparent size, as far as a factor of 1 +- ``spread`` reaches. A random factor alone
+    would leave most of that cue.
 
     Args:
-        depth_um: (n, y, x) or (n,) depth before the lens. generator: of the draws.
+        depth_um: (n,) depth before the lens. range_um: least and largest target.
+        spread: of the factors. generator: of the draws.
     """
-    wanted = torch.from_numpy(generator.uniform(*range_um, len(depth_um)))
-    return (wanted / depth_um).clamp(1 - spread, 1 + spread)
+    target_um = torch.from_numpy(generator.uniform(*range_um, len(depth_um)))
+    return (target_um / depth_um).clamp(1 - spread, 1 + spread)
 
 
 def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
-    """Rendered frames as a training batch: the mask without its margin, the slippage in
-    mm.
+    """Rendered frames as a training batch: mask without margin, slippage in mm, pose.
 
     Args:
-        made: rendered frames.
+        made: rendered frames. margin: samples around the frame.
     """
     inside = slice(margin, made.pupil.shape[-1] - margin)
     frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
@@ -322,15 +332,19 @@ def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
 
 
 def pose_of(made: RenderedFrames, margin: int) -> EyePose:
-    """How the eyes of rendered frames stand.
+    """Pose labels of rendered frames: shift in mm, optic axis, landmarks and pupil
+    centre.
+
+    Points are fractions of the frame without margin, from its centre.
 
     Args:
         made: rendered frames.
-        margin: samples around the frame that are blurred in and not seen.
+        margin: samples around the frame that are imaged and then cut off.
     """
-    size, labels = made.pupil.shape[-1], made.labels
-    places = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
-    points = (places - (size - 1) / 2) / (size - 2 * margin)
+    pixels = made.pupil.shape[-1]
+    labels = made.labels
+    points_px = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
+    points = (points_px - (pixels - 1) / 2) / (pixels - 2 * margin)
     return EyePose(
         (labels.shift_um * 1e-3).float(), labels.optic_axis.float(), points.float()
     )

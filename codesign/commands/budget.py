@@ -37,14 +37,14 @@ def run(options: Options) -> int:
     target = options.output
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
-    made, given = lens.load_plain(options.lens), _given(options)
-    if given.fwhm_nm:
-        spectrum.spectrum_points(
-            Source(made.wavelength_um * 1e3, given.fwhm_nm)
-        )  # refused now, not after the work
+    made = lens.load_plain(options.lens)
+    inputs = _budget_inputs(options)
+    if inputs.fwhm_nm:
+        # an impossible spectrum is refused before the work
+        spectrum.spectrum_points(Source(made.wavelength_um * 1e3, inputs.fwhm_nm))
     with options.claim(target, companions=(".html", ".png")) as draft:
-        origin = _provenance(options, given)
-        budget = ErrorBudget(made, given)
+        origin = _provenance(options, inputs)
+        budget = ErrorBudget(made, inputs)
         links = options.console.track(budget.entries(), total=19, label="links")
         rows = list(links)
         save_budget(draft.path, rows, origin)
@@ -54,13 +54,15 @@ def run(options: Options) -> int:
     light = of_light(made)
     words = "\n".join(filter(None, [budget_table(rows).text, light]))
     return options.console.judged(
-        _plain(values | {"light": light}), words, budget.above
+        _without_nan(values | {"light": light}), words, budget.above
     )
 
 
 def of_light(made: lens.Lens) -> str:
-    """Of which light a budget is, where pillars of one size answer x and y apart; empty
-    for others.
+    """Polarisation that a budget is for, where pillars of one size treat x and y
+    differently.
+
+    Empty for other lenses.
 
     Args:
         made: lens.
@@ -71,21 +73,20 @@ def of_light(made: lens.Lens) -> str:
 
 
 def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:
-    """The sums, what was measured on the same frames and the ratio of the two, where a
-    run was given.
+    """Total gaze and PSF error; with a run, the measured error and total over measured.
 
     Args:
         rows: of the budget.
     """
     total = rows[-1]
-    found = {"gaze_error_deg": math.degrees(total.gaze_rad), "psf_error": total.psf}
+    summary = {"gaze_error_deg": math.degrees(total.gaze_rad), "psf_error": total.psf}
     for row in rows:
         if row.link == MEASURED:
-            found |= {
+            summary |= {
                 "measured_deg": math.degrees(row.gaze_rad),
                 "closure": rows[-1].gaze_rad / row.gaze_rad,
             }
-    return found
+    return summary
 
 
 def save_budget(
@@ -180,8 +181,12 @@ def budget_cells(row: BudgetEntry) -> tuple[str, ...]:
 
 
 def plot_budget(rows: list[BudgetEntry]) -> bytes:
-    """PNG: bars of the gaze error of ``rows``, or without a run of the PSF error, the
-    largest on top.
+    """PNG bar chart of the gaze error of every link, the largest on top.
+
+    Without a run of the PSF error.
+
+    Args:
+        rows: of the budget.
     """
     gaze = any(row.gaze_rad > 0 for row in rows)
 
@@ -199,7 +204,8 @@ def plot_budget(rows: list[BudgetEntry]) -> bytes:
     return report.figure_png(figure)
 
 
-def _given(options: Options) -> BudgetInputs:
+def _budget_inputs(options: Options) -> BudgetInputs:
+    """Inputs of the budget from the files of the command line."""
     if options.led_fwhm_nm < 0:
         raise ConfigError(f"--led-fwhm-nm {options.led_fwhm_nm:g}: need 0 or more")
     return BudgetInputs(
@@ -221,10 +227,10 @@ def _provenance(options: Options, given: BudgetInputs) -> store.Provenance:
     )
 
 
-def _plain(values: Any) -> Any:
-    """JSON knows no nan: null."""
+def _without_nan(values: Any) -> Any:
+    """Values for JSON, with None in place of nan."""
     if isinstance(values, dict):
-        return {k: _plain(v) for k, v in values.items()}
+        return {k: _without_nan(v) for k, v in values.items()}
     if isinstance(values, list):
-        return [_plain(v) for v in values]
+        return [_without_nan(v) for v in values]
     return None if isinstance(values, float) and math.isnan(values) else values

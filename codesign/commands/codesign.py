@@ -47,81 +47,95 @@ SHOWN = 8  # test frames that are kept with the answers
 
 
 def run(options: Options) -> int:
-    """Train, search, finish; exit 1 where the error of the true image is above what the
-    run asks for.
+    """Train, search and write a run.
+
+    Exit 1 where the error of the true image is above what the run requires.
 
     Args:
         options: of the command line.
     """
-    settings = _frozen(runs.load_run_settings(options.config), options.freeze)
+    settings = _with_frozen_parts(
+        runs.load_run_settings(options.config), options.freeze
+    )
     device = device_of(options.device)
     parallel.join_processes(device)
     if parallel.process_rank():
-        return _assist(transaction.unfinished_path(options.output), settings, device)
+        return _train_along(
+            transaction.unfinished_path(options.output), settings, device
+        )
     with options.claim_work(
         options.output, keep=(CHECKPOINT,), resume=options.resume
     ) as draft:
-        rows, said = _work(options, settings, device, draft.path)
+        rows, image = _train_and_search(options, settings, device, draft.path)
     count = torch.get_num_threads()
     values = {
         "rows": rows,
         "folder": str(options.output),
-        "image": said,
+        "image": image,
         "threads": count,
     }
-    words = f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
+    note = f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
     return options.console.judged(
         values,
-        f"{_table(rows)}\n{formed.describe_image_text(said)}\n{words}",
-        [said["above"]],
+        f"{_table(rows)}\n{formed.describe_image_text(image)}\n{note}",
+        [image["above"]],
     )
 
 
-def _work(
+def _train_and_search(
     options: Options, settings: RunConfig, device: torch.device, folder: Path
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Train, search and write into the folder; a row a network, and what images they
-    were trained on.
+    """Train, search and write into the folder; rows of result.json, and the image
+    record.
     """
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
     if settings.run.pitch_um < settings.optics.sample_um:
-        console.say(_of_samples(settings))
+        console.say(_fine_pitch_warning(settings))
     place_on_device(going.trainer, device)
     parallel.wait_for_all()
-    writer = _writer(folder, going.trainer.step) if options.events else None
-    held = False
+    event_writer = _event_writer(folder, going.trainer.step) if options.events else None
+    pitch_reported = False
     records = runs.train_run(going, folder / CHECKPOINT)
-    left = settings.inner.steps - going.trainer.step
-    for record in console.track(records, total=left, label="training"):
+    steps_left = settings.inner.steps - going.trainer.step
+    for record in console.track(records, total=steps_left, label="training"):
         checkpoint.append_entry(folder / LOG, {"kind": "step", **asdict(record)})
-        if writer:
-            _events(writer, going, record)
-        if (limit := going.trainer.pitch_held_um) is not None and not held:
-            held = True
+        if event_writer:
+            _write_events(event_writer, going, record)
+        if (limit := going.trainer.pitch_held_um) is not None and not pitch_reported:
+            pitch_reported = True
             console.say(f"step {record.step}: {_of_pitch(going, limit)}")
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
-    for budget, born in search.search_architectures(going, folder / CHECKPOINT):
-        one = {"budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6}
-        entry = {"kind": "birth", **one, "architecture": asdict(born.architecture)}
+    for budget, candidate in search.search_architectures(going, folder / CHECKPOINT):
+        score = {
+            "budget_mmacs": budget,
+            "error": candidate.error,
+            "mmacs": candidate.macs / 1e6,
+        }
+        entry = {
+            "kind": "birth",
+            **score,
+            "architecture": asdict(candidate.architecture),
+        }
         checkpoint.append_entry(folder / LOG, entry)
         console.say(
-            f"budget {budget:g} MMACs: gaze error {born.error:.2f} deg at {born.macs / 1e6:.2f} MMACs"
+            f"budget {budget:g} MMACs: gaze error {candidate.error:.2f} deg at {candidate.macs / 1e6:.2f} MMACs"
         )
     parallel.leave_processes()
     ends = finished_budgets(going)
-    said = _image(going)
-    _keep(folder, going, ends, said)
+    image = _image_record(going)
+    _write_results(folder, going, ends, image)
     if options.export:
         _export(folder, going, ends)
-    return [end.row for end in ends], said
+    return [end.row for end in ends], image
 
 
-def _of_samples(settings: RunConfig) -> str:
+def _fine_pitch_warning(settings: RunConfig) -> str:
+    """Warning that the pitch is finer than the samples of the image."""
     return (
         f"run.pitch_um = {settings.run.pitch_um:g} is finer than the samples of the image, optics.sample_um = "
         f"{settings.optics.sample_um:g}: such pixels cost more and show nothing new"
@@ -129,6 +143,7 @@ def _of_samples(settings: RunConfig) -> str:
 
 
 def _of_pitch(going: CodesignRun, limit_um: float) -> str:
+    """Why the pitch was clamped at a limit, and what to change."""
     settings = going.settings
     if limit_um <= going.trainer.model.finest_um:
         return (
@@ -144,7 +159,10 @@ def _of_pitch(going: CodesignRun, limit_um: float) -> str:
     return f"the pitch is held at {limit_um:.3f} um: coarser pixels would leave a network less than it can take"
 
 
-def _image(going: CodesignRun) -> dict[str, Any]:
+def _image_record(going: CodesignRun) -> dict[str, Any]:
+    """Image model of a run and its error:
+    :func:`codesign.optics.formed.describe_image`.
+    """
     settings = going.settings
     side = settings.scenes.pixels + 2 * settings.scenes.margin
     coefficients = going.trainer.model.coefficients_rad.detach()
@@ -154,7 +172,7 @@ def _image(going: CodesignRun) -> dict[str, Any]:
 
 
 def _export(folder: Path, going: CodesignRun, ends: list[BudgetResult]) -> None:
-    """Every budget's network as ONNX."""
+    """Write the network of every budget as ONNX."""
     for end, state in zip(ends, going.searches, strict=True):
         path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
         own = replace(going, trainer=end.trainer)
@@ -164,9 +182,10 @@ def _export(folder: Path, going: CodesignRun, ends: list[BudgetResult]) -> None:
         )
 
 
-def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
-    """Another process of ``torchrun``: trains and searches along from the same
-    checkpoint, writes nothing.
+def _train_along(folder: Path, settings: RunConfig, device: torch.device) -> int:
+    """Training and search of the other processes of ``torchrun``, which write nothing.
+
+    From the checkpoint that process 0 wrote.
     """
     parallel.wait_for_all()
     going = runs.resume_run(folder / CHECKPOINT, settings)
@@ -179,12 +198,13 @@ def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     return 0
 
 
-def _frozen(settings: RunConfig, parts: tuple[Part, ...]) -> RunConfig:
-    both = tuple(sorted({*settings.run.frozen, *parts}))
-    return replace(settings, run=replace(settings.run, frozen=both))
+def _with_frozen_parts(settings: RunConfig, parts: tuple[Part, ...]) -> RunConfig:
+    """The settings with further parts frozen."""
+    frozen = tuple(sorted({*settings.run.frozen, *parts}))
+    return replace(settings, run=replace(settings.run, frozen=frozen))
 
 
-def _writer(folder: Path, step: int) -> Any:
+def _event_writer(folder: Path, step: int) -> Any:
     """TensorBoard events of the run's folder; those beyond a resumed step are dropped.
 
     Raises:
@@ -200,7 +220,8 @@ def _writer(folder: Path, step: int) -> Any:
     return make(str(folder), purge_step=step + 1 if step else None)
 
 
-def _events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
+def _write_events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
+    """Write a step to TensorBoard, and pictures every ``checkpoint_every`` steps."""
     for name, value in asdict(record).items():
         if name != "step":
             writer.add_scalar(name, float(value), record.step)
@@ -212,48 +233,55 @@ def _events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
 
 
 def _start(folder: Path, settings: RunConfig) -> CodesignRun:
+    """A new run, with its settings and first checkpoint in the folder."""
     store.write_text(folder / SETTINGS, config.dumps(settings))
-    made = runs.start_run(settings)
-    runs.save_run(folder / CHECKPOINT, made)
-    return made
+    new = runs.start_run(settings)
+    runs.save_run(folder / CHECKPOINT, new)
+    return new
 
 
 def _resume(folder: Path, settings: RunConfig) -> CodesignRun:
     """The run of the folder's checkpoint; log lines beyond it are dropped."""
-    made = runs.resume_run(folder / CHECKPOINT, settings)
-    births = sum(len(s.history) for s in made.searches)
+    resumed = runs.resume_run(folder / CHECKPOINT, settings)
+    births = sum(len(s.history) for s in resumed.searches)
     entries = checkpoint.read_entries(folder / LOG)
     steps = [
-        e for e in entries if e["kind"] == "step" and e["step"] <= made.trainer.step
+        e for e in entries if e["kind"] == "step" and e["step"] <= resumed.trainer.step
     ]
-    born = [e for e in entries if e["kind"] == "birth"]
-    checkpoint.write_entries(folder / LOG, steps + born[:births])
-    return made
+    births_logged = [e for e in entries if e["kind"] == "birth"]
+    checkpoint.write_entries(folder / LOG, steps + births_logged[:births])
+    return resumed
 
 
-def _keep(
+def _write_results(
     folder: Path, going: CodesignRun, ends: list[BudgetResult], said: dict[str, Any]
 ) -> None:
-    """lens.h5, the networks, result.json, answers.h5 and the plot of the Pareto set."""
+    """Write lens.h5, networks, result.json, answers.h5 and the plot of the Pareto
+    set.
+    """
     settings = going.settings
-    about = store.Provenance(config=config.dumps(settings), seed=settings.inner.seed)
+    provenance = store.Provenance(
+        config=config.dumps(settings), seed=settings.inner.seed
+    )
     phase = going.trainer.model.coefficients_rad.detach()
-    lens.save(folder / "lens.h5", trained.trained_lens(settings.optics, phase, about))
-    _weights(folder, going, ends, about)
-    pitch = float(going.trainer.model.pitch_um.detach())
+    lens.save(
+        folder / "lens.h5", trained.trained_lens(settings.optics, phase, provenance)
+    )
+    _write_networks(folder, going, ends, provenance)
+    pitch_um = float(going.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
-    found = {
-        "pitch_um": pitch,
+    record = {
+        "pitch_um": pitch_um,
         "seed": settings.inner.seed,
         "steps": settings.inner.steps,
         "rows": rows,
     }
-    found |= {"bound": results.window_depth_bound(going)}
-    found |= {"frozen": list(settings.run.frozen), "image": said}
-    found |= {"pitch_held_um": going.trainer.pitch_held_um}
-    found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
-    store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
-    said_by = {
+    record |= {"bound": results.window_depth_bound(going)}
+    record |= {"frozen": list(settings.run.frozen), "image": said}
+    record |= {"pitch_held_um": going.trainer.pitch_held_um}
+    record |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
+    store.write_text(folder / RESULT, json.dumps(record, indent=1) + "\n")
+    labels = {
         f"network_{i}": f"budget {row['budget_mmacs']:g} million MACs"
         for i, row in enumerate(rows)
     }
@@ -261,32 +289,37 @@ def _keep(
         folder / ANSWERS,
         "answers",
         results.predictions_of_frames(ends, SHOWN),
-        attributes=said_by,
+        attributes=labels,
     )
     if going.searches:
-        store.write_bytes(folder / "pareto.png", _plot(going))
+        store.write_bytes(folder / "pareto.png", _pareto_picture(going))
 
 
-def _weights(
+def _write_networks(
     folder: Path, going: CodesignRun, ends: list[BudgetResult], about: store.Provenance
 ) -> None:
-    """Every network, cut to its own architecture, with the lens of its own."""
+    """Write every budget's network, cut to its architecture, with lens and pitch.
+
+    And its own lens file, where the search optimised lenses.
+    """
     for end, state in zip(ends, going.searches, strict=True):
-        model, budget = end.trainer.model, end.row["budget_mmacs"]
-        kept = Subnet(model.net, best_candidate(state.history).architecture)
+        model = end.trainer.model
+        budget = end.row["budget_mmacs"]
+        network = Subnet(model.net, best_candidate(state.history).architecture)
         optics = {
             "optics.coefficients_rad": model.coefficients_rad,
             "optics.log_pitch": model.log_pitch,
         }
-        checkpoint.save_network(weights_file(folder, budget), kept, beside=optics)
+        checkpoint.save_network(weights_file(folder, budget), network, beside=optics)
         if going.settings.search.inner_steps:
-            own = trained.trained_lens(
+            own_lens = trained.trained_lens(
                 going.settings.optics, model.coefficients_rad.detach(), about
             )
-            lens.save(lens_file(folder, going.settings, budget), own)
+            lens.save(lens_file(folder, going.settings, budget), own_lens)
 
 
-def _plot(going: CodesignRun) -> bytes:
+def _pareto_picture(going: CodesignRun) -> bytes:
+    """PNG of gaze error over cost of all candidates, with their Pareto set."""
     figure, axes = report.make_figure(size=(6.0, 4.0))
     for budget, state in zip(
         going.settings.run.budgets_mmacs, going.searches, strict=True
@@ -332,6 +365,7 @@ COLUMNS = {  # of the table, by name in result.json
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
+    """Text table of the rows of result.json, with a warning where the image matters."""
     cells = [[row.get(name) for name in COLUMNS] for row in rows]
     text = report.Table(list(COLUMNS.values()), cells, digits=3).text
     worst = max((r.get("finer_ratio", 1.0) for r in rows), default=1.0)

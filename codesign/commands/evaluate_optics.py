@@ -86,25 +86,29 @@ def _measure(
     names: list[str],
     folder: Path,
 ) -> tuple[dict[str, Any], str]:
-    """Measure, draw, write; the numbers and the tables."""
+    """Axial information, field and scene energies of all lenses; the numbers, and
+    tables.
+
+    Writes tables, numbers, pictures and page into the folder.
+    """
     if options.baselines:
         for name, lens in tuned_like(made[0], settings.axial):
             names.append(name)
             made.append(lens)
-    measured = settings.axial.about(made[0])
+    setting = settings.axial.about(made[0])
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     pairs = options.console.track(
         zip(names, made, strict=True), total=len(made), label="PSFs"
     )
     axial = {
-        name: evaluate_optics.measure_axial_information(lens, measured)
+        name: evaluate_optics.measure_axial_information(lens, setting)
         for name, lens in pairs
     }
     pairs = options.console.track(
         zip(names, made, strict=True), total=len(made), label="field"
     )
-    seen = {
-        name: settings.over_field.of(lens, made[0], measured.angles_deg)
+    over_field = {
+        name: settings.over_field.of(lens, made[0], setting.angles_deg)
         for name, lens in pairs
     }
     spread = [
@@ -124,18 +128,18 @@ def _measure(
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *remarks])) from error
     tables = [
-        *evaluate_optics.format_tables(axial, scenes, measured, spread=remarks),
-        *field_page.field_tables(seen),
+        *evaluate_optics.format_tables(axial, scenes, setting, spread=remarks),
+        *field_page.field_tables(over_field),
     ]
-    values = evaluate_optics.table_values(axial, scenes, measured)
-    values["failures"] = evaluate_optics.table_failures(axial, scenes, measured)
-    for name, one in seen.items():
+    values = evaluate_optics.table_values(axial, scenes, setting)
+    values["failures"] = evaluate_optics.table_failures(axial, scenes, setting)
+    for name, result in over_field.items():
         values["lenses"][name] |= {
             "focuses": name not in spread,
-            "field": field_page.field_values(one),
+            "field": field_page.field_values(result),
         }
     if options.reader:
-        table, values["reader"] = _read(
+        table, values["reader"] = _reader_table(
             options, settings.reader, dict(zip(names, made, strict=True))
         )
         tables.append(table)
@@ -143,33 +147,33 @@ def _measure(
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {
-        "axial": evaluate_plots.plot_axial_information(axial, measured),
-        "slices": evaluate_plots.plot_depth_slices(axial, measured),
+        "axial": evaluate_plots.plot_axial_information(axial, setting),
+        "slices": evaluate_plots.plot_depth_slices(axial, setting),
         "scenes": evaluate_plots.plot_scenes(scenes),
-        "field": field_page.plot_over_field(seen),
-        "mtf": field_page.mtf_picture(seen),
+        "field": field_page.plot_over_field(over_field),
+        "mtf": field_page.mtf_picture(over_field),
     }
-    _write(folder, pictures, tables)
+    _write_page(folder, pictures, tables)
     return values, text
 
 
-def _read(
+def _reader_table(
     options: Options, setting: ReaderConfig, made: dict[str, Lens]
 ) -> tuple[Table, dict[str, Any]]:
-    """What the reference reader makes of every lens."""
-    found = dict(
+    """Table and numbers of the reference reader for every lens."""
+    results = dict(
         options.console.track(
             judge_lenses(made, setting), total=len(made), label="reader"
         )
     )
-    numbers = {name: one.values() for name, one in found.items()}
-    return reader.reader_table(found, setting), {
+    numbers = {name: result.values() for name, result in results.items()}
+    return reader.reader_table(results, setting), {
         "settings": dataclasses.asdict(setting),
         "lenses": numbers,
     }
 
 
-def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:
+def _write_page(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:
     """The pictures, and the page of pictures and tables."""
     captions = evaluate_plots.CAPTIONS | field_page.CAPTIONS
     for name, image in pictures.items():
@@ -182,11 +186,12 @@ def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> Non
 
 
 def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:
-    """The tuned hyperbolic lens and double helix, of the pillars and aperture of a
-    lens, with their names.
+    """Tuned hyperbolic lens and double helix with the pillars and aperture of a lens.
+
+    Returns (name, lens) each.
 
     Args:
-        setting: how lenses are measured.
+        lens: whose cell, aperture and focus are used. setting: how lenses are measured.
     """
     radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
     measured = setting.about(lens)
@@ -196,23 +201,23 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
         lens.source_distance_um,
         lens.layers,
     )
-    wanted = FisherSettings(
+    fisher = FisherSettings(
         depths_mm=measured.depths_mm,
         pixel_um=measured.pixel_um * min(setting.binnings),
         radius_um=measured.radius_um,
         normalisation="sum" if setting.normalisation == "sum" else "l2",
     ).about(focus, radius)
-    out = []
-    for found in tune_baselines(design_pupil(focus, radius, wanted), wanted):
-        mine = dataclasses.replace(focus, source_distance_um=found.focus_um)
-        helix = DoubleHelix(zones=found.zones) if found.zones else None
-        phase = design.phase_of(helix, mine, radius_um=radius)
-        kind = "double-helix" if found.zones else "hyperbolic"
-        simple, _ = design.make(
-            phase, mine, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind
+    named_lenses = []
+    for baseline in tune_baselines(design_pupil(focus, radius, fisher), fisher):
+        refocused = dataclasses.replace(focus, source_distance_um=baseline.focus_um)
+        helix = DoubleHelix(zones=baseline.zones) if baseline.zones else None
+        phase = design.phase_of(helix, refocused, radius_um=radius)
+        kind = "double-helix" if baseline.zones else "hyperbolic"
+        tuned, _ = design.make(
+            phase, refocused, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind
         )  # fmt: skip
-        out.append((found.name, simple))
-    return out
+        named_lenses.append((baseline.name, tuned))
+    return named_lenses
 
 
 def distinct_lens_names(names: list[str]) -> list[str]:

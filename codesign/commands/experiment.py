@@ -27,8 +27,10 @@ GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-ra
 
 
 def run(options: Options) -> int:
-    """Show, read, calibrate, draw; exit 1 where the error of a run's images is above
-    what the run asks for.
+    """Run the virtual experiment: simulate, predict, calibrate, and write tables and
+    plots.
+
+    Exit 1 where the error of a run's images is above what the run requires.
 
     Args:
         options: of the command line.
@@ -44,32 +46,33 @@ def run(options: Options) -> int:
         raise ConfigError(
             f"names {', '.join(names)}: two are alike; give every run one of its own"
         )
-    folder, config = options.output, options.settings
+    folder = options.output
+    config = options.settings
     sources = [retrained.load_retrained(path) for path in options.runs]
     with options.claim_folder(folder) as draft:
         results: list[RunResult] = []
         steps = run_experiment(sources, config, names=names)
-        for _, found in options.console.track(
+        for _, latest in options.console.track(
             steps, total=config.subjects, label="subjects"
         ):
-            results = found
-        shown = {
+            results = latest
+        lenses = {
             name: retrained.lens_of(path)
             for name, path in zip(names, options.runs, strict=True)
         }
         values = experiment_summary(results, config) | {
             "images": image_summary(options.runs, names),
-            "lenses": shown,
+            "lenses": lenses,
         }
         values["failures"] = [
-            f"{one.name}: {one.above}" for one in results if one.above
+            f"{result.name}: {result.above}" for result in results if result.above
         ]
         pictures = {
             "samples.png": plots.plot_samples(sources[0], config),
             "ambiguity.png": plots.plot_ambiguity(results[0]),
             "errors.png": plots.plot_gaze_errors(results),
         }
-        _write(draft.path, values, pictures)
+        _write_files(draft.path, values, pictures)
         for number, (result, source) in enumerate(
             zip(results, sources, strict=True), 1
         ):
@@ -77,15 +80,15 @@ def run(options: Options) -> int:
                 people_file.save_people(
                     draft.path / f"people_{number}.h5",
                     result.how,
-                    provenance=_made(source, config),
+                    provenance=_provenance(source, config),
                 )
     return options.console.judged(
         values, f"{experiment_text(values)}\nopen {folder / PAGE}", values["failures"]
     )
 
 
-def _made(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
-    """By which run, shown what."""
+def _provenance(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
+    """Settings of run and experiment, and the seed."""
     seed = source.settings.inner.seed
     return store.Provenance(
         config=f"{settings.dumps(source.settings)}\n{settings.dumps(config)}", seed=seed
@@ -93,10 +96,9 @@ def _made(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
 
 
 def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """How every run's images were formed and how wrong they are, as the run itself
-    found; None where it did not say.
+    """Image model and error of every run, from its result.json; None where it has none.
 
-    Of a retraining, those of the run that it went on from.
+    Of a retraining, those of its run.
 
     Args:
         folders: of finished runs. names: of the runs.
@@ -110,18 +112,17 @@ def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, An
 
 
 def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the folders, of a network in a folder with its own, numbered where they
-    repeat.
+    """Folder names of runs, with that of a network file, numbered where they repeat.
 
     Args:
         paths: of runs or retrainings.
     """
-    places = (path.resolve() for path in paths)
+    resolved = (path.resolve() for path in paths)
     stems = [
         reading.to_valid_utf8(
             p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}"
         )
-        for p in places
+        for p in resolved
     ]
     return tuple(
         s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems)
@@ -131,37 +132,39 @@ def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
 def experiment_summary(
     results: Sequence[RunResult], config: ExperimentConfig
 ) -> dict[str, Any]:
-    """Numbers of every run with intervals over subjects, and ratios of the first to the
-    others.
+    """Mean errors of every run with bootstrap intervals over subjects, and ratios.
+
+    Ratios are of the first run to each of the others.
 
     Args:
         results: one a run. config: subjects, stimuli, slippage and calibration.
     """
-    per = [_per_subject(r) for r in results]
+    subject_means = [_subject_means(r) for r in results]
     rows = []
-    for result, means in zip(results, per, strict=True):
+    for result, means in zip(results, subject_means, strict=True):
         row: dict[str, Any] = {
             "name": result.name,
             "mmacs": result.mmacs,
             **_beyond(result),
         }
         for quantity, values in means.items():
-            known = bool(
-                np.isfinite(values).all()
-            )  # a network without a mask has no overlap
-            row[quantity] = float(values.mean()) if known else None
-            if known and len(values) > 1:
+            # nan: a network without a mask has no overlap
+            finite = bool(np.isfinite(values).all())
+            row[quantity] = float(values.mean()) if finite else None
+            if finite and len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap_interval(values))
-        rows.append(row | _finer(result, row))
+        rows.append(row | _finer_image_errors(result, row))
     ratios = []
-    for other, means in zip(results[1:], per[1:], strict=True):
+    for other, means in zip(results[1:], subject_means[1:], strict=True):
         for quantity in (
             "gaze_axial_deg",
             "gaze_lateral_deg",
             "slip_mm",
             "slip_axial_mm",
         ):
-            value, low, high = bootstrap_ratio(per[0][quantity], means[quantity])
+            value, low, high = bootstrap_ratio(
+                subject_means[0][quantity], means[quantity]
+            )
             ratios.append({
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
                 "goal": GOALS.get(quantity, ""),
@@ -173,22 +176,26 @@ def experiment_summary(
 FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
 
 
-def _finer(result: RunResult, row: dict[str, Any]) -> dict[str, Any]:
-    """Errors of the same frames on a finer image, and its ratio of the gaze error."""
+def _finer_image_errors(result: RunResult, row: dict[str, Any]) -> dict[str, Any]:
+    """Mean errors on the finer image, and the ratio of its gaze error; None without
+    one.
+    """
     if result.finer is None:
         return {f"finer_{name}": None for name in (*FINER, "ratio")}
-    means = _per_subject(result.finer)
-    found = {}
+    means = _subject_means(result.finer)
+    errors = {}
     for name in FINER:
         value = float(means[name].mean())
-        found[f"finer_{name}"] = value if np.isfinite(value) else None
-    ratio = found["finer_gaze_axial_deg"] / row["gaze_axial_deg"]
-    return found | {"finer_ratio": ratio}
+        errors[f"finer_{name}"] = value if np.isfinite(value) else None
+    ratio = errors["finer_gaze_axial_deg"] / row["gaze_axial_deg"]
+    return errors | {"finer_ratio": ratio}
 
 
 def _beyond(result: RunResult) -> dict[str, Any]:
-    """Slippages that training never saw, how far it saw, and the axial error where it
-    did.
+    """Slippages outside the range of training, that range, and axial errors in and
+    outside.
+
+    Empty where none is outside.
     """
     within = result.within
     if within.all():
@@ -202,19 +209,20 @@ def _beyond(result: RunResult) -> dict[str, Any]:
 
 
 def _of_reach(row: dict[str, Any]) -> str:
-    """A sentence of :func:`_beyond`."""
-    far = ", ".join(
+    """Sentence on the slippages of :func:`_beyond`."""
+    beyond = ", ".join(
         "(" + ", ".join(f"{v:g}" for v in slip) + ")"
         for slip in row["beyond_training_mm"]
     )
-    seen = ", ".join(f"{v:g}" for v in row["trained_to_mm"])
+    range_mm = ", ".join(f"{v:g}" for v in row["trained_to_mm"])
     return (
-        f"{row['name']}: trained on slippage up to ({seen}) mm; {far} mm lie outside of what it saw: axial error "
+        f"{row['name']}: trained on slippage up to ({range_mm}) mm; {beyond} mm lie outside of what it saw: axial error "
         f"{row['slip_axial_beyond_mm']:.2f} mm there, {row['slip_axial_within_mm']:.2f} mm within (scenes.slip_mm)"
     )
 
 
-def _per_subject(result: RunResult) -> dict[str, Any]:
+def _subject_means(result: RunResult) -> dict[str, Any]:
+    """(subjects,) mean of every error by name, gaze in deg and slippage in mm."""
     error, axial = result.slip_error_mm, result.trial.group(AXIAL)
     return {
         "gaze_axial_deg": result.per_subject(result.gaze_deg, axial),
@@ -254,7 +262,7 @@ def experiment_tables(values: dict[str, Any]) -> list[report.Table]:
 
 
 def _remarks(values: dict[str, Any]) -> list[str]:
-    """Sentences on lenses as made, on slippage that training never saw."""
+    """Sentences on made lenses, and on slippage outside the range of training."""
     made = [
         f"{name}: through the lens {lens}"
         for name, lens in values["lenses"].items()
@@ -270,15 +278,18 @@ def experiment_text(values: dict[str, Any]) -> str:
         values: content of experiment.json.
     """
     images = [
-        f"{name}: {formed.describe_image_text(found)}"
-        for name, found in values["images"].items()
-        if found
+        f"{name}: {formed.describe_image_text(image)}"
+        for name, image in values["images"].items()
+        if image
     ]
     tables = [table.text for table in experiment_tables(values)]
     return "\n".join([*tables, *_remarks(values), *images])
 
 
-def _write(folder: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
+def _write_files(
+    folder: Path, values: dict[str, Any], pictures: dict[str, bytes]
+) -> None:
+    """Write pictures, page and experiment.json."""
     for name, picture in pictures.items():
         store.write_bytes(folder / name, picture)
     _page(folder / PAGE, values, pictures)
@@ -309,6 +320,7 @@ CAPTIONS = {
 
 
 def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
+    """Write report.html."""
     figures = [
         report.Figure(pictures[name], caption, wide=True)
         for name, caption in CAPTIONS.items()
@@ -331,7 +343,7 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
 
 
 def _method_text(about: dict[str, Any]) -> str:
-    """How the numbers were made."""
+    """Paragraph on subjects, calibration and intervals."""
     return (
         f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each is calibrated on "
         f"{about['share']:.0%} of the stimuli, {PLACED[about['points']]}, and judged on the rest: what is read (axis, "
@@ -339,12 +351,12 @@ def _method_text(about: dict[str, Any]) -> str:
         "network that tells no axis, by a sphere and a regressor of one hidden layer. Subjects "
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
         "error under axial slip is that of pupil, sphere and regressor alone. From calibration: the slip error beside "
-        f"its mean over the frames that calibrated a subject. Intervals are over subjects. {_of_light(about)}"
+        f"its mean over the frames that calibrated a subject. Intervals are over subjects. {_light_text(about)}"
     )
 
 
-def _of_light(about: dict[str, Any]) -> str:
-    """Which light and which image the frames were taken in."""
+def _light_text(about: dict[str, Any]) -> str:
+    """Sentences on light level and image model of the frames."""
     image = {"true": "the true image", "trained": "the image of training"}
     light = (
         "in good light"

@@ -43,11 +43,11 @@ def run(options: Options) -> int:
         finished.rows_of(path)  # refused now, not after an hour of measuring
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
         if options.runs and options.measure:
-            _measure(options, draft.path)
+            _run_measurements(options, draft.path)
         claims = paper.claim_lines(
             collect_measurements(draft.path, runs, options.others), draft.path
         )
-        _write(draft.path, claims)
+        _write_page(draft.path, claims)
         values = [
             {
                 **asdict(t.claim),
@@ -75,14 +75,14 @@ def measurement_failures(folder: Path) -> list[str]:
             "optics/optics.json",
         )
     ]
-    read = {
+    results = {
         file.parent.name: json.loads(file.read_text("utf-8"))
         for file in files
         if file.is_file()
     }
     return [
         f"{name}: {words}"
-        for name, values in read.items()
+        for name, values in results.items()
         for words in values.get("failures", [])
     ]
 
@@ -90,17 +90,17 @@ def measurement_failures(folder: Path) -> list[str]:
 def collect_measurements(
     folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()
 ) -> dict[str, MeasuredNumber]:
-    """Everything that was measured into ``folder``, and the rows of the runs and of
-    those with a part frozen.
+    """Numbers measured into ``folder``, and those of the runs and ablations.
 
     Args:
-        others: runs with a part frozen.
+        folder: of the measurements. runs: folder by role. others: runs with a part
+            frozen.
 
     Raises:
         StoreError, TrainingError: a measurement or a run is damaged or of another
             version.
     """
-    found: dict[str, MeasuredNumber] = {}
+    measured: dict[str, MeasuredNumber] = {}
     experiment, dim, optics = (
         folder / name / f"{file}.json"
         for name, file in (
@@ -110,21 +110,24 @@ def collect_measurements(
         )
     )
     if experiment.is_file():
-        found |= paper.of_experiment(experiment)
+        measured |= paper.of_experiment(experiment)
     if experiment.is_file() and dim.is_file():
-        found |= paper.of_dim(experiment, dim)
+        measured |= paper.of_dim(experiment, dim)
     if optics.is_file():
-        found |= paper.of_optics(optics)
+        measured |= paper.of_optics(optics)
     if (folder / GAZE).is_file():
-        found |= paper.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
+        measured |= paper.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
     rows = {role: finished.rows_of(path) for role, path in runs.items()}
-    found |= paper.of_runs(rows)
-    return found | paper.of_ablations(
+    measured |= paper.of_runs(rows)
+    return measured | paper.of_ablations(
         rows.get("proposed", []), dict(paper.frozen_rows(others))
     )
 
 
-def _measure(options: Options, folder: Path) -> None:
+def _run_measurements(options: Options, folder: Path) -> None:
+    """Run the experiments, gaze and optics evaluations that are missing in the
+    folder.
+    """
     names = ROLES[: len(options.runs)]
     config = ExperimentConfig(subjects=options.subjects)
     for name, settings in (
@@ -133,10 +136,10 @@ def _measure(options: Options, folder: Path) -> None:
     ):
         if not (folder / name / "experiment.json").is_file():
             options.console.say(f"measuring: {name}")
-            asked = experiment_options.Options(
+            experiment = experiment_options.Options(
                 options.runs, folder / name, names, settings, quiet=True, force=True
             )
-            command_experiment.run(asked)
+            command_experiment.run(experiment)
     _measure_gaze(options, folder / GAZE)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
@@ -144,16 +147,16 @@ def _measure(options: Options, folder: Path) -> None:
             zip(names, options.runs, strict=True),
             key=lambda pair: pair[0] != "hyperbolic",
         )
-        lenses = tuple(_named(folder, name, path) for name, path in order)
-        asked_of = folder / "optics.toml"
+        lenses = tuple(_copy_lens(folder, name, path) for name, path in order)
+        settings_file = folder / "optics.toml"
         store.write_text(
-            asked_of,
+            settings_file,
             f"[scenes]\nimage_tolerance = {paper.image_tolerance(options.runs)}\n",
         )
         optics = optics_options.Options(
             lenses=lenses,
             output=folder / "optics",
-            config=asked_of,
+            config=settings_file,
             scenes=options.scenes,
             quiet=True,
             force=True,
@@ -172,12 +175,12 @@ def _measure_gaze(options: Options, path: Path) -> None:
     store.write_text(path, json.dumps(measured, indent=1) + "\n")
 
 
-def _named(folder: Path, name: str, run_dir: Path) -> Path:
-    """The run's lens under its role's name, by which the tables know it."""
-    kept = folder / "lenses"
-    kept.mkdir(exist_ok=True)
-    store.write_bytes(kept / f"{name}.h5", (run_dir / "lens.h5").read_bytes())
-    return kept / f"{name}.h5"
+def _copy_lens(folder: Path, name: str, run_dir: Path) -> Path:
+    """Copy of a run's lens under the name of its role, which the tables use."""
+    lens_folder = folder / "lenses"
+    lens_folder.mkdir(exist_ok=True)
+    store.write_bytes(lens_folder / f"{name}.h5", (run_dir / "lens.h5").read_bytes())
+    return lens_folder / f"{name}.h5"
 
 
 def claims_table(claims: list[ClaimLine]) -> str:
@@ -190,27 +193,28 @@ def claims_table(claims: list[ClaimLine]) -> str:
     return report.Table(head, [line.words() for line in claims]).text
 
 
-def _write(folder: Path, claims: list[ClaimLine]) -> None:
+def _write_page(folder: Path, claims: list[ClaimLine]) -> None:
+    """Write the page: for every table and figure of the paper, its claims and ours."""
     places = list(dict.fromkeys(t.claim.place for t in claims))
     head = ("what", "paper", "ours", "ratio", "conditions")
     sections = []
     for place in places:
-        mine = [t for t in claims if t.claim.place == place]
+        lines = [t for t in claims if t.claim.place == place]
         items: list[report.Figure | report.Table] = (
-            [report.Table(head, [t.words()[1:] for t in mine if not t.picture])]
-            if any(not t.picture for t in mine)
+            [report.Table(head, [t.words()[1:] for t in lines if not t.picture])]
+            if any(not t.picture for t in lines)
             else []
         )
         items += [
             report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True)
-            for t in mine
+            for t in lines
             if t.picture
         ]
         sections.append(report.Section(place, items=items))
-    done = sum(t.ours is not None or bool(t.picture) for t in claims)
+    measured = sum(t.ours is not None or bool(t.picture) for t in claims)
     keys = [
         report.KeyFigure("claims of the paper", str(len(claims))),
-        report.KeyFigure("measured here", str(done)),
+        report.KeyFigure("measured here", str(measured)),
     ]
     lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
     report.write_report(

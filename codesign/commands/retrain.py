@@ -54,8 +54,8 @@ def run(options: Options) -> int:
     with options.claim_work(
         options.output, keep=("*.safetensors",), resume=options.resume
     ) as draft:
-        _agree(draft, recipe, resume=options.resume)
-        story = _story(
+        _check_recipe(draft, recipe, resume=options.resume)
+        story = _retrain_and_correct(
             options, draft.path, recipe, (source, result, design, truth, old)
         )
     return options.console.judged(
@@ -63,40 +63,40 @@ def run(options: Options) -> int:
     )
 
 
-def _story(
-    options: Options, folder: Path, recipe: RetrainingRecipe, given: Given
+def _retrain_and_correct(
+    options: Options, folder: Path, recipe: RetrainingRecipe, inputs: Given
 ) -> retrain_report.RetrainingResults:
-    """Train on, judge, correct and write into the folder."""
-    source, result, design, truth, old = given
+    """Retrain, evaluate and correct; write the correction and networks into the
+    folder.
+    """
+    source, result, design, truth, old = inputs
     made = MadeLens(design, source.settings.optics, response=result.response)
     console = options.console
     console.say(
         f"lenses: the design, the fit and {options.settings.draws} draws of its posterior"
     )
-    found = retraining.lens_psfs(made, result, options.settings, truth)
+    psfs = retraining.lens_psfs(made, result, options.settings, truth)
     trained = {
-        name: _train(options, folder, (recipe, source, found), name)
-        for name in retraining.available_jobs(found)
+        name: _train(options, folder, (recipe, source, psfs), name)
+        for name in retraining.available_jobs(psfs)
     }
     console.say(
-        f"judging: {len(retraining.available_jobs(found)) + 2} cases on the same frames"
+        f"judging: {len(retraining.available_jobs(psfs)) + 2} cases on the same frames"
     )
-    outcome = retraining.retraining_outcome(source, options.settings, found, trained)
+    outcome = retraining.retraining_outcome(source, options.settings, psfs, trained)
     plan = correction.propose_correction(
         design, result.parameters(), response=made.response, old=old
     )
-    true = (
-        truth.vector()
-        if truth
-        else list(
-            posterior_parameters(
-                result, options.settings.draws + 1, seed=options.settings.seed
-            )
-        )[-1]
-    )
+    if truth:
+        true_parameters = truth.vector()
+    else:
+        draws = posterior_parameters(
+            result, options.settings.draws + 1, seed=options.settings.seed
+        )
+        true_parameters = list(draws)[-1]
     proposals = []
     frames = retraining.render_test_frames(source, options.settings)
-    states = correction.next_lenses(made, plan, result.parameters(), true)
+    states = correction.next_lenses(made, plan, result.parameters(), true_parameters)
     for state in console.track(states, total=len(states), label="next lens"):
         error = retraining.judge_network(
             trained["nominal"],
@@ -106,9 +106,9 @@ def _story(
             frames=frames,
             finer=False,
         )
-        proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
+        proposals.append((state, psf_error(state.stack, psfs.nominal), error.slip_mm))
     printed = correction.printed_um(design)
-    sure = correction.judge_correction(
+    table_spread = correction.judge_correction(
         result,
         lambda x: (
             correction.correction_table(
@@ -116,35 +116,35 @@ def _story(
             ).bias_nm
         ),
     )
-    even = correction.judge_correction(
+    map_spread = correction.judge_correction(
         result, correction.uneven_nm, part=correction.MAP
     )
-    refused = sure.words or correction.loss_reason(states[0], states[1])
-    uneven = even.words or correction.loss_reason(states[1], states[2])
-    apart = (
-        psf_error(found.best, found.nominal),
-        psf_error(found.judges[0], found.nominal),
+    refused = table_spread.words or correction.loss_reason(states[0], states[1])
+    uneven = map_spread.words or correction.loss_reason(states[1], states[2])
+    psf_errors = (
+        psf_error(psfs.best, psfs.nominal),
+        psf_error(psfs.judges[0], psfs.nominal),
     )
-    story = retrain_report.RetrainingResults(
+    results = retrain_report.RetrainingResults(
         outcome,
-        found,
-        apart,
-        _curves(folder, found),
+        psfs,
+        psf_errors,
+        _curves(folder, psfs),
         plan,
         proposals,
-        _cautions(result, found),
+        _cautions(result, psfs),
         refused,
         uneven,
     )
     if not refused:
         correction.write_correction(folder, plan, evened=not uneven)
-    _keep(folder, options, (source, trained["retrained"]), story)
+    _write_results(folder, options, (source, trained["retrained"]), results)
     if options.export:
         net = trained["retrained"].model.net
         onnx_file.write_network_file(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
-    return story
+    return results
 
 
 def _recipe(options: Options, source: FinishedRun) -> RetrainingRecipe:
@@ -157,7 +157,9 @@ def _recipe(options: Options, source: FinishedRun) -> RetrainingRecipe:
     )
 
 
-def _agree(draft: OutputDraft, recipe: RetrainingRecipe, *, resume: bool) -> None:
+def _check_recipe(
+    draft: OutputDraft, recipe: RetrainingRecipe, *, resume: bool
+) -> None:
     """Note the recipe, or refuse to resume another."""
     folder = draft.path
     if resume:
@@ -179,31 +181,33 @@ def _agree(draft: OutputDraft, recipe: RetrainingRecipe, *, resume: bool) -> Non
 def _train(
     options: Options,
     folder: Path,
-    given: tuple[RetrainingRecipe, FinishedRun, LensPsfs],
+    inputs: tuple[RetrainingRecipe, FinishedRun, LensPsfs],
     name: str,
 ) -> Trainer:
-    """One job to its end, logged and kept; a resume drops log lines beyond its
-    checkpoint.
+    """Train one job to its end with log and checkpoints.
+
+    A resume drops the log lines after its checkpoint.
     """
-    (recipe, source, found), console = given, options.console
-    going = retraining.make_job(source, options.settings, found, name)
+    recipe, source, psfs = inputs
+    trainer = retraining.make_job(source, options.settings, psfs, name)
     path = folder / f"{name}.safetensors"
     if path.is_file():
-        going.restore(checkpoint.load(path, settings=recipe)["trainer"])
+        trainer.restore(checkpoint.load(path, settings=recipe)["trainer"])
     entries = checkpoint.read_entries(folder / LOG)
     checkpoint.write_entries(
         folder / LOG,
-        [e for e in entries if e["job"] != name or e["step"] <= going.step],
+        [e for e in entries if e["job"] != name or e["step"] <= trainer.step],
     )
-    records = retraining.run_job(going, path, recipe)
-    for record in console.track(
-        records, total=going.inner.steps - going.step, label=f"training: {name}"
+    records = retraining.run_job(trainer, path, recipe)
+    for record in options.console.track(
+        records, total=trainer.inner.steps - trainer.step, label=f"training: {name}"
     ):
         checkpoint.append_entry(folder / LOG, {"job": name, **asdict(record)})
-    return going
+    return trainer
 
 
 def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[float]]]:
+    """{job: (steps, task losses)} of the log."""
     entries = checkpoint.read_entries(folder / LOG)
     return {
         name: (
@@ -215,6 +219,7 @@ def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[fl
 
 
 def _cautions(result: asbuilt.AsBuilt, found: LensPsfs) -> list[str]:
+    """Warnings about the fit and its use, in words."""
     words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
     if release != __version__:
@@ -228,16 +233,17 @@ def _cautions(result: asbuilt.AsBuilt, found: LensPsfs) -> list[str]:
     return words
 
 
-def _keep(
+def _write_results(
     folder: Path,
     options: Options,
     trained: tuple[FinishedRun, Trainer],
     story: retrain_report.RetrainingResults,
 ) -> None:
-    source, going = trained
-    assess.recalibrate_network(going, source.architecture)
-    cut = Subnet(going.model.net, source.architecture)
-    checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
+    """Write the retrained network, the page, the picture of cases and result.json."""
+    source, trainer = trained
+    assess.recalibrate_network(trainer, source.architecture)
+    subnet = Subnet(trainer.model.net, source.architecture)
+    checkpoint.save_network(folder / "subnet_retrained.safetensors", subnet)
     retrain_report.write_retraining_page(folder / "report.html", story)
     store.write_bytes(
         folder / "cases.png", retrain_report.plot_error_bars(story.outcome)
@@ -250,7 +256,8 @@ def _keep(
 def _values(
     story: retrain_report.RetrainingResults, options: Options
 ) -> dict[str, Any]:
-    o, folder = story.outcome, options.output
+    """Content of result.json."""
+    outcome, folder = story.outcome, options.output
     states = [
         {
             "name": p.name,
@@ -268,13 +275,13 @@ def _values(
         ),
         "rows": [
             {"case": retrain_report.CASES[name], **row}
-            for name, row in o.rows().items()
+            for name, row in outcome.rows().items()
         ],
-        "slip_mm": o.rows()["after"]["slip_mm"],
-        "cases": o.rows(),
-        "gap_mm": o.gap_mm,
-        "gap_sigma_mm": o.gap_sigma_mm,
-        "recovered": o.recovered,
+        "slip_mm": outcome.rows()["after"]["slip_mm"],
+        "cases": outcome.rows(),
+        "gap_mm": outcome.gap_mm,
+        "gap_sigma_mm": outcome.gap_sigma_mm,
+        "recovered": outcome.recovered,
         "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
         "truth_known": story.lenses.known,
         "next_lens": states,
@@ -284,6 +291,7 @@ def _values(
 
 
 def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
+    """Summary of a retraining for the terminal."""
     o = story.outcome
     lines = [retrain_report.accuracy_table(o).text]
     won = (

@@ -129,75 +129,82 @@ def run(options: Options) -> int:
     with options.claim_folder(
         folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
     ) as draft:
-        count = _make(settings, draft.path)
+        count = _render_and_write(settings, draft.path)
         values: dict[str, object] = {
             "frames": settings.frames,
             "layers": count,
             "folder": str(folder),
         }
-        words = (
+        summary = (
             f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png"
         )
         if lens is not None and options.lens is not None:
             options.console.say(
                 "the lens over its field; half a minute for one of 1 mm"
             )
-            about = Provenance(
+            provenance = Provenance(
                 config.dumps(settings),
                 {options.lens.name: store.sha256(options.lens)},
                 settings.seed,
             )
-            found = _imaged(settings, lens, options.fwhm_nm)
-            imaged.write_images(draft.path, found, about)
-            values |= {"image_error": found.error, "light": found.light}
-            failures.append(found.problem)
-            words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png{found.light}"
-    return options.console.judged(values, words, failures)
+            images = _image_frames(settings, lens, options.fwhm_nm)
+            imaged.write_images(draft.path, images, provenance)
+            values |= {"image_error": images.error, "light": images.light}
+            failures.append(images.problem)
+            summary += f"\n{images.error:.2g} of a texture is the error of the image: {folder}/image.png{images.light}"
+    return options.console.judged(values, summary, failures)
 
 
-def _make(settings: SceneSettings, folder: Path) -> int:
-    """Render and write; the number of layers of the first frame."""
+def _render_and_write(settings: SceneSettings, folder: Path) -> int:
+    """Render frames, write scene, layers, labels and sheet; number of layers."""
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     states = dataset.states_at(
         torch.arange(settings.frames), settings.seed, motion=settings.motion
     )
-    made = augmented_frames(
+    rendered = augmented_frames(
         states, settings.rig, camera, settings.variety, (settings.seed, 3)
     )
-    about = Provenance(config=config.dumps(settings), seed=settings.seed)
-    dataset.write_shard(folder / "scene.h5", made, seed=settings.seed, provenance=about)
-    count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)
-    store.write_text(folder / "labels.csv", _table(made))
-    contact_sheet(made, folder / "sheet.png")
-    return count
+    provenance = Provenance(config=config.dumps(settings), seed=settings.seed)
+    dataset.write_shard(
+        folder / "scene.h5", rendered, seed=settings.seed, provenance=provenance
+    )
+    layer_count = _write_layers(
+        folder / "layers.h5", rendered, settings.layer_mm * 1e3, provenance
+    )
+    store.write_text(folder / "labels.csv", _labels_csv(rendered))
+    contact_sheet(rendered, folder / "sheet.png")
+    return layer_count
 
 
-def _imaged(settings: SceneSettings, lens: Lens, fwhm_nm: float) -> imaged.ImagedFrames:
+def _image_frames(
+    settings: SceneSettings, lens: Lens, fwhm_nm: float
+) -> imaged.ImagedFrames:
+    """First frames imaged by a lens over its field."""
     count = min(settings.frames, imaged.FRAMES)
     states = dataset.states_at(
         torch.arange(count), settings.seed, motion=settings.motion
     )
 
-    def rendered(camera: PinholeCamera, rig: CameraRig) -> RenderedFrames:
+    def render_with(camera: PinholeCamera, rig: CameraRig) -> RenderedFrames:
         return augmented_frames(
             states, rig, camera, settings.variety, (settings.seed, 3)
         )
 
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     return imaged.image_first_frames(
-        lens, camera, settings.rig, rendered, fwhm_nm=fwhm_nm
+        lens, camera, settings.rig, render_with, fwhm_nm=fwhm_nm
     )
 
 
 def _write_layers(
     path: Path, made: RenderedFrames, step_um: float, about: Provenance
 ) -> int:
-    """The occupied layers of the first frame, as image formation takes them."""
+    """Write the occupied depth layers of the first frame; their number."""
     frame = scene.Frames(
         made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1]
     )
-    seen = frame.depth_um[frame.coverage > 0]
-    low, high = float(seen.min()), float(seen.max())
+    depths_um = frame.depth_um[frame.coverage > 0]
+    low, high = float(depths_um.min()), float(depths_um.max())
     depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
     layers = scene.cut_layers(frame, depths)
     arrays = {
@@ -210,11 +217,13 @@ def _write_layers(
     return len(layers.depth_um)
 
 
-def _table(made: RenderedFrames) -> str:
+def _labels_csv(made: RenderedFrames) -> str:
     """Labels as comma-separated values, a frame a line."""
     labels = made.labels
-    marks = [f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"]
-    head = [
+    landmark_columns = [
+        f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"
+    ]
+    names = [
         "slip x um",
         "slip y um",
         "slip z um",
@@ -225,14 +234,14 @@ def _table(made: RenderedFrames) -> str:
         "visual y",
         "visual z",
     ]
-    head += [
+    names += [
         "pupil x um",
         "pupil y um",
         "pupil z um",
         "pupil x px",
         "pupil y px",
         "visible",
-        *marks,
+        *landmark_columns,
     ]
     columns = [
         labels.slip_um,
@@ -245,7 +254,7 @@ def _table(made: RenderedFrames) -> str:
     rows = torch.cat(columns, 1).tolist()
     return (
         "\n".join(
-            [",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
+            [",".join(names), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
         )
         + "\n"
     )
@@ -254,7 +263,8 @@ def _table(made: RenderedFrames) -> str:
 def contact_sheet(
     made: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
 ) -> None:
-    """A picture of frames, with depth and pupil masks of the first row below.
+    """Write a PNG of frames in rows, then depth (near is bright) and pupil masks of the
+    first.
 
     Args:
         made: rendered frames. path: of the file. columns: frames across.
@@ -266,20 +276,18 @@ def contact_sheet(
     frames = list((light * 255).numpy().astype(np.uint8))
     depth = (made.frames.depth_um * made.frames.coverage).sum(1)[:columns]
     low, high = float(depth.min()), float(depth.max())
-    near = 255 * (high - depth) / max(high - low, 1e-9)
-    frames += list(near.numpy().astype(np.uint8)) if len(frames) % columns == 0 else []
-    frames += (
-        list((made.pupil[:columns] * 255).numpy().astype(np.uint8))
-        if len(frames) % columns == 0
-        else []
-    )
+    shades = 255 * (high - depth) / max(high - low, 1e-9)
+    if len(frames) % columns == 0:
+        frames += list(shades.numpy().astype(np.uint8))
+    if len(frames) % columns == 0:
+        frames += list((made.pupil[:columns] * 255).numpy().astype(np.uint8))
     blank = np.zeros_like(frames[0])
     frames += [blank] * (-len(frames) % columns)
     rows = [
         np.concatenate(frames[k : k + columns], 1)
         for k in range(0, len(frames), columns)
     ]
-    done, coded = cv2.imencode(".png", np.concatenate(rows, 0))
-    if not done:
+    encoded, coded = cv2.imencode(".png", np.concatenate(rows, 0))
+    if not encoded:
         raise OSError(f"{path}: the picture could not be encoded")
     store.write_bytes(path, coded.tobytes())

@@ -33,37 +33,47 @@ ANSWERS = "answers.h5"
 
 
 def run_panels(path: Path) -> list[Panel]:
-    """A run's folder, finished or not.
+    """Panels of a run's folder, finished or not.
+
+    Training curves, searched networks, results, test frames with predictions, bound and
+    lens, as far as their files exist.
 
     Args:
-        path: of the file.
+        path: of the folder.
 
     Raises:
         StoreError: a log or a result that is no JSON.
     """
-    entries = _lines(path / LOG)
-    result = (
-        _json((path / RESULT).read_text(encoding="utf-8"), path / RESULT)
-        if (path / RESULT).is_file()
-        else {}
-    )
-    shown = [*_training(entries), *_searched(entries), *_networks(result)]
+    entries = _log_entries(path / LOG)
+    result: dict[str, Any] = {}
+    if (path / RESULT).is_file():
+        text = (path / RESULT).read_text(encoding="utf-8")
+        result = _parse_table(text, path / RESULT)
+    panels = [
+        *_training_panels(entries),
+        *_search_panels(entries),
+        *_network_panels(result),
+    ]
     if (path / ANSWERS).is_file():
-        shown += prediction_panels(path / ANSWERS)
-    shown += _bound(result)
+        panels += prediction_panels(path / ANSWERS)
+    panels += _bound_panels(result)
     if (path / LENS).is_file():
-        shown += lens_panels(path / LENS)
-    return shown
+        panels += lens_panels(path / LENS)
+    return panels
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
+def _log_entries(path: Path) -> list[dict[str, Any]]:
     """Entries of the log; a last line that is still being written is left out."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    whole = [line for line in lines if line.endswith("}")]
-    return [_json(line, path) for line in whole]
+    return [_parse_table(line, path) for line in lines if line.endswith("}")]
 
 
-def _json(text: str, path: Path) -> dict[str, Any]:
+def _parse_table(text: str, path: Path) -> dict[str, Any]:
+    """JSON object from text.
+
+    Raises:
+        StoreError: not JSON, or not an object; ``path`` is named.
+    """
     try:
         found = json.loads(text)
     except ValueError as error:
@@ -75,7 +85,10 @@ def _json(text: str, path: Path) -> dict[str, Any]:
     return found
 
 
-def _training(entries: list[dict[str, Any]]) -> list[Panel]:
+def _training_panels(entries: list[dict[str, Any]]) -> list[Panel]:
+    """A curve over the step for every logged number that varies; [] of less than two
+    steps.
+    """
     steps = [entry for entry in entries if entry.get("kind") == "step"]
     if len(steps) < 2:
         return []
@@ -85,29 +98,33 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
         for k, v in steps[0].items()
         if k not in ("kind", "step") and isinstance(v, (int, float))
     ]
-    lines = {
+    values = {
         name: np.array([entry.get(name, np.nan) for entry in steps], float)
         for name in names
     }
-    said = {name: report.in_words(name) for name in names}
-    moving = [name for name in names if np.ptp(lines[name]) > 0]
+    titles = {name: report.in_words(name) for name in names}
+    varying = [name for name in names if np.ptp(values[name]) > 0]
     budgets = list(
         dict.fromkeys(
             entry["budget_mmacs"] for entry in entries if "budget_mmacs" in entry
         )
     )
-    shown = {name: {said[name]: lines[name]} for name in moving}
-    if "mmacs" in shown and len(budgets) > 1:
-        shown["mmacs"] = _in_turn(x, lines["mmacs"], budgets)
+    curves_by_name = {name: {titles[name]: values[name]} for name in varying}
+    if "mmacs" in curves_by_name and len(budgets) > 1:
+        curves_by_name["mmacs"] = _curves_by_budget(x, values["mmacs"], budgets)
     return [
-        CurvePanel(f"Training: {said[name]}", x, "step", curves, "")
-        for name, curves in shown.items()
+        CurvePanel(f"Training: {titles[name]}", x, "step", curves, "")
+        for name, curves in curves_by_name.items()
     ]
 
 
-def _in_turn(step: Array, values: Array, budgets: list[float]) -> dict[str, Array]:
-    """A curve for each budget, of what is of a step for each in turn; between its steps
-    the last value stands.
+def _curves_by_budget(
+    step: Array, values: Array, budgets: list[float]
+) -> dict[str, Array]:
+    """(steps,) curve of each budget, of a value that belongs to one budget in turn.
+
+    Step s belongs to budget (s - 1) mod len(budgets). Between its steps the last value
+    is repeated; before the first it is nan.
     """
     curves = {}
     for i, budget in enumerate(budgets):
@@ -118,30 +135,32 @@ def _in_turn(step: Array, values: Array, budgets: list[float]) -> dict[str, Arra
     return curves
 
 
-def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
-    """Every network that the searches tried, and those that no other beats in both
-    error and cost.
+def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
+    """Error over cost of every network that the searches evaluated, Pareto set marked.
+
+    The Pareto set: no other network is better in both.
     """
     births = [
         e
         for e in entries
-        if e.get("kind") == "birth" and {"error", "mmacs", "budget_mmacs"} <= set(e)
+        if e.get("kind") == "birth"
+        and {"error", "mmacs", "budget_mmacs"} <= set(e)
+        and math.isfinite(e["error"])
     ]
-    births = [e for e in births if math.isfinite(e["error"])]
     if not births:
         return []
-    tried = [
+    candidates = [
         EvaluatedCandidate(
             _architecture(e.get("architecture", {})), e["error"], e["mmacs"]
         )
         for e in births
     ]
     front = [
-        next(i for i, one in enumerate(tried) if one is best)
-        for best in pareto_front(tried)
+        next(i for i, candidate in enumerate(candidates) if candidate is best)
+        for best in pareto_front(candidates)
     ]
     notes = [
-        dict(_layers(e["architecture"])) if e.get("architecture") else {}
+        dict(_layer_rows(e["architecture"])) if e.get("architecture") else {}
         for e in births
     ]
     return [
@@ -159,78 +178,90 @@ def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
     ]
 
 
-def _architecture(held: dict[str, Any]) -> Architecture:
+def _architecture(values: dict[str, Any]) -> Architecture:
+    """Architecture from its entry in a log; empty sizes where the entry lacks them."""
     sizes = {
-        name: tuple(held.get(name, ())) for name in ("depths", "kernels", "expansions")
+        name: tuple(values.get(name, ()))
+        for name in ("depths", "kernels", "expansions")
     }
     return Architecture(
-        **sizes, width=held.get("width", 1.0), resolution=held.get("resolution", 1.0)
+        **sizes,
+        width=values.get("width", 1.0),
+        resolution=values.get("resolution", 1.0),
     )
 
 
-def _layers(held: dict[str, Any]) -> list[tuple[str, str]]:
-    """(what, how many) of a network: its input, its channels, and the blocks of each
-    stage.
+def _layer_rows(architecture: dict[str, Any]) -> list[tuple[str, str]]:
+    """(property, value) rows of a network: input scale, channels, blocks of each stage.
+
+    A block is written kernel × kernel × expansion.
     """
-    depths = held["depths"]
-    slots = len(held["kernels"]) // len(depths)
+    depths = architecture["depths"]
+    slots = len(architecture["kernels"]) // len(depths)
     rows = [
-        ("input scale", f"{held['resolution']:.3g}"),
-        ("channels, of the full ones", f"{held['width']:.3g}"),
+        ("input scale", f"{architecture['resolution']:.3g}"),
+        ("channels, of the full ones", f"{architecture['width']:.3g}"),
     ]
     for stage, depth in enumerate(depths):
         used = range(stage * slots, stage * slots + depth)
         blocks = ", ".join(
-            f"{held['kernels'][i]}×{held['kernels'][i]} × {held['expansions'][i]:g}"
+            f"{architecture['kernels'][i]}×{architecture['kernels'][i]} × {architecture['expansions'][i]:g}"
             for i in used
         )
         rows.append((f"stage {stage + 1}", blocks))
     return rows
 
 
-def _bound(result: dict[str, Any]) -> list[Panel]:
-    held = result.get("bound")
-    if not held:
+def _bound_panels(result: dict[str, Any]) -> list[Panel]:
+    """Cramér-Rao bound on the depth of a window over the depth; [] where the run has
+    none.
+    """
+    bound = result.get("bound")
+    if not bound:
         return []
-    x = np.array(held["depth_mm"])
-    least = np.array(held["window_depth_mm"])
-    words = (
+    depth_mm = np.array(bound["depth_mm"])
+    sigma_mm = np.array(bound["window_depth_mm"])
+    caption = (
         "Least standard deviation of any reader of the blur of one window, on axis: 1/f texture as wide as the PSFs, "
         "noise a thousandth of its power. Readers of real frames collect less."
     )
     return [
         CurvePanel(
             "Bound on the depth of a window",
-            x,
+            depth_mm,
             "depth / mm",
-            {"bound": least},
+            {"bound": sigma_mm},
             "mm",
-            caption=words,
+            caption=caption,
             scale="log",
         )
     ]
 
 
 def prediction_panels(path: Path) -> list[Panel]:
-    """Test frames and what the networks said of them, beside the truth.
+    """Test frames, and predictions of the networks next to the truth.
+
+    Pupil mask and window depths as images that alternate; a table of slippages in mm.
 
     Args:
         path: of the file.
     """
     stored = store.load(path, "answers")
-    held, count = stored.arrays, len(stored.arrays["frames"])
+    arrays = stored.arrays
+    count = len(arrays["frames"])
     names = [
-        str(stored.attributes[f"network_{i}"]) for i in range(len(held["told_slip_um"]))
+        str(stored.attributes[f"network_{i}"])
+        for i in range(len(arrays["told_slip_um"]))
     ]
     axes = [
         SliderAxis("network", names),
         SliderAxis("frame", list(range(count))),
         SliderAxis("shown", ["truth", "answer"], blink=True),
     ]
-    shown: list[Panel] = [
+    panels: list[Panel] = [
         ImagePanel(
             "Frames of the test",
-            held["frames"],
+            arrays["frames"],
             axes[1:2],
             1.0,
             "of its spread",
@@ -238,13 +269,12 @@ def prediction_panels(path: Path) -> list[Panel]:
             from_least=True,
         )
     ]
-    for title, true, told, unit in _PAIRS:
-        if told in held:
-            both = np.stack(
-                [np.broadcast_to(held[true], held[told].shape), held[told]], axis=2
-            )
-            scaled = both * (1e-3 if unit == "mm" else 1.0)
-            shown.append(
+    for title, truth, predicted, unit in _PAIRS:
+        if predicted in arrays:
+            repeated = np.broadcast_to(arrays[truth], arrays[predicted].shape)
+            pair = np.stack([repeated, arrays[predicted]], axis=2)
+            scaled = pair * (1e-3 if unit == "mm" else 1.0)
+            panels.append(
                 ImagePanel(
                     title,
                     scaled,
@@ -257,25 +287,30 @@ def prediction_panels(path: Path) -> list[Panel]:
             )
     rows = []
     for i, name in enumerate(names):
-        slips = np.stack([held["slip_um"], held["told_slip_um"][i]], axis=2).reshape(
-            count, 6
-        )
-        wide = [1e-3 * v if v == v else "–" for v in held["interval_um"][i].tolist()]
-        rows += [(name, k, *(1e-3 * slips[k]).tolist(), wide[k]) for k in range(count)]
-    head = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]
-    words = "Slippage of the eye; z is along the axis of the camera."
+        slips = np.stack(
+            [arrays["slip_um"], arrays["told_slip_um"][i]], axis=2
+        ).reshape(count, 6)
+        half_widths = [
+            1e-3 * v if v == v else "–" for v in arrays["interval_um"][i].tolist()
+        ]
+        rows += [
+            (name, k, *(1e-3 * slips[k]).tolist(), half_widths[k]) for k in range(count)
+        ]
+    columns = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]
+    caption = "Slippage of the eye; z is along the axis of the camera."
     return [
-        *shown,
+        *panels,
         TablePanel(
             "Answers",
-            ("network", "frame", *head, "90 % interval of z / mm"),
+            ("network", "frame", *columns, "90 % interval of z / mm"),
             rows,
-            words,
+            caption,
         ),
     ]
 
 
-def _networks(result: dict[str, Any]) -> list[Panel]:
+def _network_panels(result: dict[str, Any]) -> list[Panel]:
+    """Tables of the results and of the layers of every network; [] without a result."""
     if not result:
         return []
     rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
@@ -288,63 +323,74 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
         }
     )
     table = [[row.get(name, "") for name in names] for row in rows]
-    shown: list[Panel] = [
+    panels: list[Panel] = [
         TablePanel(
             "Networks of the run", [report.in_words(name) for name in names], table
         )
     ]
-    drawn = [
-        (f"budget {row['budget_mmacs']:g}", _layers(held))
+    layers_of_budgets = [
+        (f"budget {row['budget_mmacs']:g}", _layer_rows(architecture))
         for row in rows
-        if (held := row.get("architecture"))
+        if (architecture := row.get("architecture"))
     ]
-    if drawn:
-        head = ["", *(name for name, _ in drawn)]
+    if layers_of_budgets:
+        columns = ["", *(name for name, _ in layers_of_budgets)]
         lines = [
-            [what, *(layers[i][1] for _, layers in drawn)]
-            for i, (what, _) in enumerate(drawn[0][1])
+            [what, *(layers[i][1] for _, layers in layers_of_budgets)]
+            for i, (what, _) in enumerate(layers_of_budgets[0][1])
         ]
-        words = "Blocks of each stage: side of the kernel × expansion of the channels."
-        shown.append(TablePanel("Layers of the networks", head, lines, words))
-    return shown
+        caption = (
+            "Blocks of each stage: side of the kernel × expansion of the channels."
+        )
+        panels.append(TablePanel("Layers of the networks", columns, lines, caption))
+    return panels
 
 
 def scene_panels(path: Path) -> list[Panel]:
-    """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of
-    every frame.
+    """Rendered eyes, depth in mm, pupil mask, and a table of the labels of every frame.
+
+    The depth of a pixel is that of the sheet that covers most of it.
 
     Args:
         path: of the file.
     """
-    held = store.load(path, "scene").arrays
-    count = len(held["radiance"])
+    arrays = store.load(path, "scene").arrays
+    count = len(arrays["radiance"])
     frames = [SliderAxis("frame", list(range(count)))]
-    full = float(np.iinfo(held["radiance"].dtype).max)
-    far = (
-        held["coverage"] > full / 2
-    )  # the far sheet shows where it covers most of the pixel
-    depth_mm = 1e-3 * np.where(far, held["depth_um"][:, 1], held["depth_um"][:, 0])
+    full = float(np.iinfo(arrays["radiance"].dtype).max)
+    # the far sheet's depth counts where it covers most of the pixel
+    is_far = arrays["coverage"] > full / 2
+    depth_mm = 1e-3 * np.where(
+        is_far, arrays["depth_um"][:, 1], arrays["depth_um"][:, 0]
+    )
     labels = {
-        k.removeprefix("labels/"): v for k, v in held.items() if k.startswith("labels/")
+        k.removeprefix("labels/"): v
+        for k, v in arrays.items()
+        if k.startswith("labels/")
     }
-    told = {
+    shown_labels = {
         name: value
         for name in ("slip_um", "pupil_um", "visible")
         if (value := labels.get(name)) is not None
     }
-    head = [
+    columns = [
         f"{report.in_words(name)}{axis}"
-        for name, v in told.items()
+        for name, v in shown_labels.items()
         for axis in ([""] if v.ndim == 1 else _XYZ)
     ]
     rows = [
-        [i, *np.concatenate([np.atleast_1d(v[i]) for v in told.values()]).tolist()]
+        [
+            i,
+            *np.concatenate(
+                [np.atleast_1d(v[i]) for v in shown_labels.values()]
+            ).tolist(),
+        ]
         for i in range(count)
     ]
     return [
         ImagePanel(
             "Rendered eyes",
-            held["radiance"].sum(1, dtype=float) / full,
+            arrays["radiance"].sum(1, dtype=float) / full,
             frames,
             1.0,
             "of full light",
@@ -361,7 +407,7 @@ def scene_panels(path: Path) -> list[Panel]:
         ),
         ImagePanel(
             "Pupil",
-            held["pupil"] / full,
+            arrays["pupil"] / full,
             frames,
             1.0,
             "share of the pixel",
@@ -369,7 +415,7 @@ def scene_panels(path: Path) -> list[Panel]:
         ),
         TablePanel(
             "Labels",
-            ("frame", *head),
+            ("frame", *columns),
             rows,
             "Positions in the camera's axes; labels.csv holds all of them.",
         ),
@@ -377,17 +423,18 @@ def scene_panels(path: Path) -> list[Panel]:
 
 
 def layer_panels(path: Path) -> list[Panel]:
-    """The layers of one frame, as images are formed of them.
+    """Light and coverage of the depth layers of one frame, as images are formed of
+    them.
 
     Args:
         path: of the file.
     """
-    held = store.load(path, "layers").arrays
-    axis = [SliderAxis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
+    arrays = store.load(path, "layers").arrays
+    axis = [SliderAxis("layer at", (1e-3 * arrays["depth_um"]).tolist(), "mm")]
     return [
         ImagePanel(
             "Light of a layer",
-            held["radiance"],
+            arrays["radiance"],
             axis,
             1.0,
             "of full light",
@@ -395,7 +442,7 @@ def layer_panels(path: Path) -> list[Panel]:
         ),
         ImagePanel(
             "What a layer covers",
-            held["coverage"],
+            arrays["coverage"],
             axis,
             1.0,
             "share of the pixel",
@@ -405,55 +452,56 @@ def layer_panels(path: Path) -> list[Panel]:
 
 
 def image_panels(path: Path) -> list[Panel]:
-    """Scenes and what a lens makes of them, and the PSFs over field and depth that did
-    it.
+    """Scene, image and their difference, PSFs over field and depth, and the error by
+    cause.
 
     Args:
         path: of the file.
     """
     stored = store.load(path, "image")
-    held, about = stored.arrays, stored.attributes
-    frames = SliderAxis("frame", list(range(len(held["scene"]))))
-    both = np.stack([held["scene"], held["image"]], axis=1)
-    shown = SliderAxis("shown", ["scene", "image"], blink=True)
-    names = [SliderAxis("depth", (1e-3 * held["depth_um"]).tolist(), "mm")]
-    names += [
-        SliderAxis("field, down", held["y_deg"].tolist(), "deg"),
-        SliderAxis("field, across", held["x_deg"].tolist(), "deg"),
+    arrays = stored.arrays
+    attributes = stored.attributes
+    frames = SliderAxis("frame", list(range(len(arrays["scene"]))))
+    pairs = np.stack([arrays["scene"], arrays["image"]], axis=1)
+    choice = SliderAxis("shown", ["scene", "image"], blink=True)
+    axes = [SliderAxis("depth", (1e-3 * arrays["depth_um"]).tolist(), "mm")]
+    axes += [
+        SliderAxis("field, down", arrays["y_deg"].tolist(), "deg"),
+        SliderAxis("field, across", arrays["x_deg"].tolist(), "deg"),
     ]
-    psf = held["psf"] / held["psf"].max()
-    step = float(about["pitch_um"])
-    parts = [
+    psf = arrays["psf"] / arrays["psf"].max()
+    pitch_um = float(attributes["pitch_um"])
+    errors = [
         (report.in_words(k.removeprefix("error_")), v)
-        for k, v in sorted(about.items())
+        for k, v in sorted(attributes.items())
         if k.startswith("error_")
     ]
-    words = f"Relative L2 error of a texture, {float(about['error']):.2g} together; outside: light beyond the windows."
+    note = f"Relative L2 error of a texture, {float(attributes['error']):.2g} together; outside: light beyond the windows."
     unit = "light, as of the scene"
     return [
-        ImagePanel("Scene and image", both, [frames, shown], step, unit),
+        ImagePanel("Scene and image", pairs, [frames, choice], pitch_um, unit),
         ImagePanel(
             "Image less scene",
-            held["image"] - held["scene"],
+            arrays["image"] - arrays["scene"],
             [frames],
-            step,
+            pitch_um,
             unit,
             signed=True,
         ),
         ImagePanel(
             "Points of the field",
             psf,
-            at_brightest(names, psf),
-            step,
+            at_brightest(axes, psf),
+            pitch_um,
             "of the highest peak",
             optics=True,
         ),
-        TablePanel("Error of the image", ("cause", "error"), parts, words),
+        TablePanel("Error of the image", ("cause", "error"), errors, note),
     ]
 
 
 def budget_panels(path: Path) -> list[Panel]:
-    """Every link from pillar to answer with its error.
+    """Table of the error of every link from pillar to gaze: phase, PSF and gaze.
 
     Args:
         path: of the file.
@@ -469,7 +517,7 @@ def budget_panels(path: Path) -> list[Panel]:
         )
         for row in budgets.load_budget(path)
     ]
-    shown = [
+    cells = [
         tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row)
         for row in rows
     ]
@@ -481,10 +529,10 @@ def budget_panels(path: Path) -> list[Panel]:
         "in the sum",
         "how",
     )
-    words = (
+    caption = (
         "The last row is the root of the sum of squares of those that are in the sum."
     )
-    return [TablePanel("Error of every link", head, shown, words)]
+    return [TablePanel("Error of every link", head, cells, caption)]
 
 
 _PAIRS = (

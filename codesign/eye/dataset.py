@@ -22,12 +22,13 @@ from metalens.core.store import Provenance
 def states_at(
     indices: Tensor, seed: int, *, motion: MotionRanges | None = None
 ) -> EyeStates:
-    """State number i of the endless set of a seed: the same whoever asks for it, alone
-    or among others.
+    """States of given numbers from the endless sequence of a seed.
+
+    State i is the same alone or together with others.
 
     Args:
-        indices: (n,) numbers of the states.
-        motion: ranges of the states; the usual ones without it.
+        indices: (n,) numbers of the states. seed: of the sequence.
+        motion: ranges of the states; the defaults without it.
     """
     parts = [eye.draw_states(1, (seed, int(i)), motion=motion) for i in indices]
     return _joined(parts)
@@ -69,21 +70,21 @@ def ambiguity_pairs(
     camera: PinholeCamera | None = None,
     motion: MotionRanges | None = None,
 ) -> EyeStates:
-    """Pairs of states of one subject with distinct slip and gaze, whose visible pupils
-    have the same centroid within 0.1 pixels (paper Sec. 3.6).
+    """Pairs of states of one subject whose visible pupils have one centroid (Sec. 3.6).
 
-    The second state takes a new slip, 0.8 mm or more away; its gaze is then solved, on
-    the rendered masks, so that the centroid returns. Pairs that need a gaze outside the
-    range, or whose pupil is cut by lid or frame, are left out.
+    Slip and gaze of a pair differ; centroids agree within 0.1 pixels. The second state
+    has a new slip, 0.8 mm or more away; its gaze is solved on the rendered masks to
+    restore the centroid. Pairs that need a gaze outside the range, or whose pupil is
+    cut by lid or frame, are left out.
 
     Args:
-        count: how many. seed: of the random generator.
-        rig: pose of camera and lamps; the default one without it.
-        camera: pixel grid; the default one without it.
-        motion: ranges of the states; the usual ones without it.
+        count: number of pairs. seed: of the random generator.
+        rig: pose of camera and lamps; the default without it.
+        camera: pixel grid; the default without it.
+        motion: ranges of the states; the defaults without it.
 
     Returns:
-        2 ``count`` states, the two of a pair one after the other.
+        2 ``count`` states, the two of a pair consecutive.
 
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
@@ -91,31 +92,31 @@ def ambiguity_pairs(
     rig = rig or CameraRig()
     camera = camera or PinholeCamera()
     motion = motion or MotionRanges()
-    kept: list[EyeStates] = []
-    found = tried = 0
-    while found < count:
-        if tried > 50 * max(found, 64):
+    states: list[EyeStates] = []
+    pairs = tried = 0
+    while pairs < count:
+        if tried > 50 * max(pairs, 64):
             raise SceneError(
-                f"{found} pairs in {tried} tries: widen the gaze range or narrow the slip range"
+                f"{pairs} pairs in {tried} tries: widen the gaze range or narrow the slip range"
             )
-        batch = max(32, count - found)
+        batch = max(32, count - pairs)
         first, second = (
             eye.draw_states(batch, (seed, tried, part), motion=motion)
             for part in (0, 1)
         )
         tried += batch
         second = replace(first, slip_um=second.slip_um)
-        second, good = _returned(first, second, rig=rig, camera=camera)
+        second, good = _with_matching_gaze(first, second, rig=rig, camera=camera)
         limits = torch.tensor([motion.gaze_x_rad, motion.gaze_y_rad])
         good &= (second.gaze_rad.abs() <= limits).all(1)
         good &= (second.slip_um - first.slip_um).norm(dim=1) >= 800.0
-        for row in torch.nonzero(good)[: count - found]:
-            kept += [first[row], second[row]]
-        found = len(kept) // 2
-    return _joined(kept)
+        for row in torch.nonzero(good)[: count - pairs]:
+            states += [first[row], second[row]]
+        pairs = len(states) // 2
+    return _joined(states)
 
 
-def _returned(
+def _with_matching_gaze(
     first: EyeStates,
     second: EyeStates,
     *,
@@ -123,12 +124,18 @@ def _returned(
     camera: PinholeCamera,
     tolerance_px: float = 0.1,
 ) -> tuple[EyeStates, Tensor]:
-    """``second`` with the gaze that brings its centroid to that of ``first``: Newton
-    steps on rendered masks.
+    """``second`` with the gaze whose pupil centroid is that of ``first``, and where it
+    is.
+
+    Newton steps on rendered masks with a Jacobian by central differences, computed once
+    and regularised where nearly singular.
+
+    Returns:
+        states, and (n,) whether centroids agree and both pupils are visible.
     """
     goal = render(first, rig=rig, camera=camera).labels
     gaze, step = second.gaze_rad, 2e-3
-    slopes = torch.stack(
+    jacobian = torch.stack(
         [
             (
                 _centroids(second, gaze + step * way, rig, camera)[0]
@@ -139,27 +146,30 @@ def _returned(
         ],
         2,
     )
-    det = slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]
-    slopes = slopes + torch.where(det.abs() < 1.0, 1e3, 0.0)[:, None, None] * torch.eye(
-        2, dtype=torch.float64
+    determinant = (
+        jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
     )
+    jacobian = jacobian + torch.where(determinant.abs() < 1.0, 1e3, 0.0)[
+        :, None, None
+    ] * torch.eye(2, dtype=torch.float64)
     for _ in range(6):
-        here, visible = _centroids(second, gaze, rig, camera)
-        miss = goal.centroid_px - here
-        if bool((miss.norm(dim=1) < 0.3 * tolerance_px).all()):
+        centroid, visible = _centroids(second, gaze, rig, camera)
+        error = goal.centroid_px - centroid
+        if bool((error.norm(dim=1) < 0.3 * tolerance_px).all()):
             break
-        gaze = gaze + torch.linalg.solve(slopes, miss[..., None])[..., 0].clamp(
+        gaze = gaze + torch.linalg.solve(jacobian, error[..., None])[..., 0].clamp(
             -0.25, 0.25
         )
-    here, visible = _centroids(second, gaze, rig, camera)
-    distance = (goal.centroid_px - here).norm(dim=1)
-    good = (distance <= tolerance_px) & (visible > 0.97) & (goal.visible > 0.97)
-    return replace(second, gaze_rad=gaze), good
+    centroid, visible = _centroids(second, gaze, rig, camera)
+    distance = (goal.centroid_px - centroid).norm(dim=1)
+    matches = (distance <= tolerance_px) & (visible > 0.97) & (goal.visible > 0.97)
+    return replace(second, gaze_rad=gaze), matches
 
 
 def _centroids(
     states: EyeStates, gaze_rad: Tensor, rig: CameraRig, camera: PinholeCamera
 ) -> tuple[Tensor, Tensor]:
+    """(n, 2) pupil centroid in pixels and (n,) visible share, of states at a gaze."""
     labels = render(replace(states, gaze_rad=gaze_rad), rig=rig, camera=camera).labels
     return labels.centroid_px, labels.visible
 

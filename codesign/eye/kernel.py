@@ -32,12 +32,16 @@ TILE, WORDS = PLACE + 2 * SAMPLES * LANES, 2 * SAMPLES * LANES
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _vector(a: Any, at: Any, step: Any) -> Any:
+def _load(a: Any, at: Any, step: Any) -> Any:
+    """(3,) vector stored in ``a`` at ``at``, its components ``step`` apart."""
     return a[at], a[at + step], a[at + 2 * step]
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _put(x: Any, at: Any, v: Any) -> None:
+def _store(x: Any, at: Any, v: Any) -> None:
+    """Write vector ``v`` to lane ``at`` of tile ``x``: one plane of lanes a
+    component.
+    """
     x[at], x[at + LANES], x[at + 2 * LANES] = v
 
 
@@ -47,7 +51,7 @@ def _dot(a: Any, b: Any) -> Any:
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _blended(a: Any, k: Any, b: Any) -> Any:
+def _add_scaled(a: Any, k: Any, b: Any) -> Any:
     """a + k b."""
     return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
 
@@ -58,354 +62,438 @@ def _scaled(k: Any, a: Any) -> Any:
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _unit(x: Any) -> Any:
+def _clip01(x: Any) -> Any:
+    """x clipped to [0, 1]."""
     return min(max(x, f32(0)), f32(1))
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _step(x: Any) -> Any:
-    """Smooth step from 0 at x = -1 to 1 at x = 1."""
-    t = _unit(f32(0.5) + f32(0.5) * x)
+def _smooth_step(x: Any) -> Any:
+    """Cubic step t² (3 - 2 t), t = (1 + x) / 2: 0 at x = -1, 1 at x = 1."""
+    t = _clip01(f32(0.5) + f32(0.5) * x)
     return t * t * (f32(3) - f32(2) * t)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _bell(x: Any) -> Any:
+def _lorentzian(x: Any) -> Any:
     """1 / (1 + x²)."""
     return f32(1) / (f32(1) + x * x)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _root(x: Any, least: Any) -> Any:
+def _bounded_sqrt(x: Any, least: Any) -> Any:
+    """sqrt(max(x, least))."""
     return math.sqrt(max(x, f32(least)))
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _locate(index: Any, u: Any, v: Any, x: Any, words: Any, k: Any, lane: Any) -> None:
-    """Note the texture pixels about (u, v) for sample k, and the parts of a pixel.
+def _texture_indices(
+    index: Any, u: Any, v: Any, x: Any, words: Any, k: Any, lane: Any
+) -> None:
+    """Indices and fractions for bilinear sample ``k`` of one texture at (u, v) pixels.
 
-    Textures repeat; their size is a power of two. The casts keep numba from widening to
-    64 bits.
+    Writes to ``words`` the flat indices of the pixels at (floor u, floor v) and one row
+    below, and to ``x[PLACE + ...]`` the fractions u - floor(u), v - floor(v). ``index``
+    is the number of the texture in the bank.
+
+    Textures are periodic; their size is a power of two. The casts keep numba from
+    widening to 64 bits.
     """
     first, last = i32(index) * i32(SIZE * SIZE), i32(SIZE - 1)
     fu, fv = np.floor(u), np.floor(v)
     i, j = i32(i32(fu) & last), i32(i32(fv) & last)
     below = i32(i32(j + i32(1)) & last)
-    at = 2 * k * LANES + lane
-    words[at] = i32(first + i32(i32(j * i32(SIZE)) + i))
-    words[at + LANES] = i32(first + i32(i32(below * i32(SIZE)) + i))
-    x[PLACE + at], x[PLACE + at + LANES] = u - fu, v - fv
+    slot = 2 * k * LANES + lane
+    words[slot] = i32(first + i32(i32(j * i32(SIZE)) + i))
+    words[slot + LANES] = i32(first + i32(i32(below * i32(SIZE)) + i))
+    x[PLACE + slot], x[PLACE + slot + LANES] = u - fu, v - fv
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _look_up(t: Any, words: Any, samples: Any) -> None:
-    """Put pairs of texture pixels (:func:`codesign.eye.textures.packed_bank`) in place
-    of where they are.
+def _fetch_texels(t: Any, words: Any, samples: Any) -> None:
+    """Replace texel indices in ``words`` by the packed texel pairs of bank ``t``.
+
+    A pair is a pixel and its right neighbour, as in
+    :func:`codesign.eye.textures.packed_bank`.
     """
     for at in range(2 * samples * LANES):
         words[at] = t[np.uint32(words[at])]
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _sampled(x: Any, words: Any, k: Any, lane: Any) -> Any:
-    """Sample k, blended between four pixels by smooth steps."""
-    at, half = 2 * k * LANES + lane, i32(16)
-    s, t = x[PLACE + at], x[PLACE + at + LANES]
-    top, bottom = words[at], words[at + LANES]
-    a, b = f32(i32(i32(top << half) >> half)), f32(i32(top >> half))
-    c = f32(i32(i32(bottom << half) >> half))
-    d = f32(i32(bottom >> half))
-    s, t = s * s * (f32(3) - f32(2) * s), t * t * (f32(3) - f32(2) * t)
-    above, below = a + (b - a) * s, c + (d - c) * s
+def _interpolate_texel(x: Any, words: Any, k: Any, lane: Any) -> Any:
+    """Value of texture sample ``k`` in [-1, 1], interpolated between four texels.
+
+    The weights are cubic steps t² (3 - 2 t) of the fractions. Each int32 of ``words``
+    holds a texel in its low 16 bits and the right neighbour in its high 16 bits.
+    """
+    slot = 2 * k * LANES + lane
+    bits = i32(16)
+    s, t = x[PLACE + slot], x[PLACE + slot + LANES]
+    top, bottom = words[slot], words[slot + LANES]
+    top_left = f32(i32(i32(top << bits) >> bits))
+    top_right = f32(i32(top >> bits))
+    bottom_left = f32(i32(i32(bottom << bits) >> bits))
+    bottom_right = f32(i32(bottom >> bits))
+    s = s * s * (f32(3) - f32(2) * s)
+    t = t * t * (f32(3) - f32(2) * t)
+    above = top_left + (top_right - top_left) * s
+    below = bottom_left + (bottom_right - bottom_left) * s
     return (above + (below - above) * t) * f32(1 / STEPS)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _sphere(centre: Any, radius: Any, least: Any, d: Any) -> Any:
-    """Distance at which a ray meets a sphere, what lies under the root, and the
-    direction there from its centre; :data:`least` keeps the root real.
+def _intersect_sphere(centre: Any, radius: Any, least: Any, d: Any) -> Any:
+    """First intersection of the ray s d from the origin with a sphere.
+
+    Returns: distance s in um, discriminant r² - |c - (c·d) d|² in um², unit normal
+    there. The discriminant is at least ``least`` under the square root, so that s is
+    real.
     """
-    b = _dot(centre, d)
-    off = _blended(centre, -b, d)
-    free = radius * radius - _dot(off, off)
-    s = b - _root(free, least)
-    return s, free, _scaled(f32(1) / radius, _blended(_scaled(s, d), f32(-1), centre))
+    along = _dot(centre, d)
+    closest = _add_scaled(centre, -along, d)
+    discriminant = radius * radius - _dot(closest, closest)
+    distance = along - _bounded_sqrt(discriminant, least)
+    out = _add_scaled(_scaled(distance, d), f32(-1), centre)
+    return distance, discriminant, _scaled(f32(1) / radius, out)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _lids(p: Any, d: Any) -> Any:
-    """Front of the face: lid shell and face plane in a smooth union.
+def _intersect_face(p: Any, d: Any) -> Any:
+    """Intersection of the ray s d with the face: smooth minimum of lid shell and plane.
 
-    Returns: distance, openness of the lids (1 where the eye is seen), face coordinates
-    x and y, gap to the upper and lower margin (above 0 inside the opening), normal.
+    The smooth minimum blends both distances over ``p.blend`` um.
+
+    Returns: distance in um; openness of the lids, 1 where the eye is visible; face
+    coordinates x and y in um; gap to the upper and to the lower lid margin in um, above
+    0 inside the opening; unit normal.
     """
-    shell = _sphere(p.centre, p.lid_r, 1e6, d)[0]
+    shell = _intersect_sphere(p.centre, p.lid_r, 1e6, d)[0]
     facing = max(-_dot(d, p.face_z), f32(0.05))
     plane = -_dot(p.plane, p.face_z) / facing
-    h = _unit(f32(0.5) + f32(0.5) * (plane - shell) / p.blend)
-    s = plane + (shell - plane) * h - f32(0.5) * p.blend * h * (f32(1) - h)
-    q = _blended(_scaled(s, d), f32(-1), p.centre)
-    n = _blended(_scaled(h / p.lid_r, q), f32(1) - h, p.face_z)
-    n = _scaled(f32(1) / math.sqrt(_dot(n, n) + f32(1e-6)), n)
-    gx, gy = _dot(q, p.face_x), _dot(q, p.face_y)
-    along = (gx - p.middle) / p.half
-    arch = f32(1) - along * along
-    upper = gy + arch * (p.upper + p.skew * along)
-    lower = arch * (p.lower - p.skew * along) - gy
-    edges = _step(upper / p.edge) * _step(lower / p.edge)
-    return s, edges * _step((upper + lower) / p.edge - f32(1)), gx, gy, upper, lower, n
+    share = _clip01(f32(0.5) + f32(0.5) * (plane - shell) / p.blend)
+    distance = (
+        plane + (shell - plane) * share - f32(0.5) * p.blend * share * (f32(1) - share)
+    )
+    point = _add_scaled(_scaled(distance, d), f32(-1), p.centre)
+    normal = _add_scaled(_scaled(share / p.lid_r, point), f32(1) - share, p.face_z)
+    normal = _scaled(f32(1) / math.sqrt(_dot(normal, normal) + f32(1e-6)), normal)
+    gx, gy = _dot(point, p.face_x), _dot(point, p.face_y)
+    across = (gx - p.middle) / p.half
+    arch = f32(1) - across * across
+    upper = gy + arch * (p.upper + p.skew * across)
+    lower = arch * (p.lower - p.skew * across) - gy
+    edges = _smooth_step(upper / p.edge) * _smooth_step(lower / p.edge)
+    openness = edges * _smooth_step((upper + lower) / p.edge - f32(1))
+    return distance, openness, gx, gy, upper, lower, normal
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _ambient(p: Any, n: Any) -> Any:
-    """Diffuse irradiance: more from above than from below."""
+def _ambient_irradiance(p: Any, n: Any) -> Any:
+    """Diffuse irradiance a (0.6 - 0.4 n·y): larger from above than from below."""
     return p.ambient * (f32(0.6) - f32(0.4) * _dot(n, p.face_y))
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _lamp(light: Any, at: Any, n: Any, wrap: Any) -> Any:
-    """Irradiance of a surface by a small lamp, 1 at 20 mm straight on; it wraps around
+def _lamp_irradiance(light: Any, at: Any, n: Any, wrap: Any) -> Any:
+    """Irradiance of a surface of normal ``n`` at ``at`` by a point lamp at ``light``.
+
+    max(cos + wrap, 0) (20 mm / r)²: 1 at 20 mm and normal incidence. ``wrap`` softens
     the terminator.
     """
-    v = _blended(light, f32(-1), at)
-    k = f32(1) / math.sqrt(_dot(v, v) + f32(1e6))
-    return max(_dot(v, n) * k + wrap, f32(0)) * (k * k * f32(4e8))
+    to_lamp = _add_scaled(light, f32(-1), at)
+    inverse_distance = f32(1) / math.sqrt(_dot(to_lamp, to_lamp) + f32(1e6))
+    return max(_dot(to_lamp, n) * inverse_distance + wrap, f32(0)) * (
+        inverse_distance * inverse_distance * f32(4e8)
+    )
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _lit_by(p: Any, at: Any, n: Any, wrap: Any) -> Any:
-    """Irradiance of a surface of normal n by the three lamps and from above."""
-    light = _lamp(p.lamp_a, at, n, wrap) + _lamp(p.lamp_b, at, n, wrap)
-    light += _lamp(p.lamp_c, at, n, wrap)
-    return light / (f32(1) + wrap) + _ambient(p, n)
+def _total_irradiance(p: Any, at: Any, n: Any, wrap: Any) -> Any:
+    """Irradiance of a surface of normal ``n`` at ``at``: lamps and ambient light."""
+    light = _lamp_irradiance(p.lamp_a, at, n, wrap)
+    light += _lamp_irradiance(p.lamp_b, at, n, wrap)
+    light += _lamp_irradiance(p.lamp_c, at, n, wrap)
+    return light / (f32(1) + wrap) + _ambient_irradiance(p, n)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _skin(p: Any, s: Any, d: Any, n: Any, face: Any, pictures: Any) -> Any:
-    """Radiance of skin, lid margins, creases, lashes and brow at distance ``s``."""
+def _skin_radiance(
+    p: Any, distance: Any, d: Any, n: Any, face: Any, pictures: Any
+) -> Any:
+    """Radiance of skin, lid margins, creases, lashes and brow at ``distance`` along d.
+
+    ``face``: face coordinates x, y and gaps to the upper and lower margin, um.
+    ``pictures``: samples of coarse skin, pores, upper and lower lashes, each in [-1,
+    1].
+    """
     gx, gy, upper, lower = face
-    coarse, fine, hair, short = pictures
+    coarse, fine, upper_lash, lower_lash = pictures
     fold = (upper + p.crease + f32(160) * coarse) / f32(260)
     pouch = (lower + f32(2600) + f32(350) * coarse) / f32(420)
     rim_up = (upper + f32(250)) / f32(260)
     rim_low = (lower + f32(330)) / f32(330)
     albedo = p.skin * (f32(1) + p.pores * (coarse + f32(0.7) * fine))
-    albedo *= (f32(1) - f32(0.42) * _bell(fold)) * (f32(1) - f32(0.20) * _bell(pouch))
-    albedo *= f32(1) - f32(0.25) * _bell(rim_up)
-    albedo += f32(0.10) * _bell(rim_low * rim_low)
-    hair *= _step(_unit(-upper / f32(3800)) * f32(20) - f32(1))
-    short *= _step(_unit(-lower / f32(2600)) * f32(8) - f32(1))
-    lash = _unit(p.lashes * (hair + f32(0.5) * short))
+    albedo *= (f32(1) - f32(0.42) * _lorentzian(fold)) * (
+        f32(1) - f32(0.20) * _lorentzian(pouch)
+    )
+    albedo *= f32(1) - f32(0.25) * _lorentzian(rim_up)
+    albedo += f32(0.10) * _lorentzian(rim_low * rim_low)
+    upper_lash *= _smooth_step(_clip01(-upper / f32(3800)) * f32(20) - f32(1))
+    lower_lash *= _smooth_step(_clip01(-lower / f32(2600)) * f32(8) - f32(1))
+    lash = _clip01(p.lashes * (upper_lash + f32(0.5) * lower_lash))
     band = (gy + f32(17000) + gx * gx / f32(60000)) / f32(2600)
-    brow = _unit(p.brow * (f32(0.8) + f32(1.6) * fine) * _bell(band * band))
+    brow = _clip01(p.brow * (f32(0.8) + f32(1.6) * fine) * _lorentzian(band * band))
     albedo *= (f32(1) - f32(0.85) * lash) * (f32(1) - f32(0.75) * brow)
-    return albedo * _lit_by(p, _scaled(s, d), n, f32(0.35)) * p.gain
+    return albedo * _total_irradiance(p, _scaled(distance, d), n, f32(0.35)) * p.gain
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _refract(p: Any, tc: Any, n: Any, d: Any) -> Any:
-    """Where the refracted ray meets the iris plane, in iris coordinates, and its path
-    inside the eye.
+def _refract_to_iris(p: Any, tc: Any, n: Any, d: Any) -> Any:
+    """Intersection of the refracted ray with the iris plane, and its path inside, um.
 
-    Rays that meet the plane at a glancing angle are held at a slope of 0.05: they land
-    far outside the iris.
+    Snell's law at the cornea, distance ``tc`` along ray ``d``, of normal ``n``. Returns
+    iris coordinates x and y and the path.
+
+    Rays at a glancing angle to the plane have their slope set to 0.05: they land well
+    outside the iris.
     """
     eta = f32(1) / p.index
-    c = -_dot(n, d)
-    k = eta * c - _root(f32(1) - eta * eta * (f32(1) - c * c), 1e-4)
-    r = _blended(_scaled(eta, d), k, n)
-    f = _blended(_scaled(tc, d), f32(-1), _blended(p.centre, p.pupil_d, p.axis))
-    slope = max(-_dot(r, p.axis), f32(0.05))
-    path = max(_dot(f, p.axis) / slope, f32(0))
-    g = _blended(f, path, r)
-    return _dot(g, p.iris_x), _dot(g, p.iris_y), path
+    cosine = -_dot(n, d)
+    bend = eta * cosine - _bounded_sqrt(
+        f32(1) - eta * eta * (f32(1) - cosine * cosine), 1e-4
+    )
+    ray = _add_scaled(_scaled(eta, d), bend, n)
+    offset = _add_scaled(
+        _scaled(tc, d), f32(-1), _add_scaled(p.centre, p.pupil_d, p.axis)
+    )
+    slope = max(-_dot(ray, p.axis), f32(0.05))
+    path = max(_dot(offset, p.axis) / slope, f32(0))
+    hit = _add_scaled(offset, path, ray)
+    return _dot(hit, p.iris_x), _dot(hit, p.iris_y), path
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _sclera(p: Any, gx: Any, gy: Any, lower: Any, r: Any, met: Any, vein: Any) -> Any:
-    """Albedo of sclera, vessels, limbal ring, caruncle and tear film; ``r`` is from the
-    axis in the iris plane.
+def _sclera_albedo(
+    p: Any, gx: Any, gy: Any, lower: Any, r: Any, cornea: Any, vein: Any
+) -> Any:
+    """Albedo of sclera, vessels, limbal ring, caruncle and tear film.
+
+    ``gx, gy``: face coordinates, um. ``lower``: gap to the lower margin, um. ``r``:
+    distance from the optic axis in the iris plane, um. ``cornea``: share of the cornea,
+    1 in front of the limbus. ``vein``: texture sample.
     """
-    ring = f32(0.25) * met * _bell((r - p.limbus_r) / f32(1300))
+    ring = f32(0.25) * cornea * _lorentzian((r - p.limbus_r) / f32(1300))
     white = p.sclera * (f32(1) - p.veins * vein) * (f32(1) - ring)
     x, y = gx - p.caruncle, gy - f32(500)
-    flesh = (x * x + y * y) / f32(3.2e6)
+    radius2 = (x * x + y * y) / f32(3.2e6)
     red = f32(0.8) * p.skin * (f32(1) + f32(0.3) * vein)
-    white += (red - white) / (f32(1) + flesh * flesh * flesh)
+    white += (red - white) / (f32(1) + radius2 * radius2 * radius2)
     tear = (lower - f32(120)) / f32(150)
-    return white + f32(0.12) * _bell(tear * tear)
+    return white + f32(0.12) * _lorentzian(tear * tear)
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _mirrored(light: Any, at: Any, n: Any, d: Any, sharp: Any) -> Any:
-    """Reflection of a lamp: a lobe about the mirror direction, of peak 1."""
-    v = _blended(light, f32(-1), at)
-    k = f32(1) / math.sqrt(_dot(v, v) + f32(1e6))
-    h = _blended(_scaled(k, v), f32(-1), d)
-    along = max(_dot(h, n), f32(0))
-    apart = f32(1) - along * along / (_dot(h, h) + f32(1e-3))
-    off = f32(1) + sharp * f32(0.5) * apart
-    return f32(1) / (off * off)
+def _specular_lobe(light: Any, at: Any, n: Any, d: Any, sharp: Any) -> Any:
+    """Reflection of a lamp by a glossy surface: 1 / (1 + sharp sin² / 2)², peak 1.
+
+    The angle is between the normal and the half vector of lamp and camera directions.
+    """
+    to_lamp = _add_scaled(light, f32(-1), at)
+    inverse_distance = f32(1) / math.sqrt(_dot(to_lamp, to_lamp) + f32(1e6))
+    half = _add_scaled(_scaled(inverse_distance, to_lamp), f32(-1), d)
+    cosine = max(_dot(half, n), f32(0))
+    sine2 = f32(1) - cosine * cosine / (_dot(half, half) + f32(1e-3))
+    fall = f32(1) + sharp * f32(0.5) * sine2
+    return f32(1) / (fall * fall)
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_face(p: Any, x: Any) -> None:
+    """Rays of the tile, and where they meet the face: distance, normal, lid gaps,
+    openness.
+    """
     for i in range(LANES):
         u, w = x[U + i], x[W + i]
-        k = f32(1) / math.sqrt(u * u + w * w + f32(1))
-        d = u * k, w * k, k
-        s, seen, gx, gy, upper, lower, n = _lids(p, d)
-        _put(x, D + i, d)
-        _put(x, N + i, n)
-        x[S + i], x[SEEN + i], x[BARE + i], x[FRONT + i] = s, seen, f32(1) - seen, s * k
-        x[GX + i], x[GY + i], x[UPPER + i], x[LOWER + i] = gx, gy, upper, lower
+        cosine = f32(1) / math.sqrt(u * u + w * w + f32(1))
+        d = u * cosine, w * cosine, cosine
+        distance, openness, gx, gy, upper, lower, n = _intersect_face(p, d)
+        _store(x, D + i, d)
+        _store(x, N + i, n)
+        x[S + i] = distance
+        x[SEEN + i] = openness
+        x[BARE + i] = f32(1) - openness
+        x[FRONT + i] = distance * cosine
+        x[GX + i] = gx
+        x[GY + i] = gy
+        x[UPPER + i] = upper
+        x[LOWER + i] = lower
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_skin(p: Any, t: Any, x: Any, words: Any) -> None:
+    """Radiance of the near sheet, times its coverage, from four texture samples."""
     for i in range(LANES):
         gx, gy = x[GX + i], x[GY + i]
         coarse_u, coarse_v = gx * f32(0.010), gy * f32(0.012)
         fine_u, fine_v = gx * f32(0.030), gy * f32(0.036)
-        hair = f32(255) * _unit(-x[UPPER + i] / f32(3800))
-        short = f32(255) * _unit(-x[LOWER + i] / f32(2600))
-        a, b = p.offset_x, p.offset_y
-        _locate(p.t_skin, coarse_u + a, coarse_v + b, x, words, 0, i)
-        _locate(p.t_fine, fine_u + b, fine_v + a, x, words, 1, i)
-        _locate(p.t_lash, gx * f32(0.016) + a, hair, x, words, 2, i)
-        _locate(p.t_lash, gx * f32(0.011) + b, short, x, words, 3, i)
-    _look_up(t, words, 4)
+        upper_row = f32(255) * _clip01(-x[UPPER + i] / f32(3800))
+        lower_row = f32(255) * _clip01(-x[LOWER + i] / f32(2600))
+        shift_x, shift_y = p.offset_x, p.offset_y
+        _texture_indices(
+            p.t_skin, coarse_u + shift_x, coarse_v + shift_y, x, words, 0, i
+        )
+        _texture_indices(p.t_fine, fine_u + shift_y, fine_v + shift_x, x, words, 1, i)
+        _texture_indices(p.t_lash, gx * f32(0.016) + shift_x, upper_row, x, words, 2, i)
+        _texture_indices(p.t_lash, gx * f32(0.011) + shift_y, lower_row, x, words, 3, i)
+    _fetch_texels(t, words, 4)
     for i in range(LANES):
-        d, n = _vector(x, D + i, LANES), _vector(x, N + i, LANES)
+        d, n = _load(x, D + i, LANES), _load(x, N + i, LANES)
         face = x[GX + i], x[GY + i], x[UPPER + i], x[LOWER + i]
         pictures = (
-            _sampled(x, words, 0, i),
-            _sampled(x, words, 1, i),
-            _sampled(x, words, 2, i),
-            _sampled(x, words, 3, i),
+            _interpolate_texel(x, words, 0, i),
+            _interpolate_texel(x, words, 1, i),
+            _interpolate_texel(x, words, 2, i),
+            _interpolate_texel(x, words, 3, i),
         )
-        x[NEAR + i] = _skin(p, x[S + i], d, n, face, pictures) * x[BARE + i]
+        x[NEAR + i] = _skin_radiance(p, x[S + i], d, n, face, pictures) * x[BARE + i]
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_globe(p: Any, x: Any) -> None:
-    """Where rays meet sclera and cornea; ``INSIDE`` is 1 in front of the limbus."""
-    ball = _blended(p.centre, p.cornea_d, p.axis)
+    """Intersections of the rays with sclera and cornea: distances, normals, cornea
+    share.
+
+    ``INSIDE`` is the cornea's share of a pixel: 1 in front of the limbus.
+    """
+    cornea_centre = _add_scaled(p.centre, p.cornea_d, p.axis)
     for i in range(LANES):
-        d = _vector(x, D + i, LANES)
-        ts, _, m = _sphere(p.centre, p.sclera_r, 1e6, d)
-        tc, free, c = _sphere(ball, p.cornea_r, 1e4, d)
+        d = _load(x, D + i, LANES)
+        ts, _, m = _intersect_sphere(p.centre, p.sclera_r, 1e6, d)
+        tc, free, c = _intersect_sphere(cornea_centre, p.cornea_r, 1e4, d)
         forward = _dot(c, p.axis) * p.cornea_r + p.cornea_d - p.limbus_d
-        met = _step(forward / (f32(2) * p.edge)) * _unit(free / f32(2e5))
-        _put(x, M + i, m)
-        _put(x, C + i, c)
-        x[TS + i], x[TC + i], x[INSIDE + i] = ts, tc, met
+        cornea = _smooth_step(forward / (f32(2) * p.edge)) * _clip01(free / f32(2e5))
+        _store(x, M + i, m)
+        _store(x, C + i, c)
+        x[TS + i], x[TC + i], x[INSIDE + i] = ts, tc, cornea
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_iris(p: Any, t: Any, x: Any, words: Any) -> None:
-    """Shares of iris and pupil, distance from the axis, albedo, and how far behind the
-    cornea the virtual image lies; the picture stretches with the pupil.
+    """Shares of iris and pupil, iris albedo, and depth of the virtual image behind the
+    cornea.
+
+    The refracted path s appears at s / (n - (n - 1) s / R) (paraxial refraction at the
+    cornea of radius R and index n). The texture stretches with the pupil.
     """
-    wide = max(p.limbus_r - p.pupil_r, f32(300))
+    width = max(p.limbus_r - p.pupil_r, f32(300))
     for i in range(LANES):
-        d, c = _vector(x, D + i, LANES), _vector(x, C + i, LANES)
-        a, b, path = _refract(p, x[TC + i], c, d)
+        d, c = _load(x, D + i, LANES), _load(x, C + i, LANES)
+        a, b, path = _refract_to_iris(p, x[TC + i], c, d)
         r = math.sqrt(a * a + b * b + f32(1))
         rim = f32(3) * p.edge + f32(120)
-        disc = x[INSIDE + i] * _step((p.limbus_r - r) / rim)
+        disc = x[INSIDE + i] * _smooth_step((p.limbus_r - r) / rim)
         x[DISC + i], x[R + i] = disc, r
-        x[PUPIL + i] = disc * _step((p.pupil_r - r) / p.edge)
-        bent = p.index - (p.index - f32(1)) * path / p.cornea_r
-        x[VIRTUAL + i] = path / bent
-        span = _unit((r - p.pupil_r) / wide)
-        place = (f32(40) + f32(84) * span) / r
-        u, v = a * place, b * place
+        x[PUPIL + i] = disc * _smooth_step((p.pupil_r - r) / p.edge)
+        denominator = p.index - (p.index - f32(1)) * path / p.cornea_r
+        x[VIRTUAL + i] = path / denominator
+        span = _clip01((r - p.pupil_r) / width)
+        scale = (f32(40) + f32(84) * span) / r
+        u, v = a * scale, b * scale
         across = f32(128) + p.turn_x * u - p.turn_y * v
         down = f32(128) + p.turn_y * u + p.turn_x * v
-        _locate(p.t_iris, across, down, x, words, 0, i)
-    _look_up(t, words, 1)
+        _texture_indices(p.t_iris, across, down, x, words, 0, i)
+    _fetch_texels(t, words, 1)
     for i in range(LANES):
-        span = _unit((x[R + i] - p.pupil_r) / wide)
-        outer = f32(0.45) * _step((span - f32(0.94)) * f32(9))
-        inner = f32(0.35) * _step((f32(0.03) - span) * f32(25))
-        figure = f32(1) + p.iris_contrast * _sampled(x, words, 0, i)
-        x[BROWN + i] = p.iris * figure * (f32(1) - outer) * (f32(1) - inner)
+        span = _clip01((x[R + i] - p.pupil_r) / width)
+        outer = f32(0.45) * _smooth_step((span - f32(0.94)) * f32(9))
+        inner = f32(0.35) * _smooth_step((f32(0.03) - span) * f32(25))
+        pattern = f32(1) + p.iris_contrast * _interpolate_texel(x, words, 0, i)
+        x[BROWN + i] = p.iris * pattern * (f32(1) - outer) * (f32(1) - inner)
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_sclera(p: Any, t: Any, x: Any, words: Any) -> None:
+    """Albedo of the white of the eye, with its vessel texture."""
     for i in range(LANES):
-        m = _vector(x, M + i, LANES)
+        m = _load(x, M + i, LANES)
         u = _dot(m, p.iris_x) * f32(190) + p.offset_x
         v = _dot(m, p.iris_y) * f32(190) + p.offset_y
-        _locate(p.t_vein, u, v, x, words, 0, i)
-    _look_up(t, words, 1)
+        _texture_indices(p.t_vein, u, v, x, words, 0, i)
+    _fetch_texels(t, words, 1)
     for i in range(LANES):
-        vein = _sampled(x, words, 0, i)
+        vein = _interpolate_texel(x, words, 0, i)
         gx, gy, lower = x[GX + i], x[GY + i], x[LOWER + i]
-        x[WHITE + i] = _sclera(p, gx, gy, lower, x[R + i], x[INSIDE + i], vein)
+        x[WHITE + i] = _sclera_albedo(p, gx, gy, lower, x[R + i], x[INSIDE + i], vein)
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_light(p: Any, x: Any) -> None:
-    """Radiance of the eye from its albedos and shares, under the lamps and below the
-    lids, and the depth of what is seen: of the iris, its virtual image.
+    """Radiance and depth of the far sheet (the eye), and visible share of the pupil.
+
+    Lambert shading of the albedos by the lamps, darkened below the lids, plus glints.
+    The depth of the iris is that of its virtual image.
     """
     for i in range(LANES):
-        met, disc, pupil = x[INSIDE + i], x[DISC + i], x[PUPIL + i]
-        d = _vector(x, D + i, LANES)
-        m = _vector(x, M + i, LANES)
-        c = _vector(x, C + i, LANES)
-        ts, tc, seen = x[TS + i], x[TC + i], x[SEEN + i]
-        near = _scaled(ts + met * (tc - ts), d)
-        n = _blended(_scaled(f32(1) - met, m), met, c)
-        sharp = f32(250) + f32(1750) * met
-        shine = _mirrored(p.lamp_a, near, n, d, sharp)
-        shine += _mirrored(p.lamp_b, near, n, d, sharp)
-        outer = _lit_by(p, near, n, f32(0.3))
-        inner = _lit_by(p, near, p.axis, f32(0.15))
-        lid = f32(1) + max(x[UPPER + i], f32(0)) / f32(900)
-        low = f32(1) + max(x[LOWER + i], f32(0)) / f32(500)
-        dim = f32(1) - f32(0.50) / (lid * lid) - f32(0.15) / low
+        cornea, disc, pupil = x[INSIDE + i], x[DISC + i], x[PUPIL + i]
+        d = _load(x, D + i, LANES)
+        m = _load(x, M + i, LANES)
+        c = _load(x, C + i, LANES)
+        ts, tc, openness = x[TS + i], x[TC + i], x[SEEN + i]
+        point = _scaled(ts + cornea * (tc - ts), d)
+        normal = _add_scaled(_scaled(f32(1) - cornea, m), cornea, c)
+        sharp = f32(250) + f32(1750) * cornea
+        specular = _specular_lobe(p.lamp_a, point, normal, d, sharp)
+        specular += _specular_lobe(p.lamp_b, point, normal, d, sharp)
+        outer = _total_irradiance(p, point, normal, f32(0.3))
+        inner = _total_irradiance(p, point, p.axis, f32(0.15))
+        upper_gap = f32(1) + max(x[UPPER + i], f32(0)) / f32(900)
+        lower_gap = f32(1) + max(x[LOWER + i], f32(0)) / f32(500)
+        occlusion = f32(1) - f32(0.50) / (upper_gap * upper_gap) - f32(0.15) / lower_gap
         stroma = x[BROWN + i] * inner * (f32(1) - pupil / max(disc, f32(1e-3)))
-        lit = x[WHITE + i] * outer * (f32(1) - disc) + disc * stroma
-        lit = (lit + p.pupil * pupil) * dim
-        x[FAR + i] = (lit + p.glint * shine) * p.gain * seen
+        radiance = x[WHITE + i] * outer * (f32(1) - disc) + disc * stroma
+        radiance = (radiance + p.pupil * pupil) * occlusion
+        x[FAR + i] = (radiance + p.glint * specular) * p.gain * openness
         x[BACK + i] = (ts + disc * (tc + x[VIRTUAL + i] - ts)) * d[2]
-        x[HOLE + i] = pupil * seen
+        x[HOLE + i] = pupil * openness
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _extremes(x: Any, at: Any) -> Any:
-    """Least and largest of a quantity over the tile."""
-    least = most = x[at]
+def _tile_range(x: Any, at: Any) -> Any:
+    """Least and largest value over the tile of the quantity at offset ``at``."""
+    least = largest = x[at]
     for i in range(1, LANES):
-        least, most = min(least, x[at + i]), max(most, x[at + i])
-    return least, most
+        least, largest = min(least, x[at + i]), max(largest, x[at + i])
+    return least, largest
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade(p: Any, t: Any, x: Any, words: Any) -> None:
-    """All passes over a tile, each where a pixel needs it; what is left out is 0."""
+    """Shade one tile: every pass runs only if some pixel needs it; the others leave 0.
+
+    ``p``: parameters of the frame. ``t``: packed texture bank. ``x``: planes of the
+    tile, float32. ``words``: texel scratch, int32.
+    """
     for i in range(NEAR, PLACE):
         x[i] = f32(0)
     _shade_face(p, x)
-    least, most = _extremes(x, SEEN)
+    least, largest = _tile_range(x, SEEN)
     if least < f32(1):
         _shade_skin(p, t, x, words)
-    if most > f32(0):
+    if largest > f32(0):
         _shade_globe(p, x)
-        if _extremes(x, INSIDE)[1] > f32(0):
+        if _tile_range(x, INSIDE)[1] > f32(0):
             _shade_iris(p, t, x, words)
-        if _extremes(x, DISC)[0] < f32(1):
+        if _tile_range(x, DISC)[0] < f32(1):
             _shade_sclera(p, t, x, words)
         _shade_light(p, x)
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _copy_out(x: Any, at: Any, out: Any, row: Any, column: Any) -> None:
-    """The part of a tile's lanes that lies in the frame, to a plane (y, x)."""
+    """Copy the plane at offset ``at`` of a tile to (y, x) of ``out``, clipped to the
+    frame.
+    """
     for j in range(min(ROWS, out.shape[0] - row)):
         for i in range(min(COLUMNS, out.shape[1] - column)):
             out[row + j, column + i] = x[at + j * COLUMNS + i]
@@ -416,9 +504,9 @@ def _unpack(row: Any) -> Any:
     """The parameters of a frame by name."""
     v = row
     return Parameters(  # type: ignore[call-arg]
-        _vector(v, 0, 1), _vector(v, 3, 1), _vector(v, 6, 1), _vector(v, 9, 1),
-        _vector(v, 12, 1), _vector(v, 15, 1), _vector(v, 18, 1), _vector(v, 21, 1),
-        _vector(v, 24, 1), _vector(v, 27, 1), _vector(v, 30, 1),
+        _load(v, 0, 1), _load(v, 3, 1), _load(v, 6, 1), _load(v, 9, 1),
+        _load(v, 12, 1), _load(v, 15, 1), _load(v, 18, 1), _load(v, 21, 1),
+        _load(v, 24, 1), _load(v, 27, 1), _load(v, 30, 1),
         v[33], v[34], v[35], v[36], v[37], v[38], v[39], v[40], v[41], v[42], v[43],
         v[44], v[45], v[46], v[47], v[48], v[49], v[50], v[51], v[52], v[53], v[54],
         v[55], v[56], v[57], v[58], v[59], v[60], v[61], v[62], v[63], v[64], v[65],
@@ -431,7 +519,10 @@ def frames(
     first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array,
     w: Array, light: Array, cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip
-    """Strips of frames from the first to before the end; see :func:`render_rows`.
+    """Render jobs ``first`` to ``end`` - 1, each a strip of ROWS rows of one frame.
+
+    Job number j is strip j mod S of frame j // S, of S strips a frame. See
+    :func:`render_rows`.
 
     Args:
         parameters: (n, COUNT) of the frames. scale: (n,) factor of the depths.
@@ -441,48 +532,49 @@ def frames(
         pupil: (n, 1, y, x) share of pupil to fill.
     """
     strips = (len(w) + ROWS - 1) // ROWS
-    x, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
+    tile, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
     for job in range(first, end):
-        n, row = job // strips, job % strips * ROWS
-        p = _unpack(parameters[n])
+        frame, row = job // strips, job % strips * ROWS
+        named = _unpack(parameters[frame])
         for column in range(0, len(u), COLUMNS):
             for j in range(ROWS):  # beyond the frame its last row and column repeat
                 for i in range(COLUMNS):
-                    x[U + j * COLUMNS + i] = u[min(column + i, len(u) - 1)]
-                    x[W + j * COLUMNS + i] = w[min(row + j, len(w) - 1)]
-            _shade(p, bank, x, words)
+                    tile[U + j * COLUMNS + i] = u[min(column + i, len(u) - 1)]
+                    tile[W + j * COLUMNS + i] = w[min(row + j, len(w) - 1)]
+            _shade(named, bank, tile, words)
             for i in range(LANES):
-                x[FRONT + i] *= scale[n]
-                x[BACK + i] *= scale[n]
-            _copy_out(x, NEAR, light[n, 0], row, column)
-            _copy_out(x, FAR, light[n, 1], row, column)
-            _copy_out(x, BARE, cover[n, 0], row, column)
-            _copy_out(x, SEEN, cover[n, 1], row, column)
-            _copy_out(x, FRONT, depth[n, 0], row, column)
-            _copy_out(x, BACK, depth[n, 1], row, column)
-            _copy_out(x, HOLE, pupil[n, 0], row, column)
+                tile[FRONT + i] *= scale[frame]
+                tile[BACK + i] *= scale[frame]
+            _copy_out(tile, NEAR, light[frame, 0], row, column)
+            _copy_out(tile, FAR, light[frame, 1], row, column)
+            _copy_out(tile, BARE, cover[frame, 0], row, column)
+            _copy_out(tile, SEEN, cover[frame, 1], row, column)
+            _copy_out(tile, FRONT, depth[frame, 0], row, column)
+            _copy_out(tile, BACK, depth[frame, 1], row, column)
+            _copy_out(tile, HOLE, pupil[frame, 0], row, column)
 
 
 def render_rows(
     parameters: Array, scale: Array, bank: Array, u: Array, w: Array, light: Array,
     cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip
-    """Render frames (float32), on all threads.
+    """Render frames into the arrays ``light``, ``cover``, ``depth``, ``pupil``, on all
+    threads.
 
-    Sheet 0 is skin, sheet 1 the eye; light is multiplied by the coverage. What is
-    hidden is not shaded.
+    All arrays are float32. Sheet 0 is skin, sheet 1 the eye; light is multiplied by the
+    coverage. What is hidden is not shaded.
 
     Args:
         parameters: (n, :data:`codesign.eye.model.COUNT`). scale: (n,) of the depths.
-        bank: of :func:`codesign.eye.textures.packed_bank`. u, w: (x,) and (y,) tangents
-            of the rays.
-        light, cover, depth: (n, 2, y, x) to fill, radiance 1, share and um. pupil: (n,
-            1, y, x) to fill, share.
+        bank: of :func:`codesign.eye.textures.packed_bank`.
+        u, w: (x,) and (y,) tangents of the rays.
+        light, cover, depth: (n, 2, y, x) to fill: radiance of full light 1, share, um.
+        pupil: (n, 1, y, x) to fill, share.
 
     Accuracy: 1e-3 of full light against float64, at edges a pixel wide.
     """
-    rest = (parameters, scale, bank, u, w, light, cover, depth, pupil)
+    arrays = (parameters, scale, bank, u, w, light, cover, depth, pupil)
     threads.run_split(
         len(parameters) * -(-len(w) // ROWS),
-        lambda first, end: frames(first, end, *rest),
+        lambda first, end: frames(first, end, *arrays),
     )

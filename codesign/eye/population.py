@@ -277,12 +277,16 @@ def draw_states(
 ) -> EyeStates:
     """Random subjects in random states; the same seed gives the same states.
 
-    ``motion.scale`` s > 0 draws the scale factor of each state uniformly in 1 +- s.
+    Traits are normal, clipped to their limits; gaze, torsion, slip, mount and lid
+    aperture are uniform in their ranges. ``motion.scale`` s > 0 draws the scale factor
+    of each state uniformly in 1 +- s.
 
     Args:
-        count: how many.
+        count: number of states. seed: of the random generator.
+        motion: ranges of the states; the defaults without it.
     """
-    rng, motion = np.random.default_rng(seed), motion or MotionRanges()
+    rng = np.random.default_rng(seed)
+    motion = motion or MotionRanges()
     columns = []
     for trait in motion.population.values():
         value = trait.mean + trait.sd * rng.standard_normal(count)
@@ -290,7 +294,7 @@ def draw_states(
     pictures = [
         kind * VARIANTS + rng.integers(0, VARIANTS, count) for kind in range(len(KINDS))
     ]
-    places = [
+    offsets = [
         rng.uniform(0, 256, count),
         rng.uniform(0, 256, count),
         rng.uniform(-math.pi, math.pi, count),
@@ -298,7 +302,7 @@ def draw_states(
     gaze = rng.uniform(-1, 1, (count, 2)) * [motion.gaze_x_rad, motion.gaze_y_rad]
     values = (
         np.stack(columns, 1),
-        np.stack([*pictures, *places], 1),
+        np.stack([*pictures, *offsets], 1),
         gaze,
         rng.uniform(-1, 1, count) * motion.torsion_rad,
         rng.uniform(-1, 1, (count, 3)) * motion.slip_um,
@@ -317,10 +321,14 @@ def model_parameters(
     exposed: EyeStates | None = None,
     view: CameraView | None = None,
 ) -> Tensor:
-    """(n, COUNT) parameters of :mod:`codesign.eye.model` in float64, differentiable in
-    gaze, torsion, slip, mount.
+    """(n, COUNT) renderer parameters of :mod:`codesign.eye.model`, float64.
+
+    Differentiable in gaze, torsion, slip and mount. The lids follow the vertical gaze
+    by half the motion of the sclera. Exposure gain grows with the square of the face's
+    depth.
 
     Args:
+        states: subjects with gaze and slippage. rig: pose of camera and lamps.
         pixel_rad: angle of a pixel, which sets the softness of edges.
         exposed: states that the automatic exposure was set at; by default these,
             without following their derivatives.
@@ -328,54 +336,49 @@ def model_parameters(
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
-    cornea, limbus, sclera = (
-        t[k] * size
-        for k in ("cornea_radius_um", "limbus_radius_um", "sclera_radius_um")
-    )
-    ring, offset = _spheres(sclera, cornea, limbus)
-    behind = offset + cornea - t["pupil_behind_um"] * size
+    cornea = t["cornea_radius_um"] * size
+    limbus = t["limbus_radius_um"] * size
+    sclera = t["sclera_radius_um"] * size
+    limbus_plane, cornea_centre = _limbus_and_cornea_um(sclera, cornea, limbus)
+    pupil_plane = cornea_centre + cornea - t["pupil_behind_um"] * size
     face = _face(rig, states, view)
-    axis, across, down = _turned(face, states)
+    axis, across, down = _rotated_axes(face, states)
     centre = (
-        _turn(_nominal_centre(rig, t["depth_um"], behind, view), states.mount_rad)
+        _turn(_nominal_centre(rig, t["depth_um"], pupil_plane, view), states.mount_rad)
         + states.slip_um
     )
-    plane = centre + face[2] * (offset + cornea - t["plane_um"])[:, None]
+    plane = centre + face[2] * (cornea_centre + cornea - t["plane_um"])[:, None]
     lamps = (
         torch.tensor(rig.lamps_um, dtype=torch.float64)
         .flatten()
         .expand(len(states), -1)
     )
-    follow = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
-    lower = t["fissure_lower_um"] * size + 0.9 * follow
+    lid_shift = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
+    lower = t["fissure_lower_um"] * size + 0.9 * lid_shift
     upper = (
-        states.aperture * (t["fissure_upper_um"] * size - follow)
+        states.aperture * (t["fissure_upper_um"] * size - lid_shift)
         - (1 - states.aperture) * lower
     )
-    half = t["fissure_half_um"] * size
-    held = states if exposed is None else exposed
-    depth = _exposure_depth(rig, t["depth_um"], behind, held, view)
+    half_width = t["fissure_half_um"] * size
+    exposed_states = states if exposed is None else exposed
+    depth = _exposure_depth(rig, t["depth_um"], pupil_plane, exposed_states, view)
     gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
-    edge = (
-        0.6
-        * (pixel_rad if view is None else pixel_rad * view.wide)
-        * depth.clamp_min(2000.0)
-        + 25.0
-    )
-    places = {
+    angle = pixel_rad if view is None else pixel_rad * view.wide
+    edge = 0.6 * angle * depth.clamp_min(2000.0) + 25.0
+    parameters = {
         model.CENTRE: centre, model.FACE_X: face[0], model.FACE_Y: face[1], model.FACE_Z: face[2], model.AXIS: axis,
         model.IRIS_X: across, model.IRIS_Y: down, model.PLANE: plane, model.LED: lamps,
-        model.SCLERA_R: sclera, model.CORNEA_R: cornea, model.CORNEA_D: offset, model.LIMBUS_R: limbus,
-        model.LIMBUS_D: ring, model.PUPIL_D: behind, model.LID_R: sclera + t["lid_thickness_um"],
+        model.SCLERA_R: sclera, model.CORNEA_R: cornea, model.CORNEA_D: cornea_centre, model.LIMBUS_R: limbus,
+        model.LIMBUS_D: limbus_plane, model.PUPIL_D: pupil_plane, model.LID_R: sclera + t["lid_thickness_um"],
         model.EDGE: edge, model.UPPER: upper, model.LOWER: lower, model.SKEW: t["fissure_skew_um"] * size,
-        model.HALF: half, model.GAIN: gain, model.AMBIENT: t["ambient"] / (depth.clamp_min(3000.0) / 20e3) ** 2,
-        model.CARUNCLE: t["fissure_middle_um"] - 0.93 * half,
+        model.HALF: half_width, model.GAIN: gain, model.AMBIENT: t["ambient"] / (depth.clamp_min(3000.0) / 20e3) ** 2,
+        model.CARUNCLE: t["fissure_middle_um"] - 0.93 * half_width,
     }  # fmt: skip
-    return _row(places | _as_they_are(t) | _textures(states.textures))
+    return _row(parameters | _copied_traits(t) | _texture_parameters(states.textures))
 
 
 BLEND_UM = 1600.0  # over which lid shell and face plane run into each other
-AS_THEY_ARE = {  # traits that enter the picture unchanged
+AS_THEY_ARE = {  # traits that are renderer parameters unchanged
     model.PUPIL_R: "pupil_radius_um", model.INDEX: "index", model.MIDDLE: "fissure_middle_um",
     model.CREASE: "crease_um", model.IRIS: "iris", model.IRIS_CONTRAST: "iris_contrast",
     model.SCLERA: "sclera", model.VEINS: "veins", model.SKIN: "skin",
@@ -388,37 +391,42 @@ PICTURES = {
 }  # fmt: skip
 
 
-def _as_they_are(traits: Mapping[str, Tensor]) -> dict[int, Tensor]:
+def _copied_traits(traits: Mapping[str, Tensor]) -> dict[int, Tensor]:
+    """Renderer parameters by index that are traits unchanged, and the blend of the
+    face.
+    """
     return {model.BLEND: torch.full_like(traits["size"], BLEND_UM)} | {
-        place: traits[name] for place, name in AS_THEY_ARE.items()
+        index: traits[name] for index, name in AS_THEY_ARE.items()
     }
 
 
-def _textures(textures: Tensor) -> dict[int, Tensor]:
-    named = dict(zip(TEXTURES, textures.unbind(1), strict=True))
+def _texture_parameters(textures: Tensor) -> dict[int, Tensor]:
+    """Renderer parameters by index of texture numbers, offsets and iris rotation."""
+    columns = dict(zip(TEXTURES, textures.unbind(1), strict=True))
     turn = {
-        model.TURN_X: torch.cos(named["turn"]),
-        model.TURN_Y: torch.sin(named["turn"]),
+        model.TURN_X: torch.cos(columns["turn"]),
+        model.TURN_Y: torch.sin(columns["turn"]),
     }
-    return turn | {place: named[name] for place, name in PICTURES.items()}
+    return turn | {index: columns[name] for index, name in PICTURES.items()}
 
 
 def _row(places: Mapping[int, Tensor]) -> Tensor:
-    """(n, COUNT) parameters of frames from what stands at each index, (n,) or (n,
-    several).
+    """(n, COUNT) parameters of frames from their values by first column index.
+
+    Each value is (n,) or (n, columns).
 
     Raises:
         SceneError: an index is left out, or filled twice.
     """
-    columns, filled = [], 0
+    columns = []
+    filled = 0
     for place in sorted(places):
         if place != filled:
             raise SceneError(
                 f"parameter {filled} of a frame is {'left out' if place > filled else 'filled twice'}"
             )
-        columns.append(
-            places[place] if places[place].ndim == 2 else places[place][:, None]
-        )
+        values = places[place]
+        columns.append(values if values.ndim == 2 else values[:, None])
         filled += columns[-1].shape[1]
     if filled != model.COUNT:
         raise SceneError(
@@ -428,8 +436,10 @@ def _row(places: Mapping[int, Tensor]) -> Tensor:
 
 
 def mean_eye_um(rig: CameraRig) -> tuple[tuple[float, float, float], float]:
-    """Rotation centre of the population's mean eye before this camera, and how far its
-    pupil lies from that centre.
+    """Rotation centre (x, y, z) of the population's mean eye, and its distance to the
+    pupil.
+
+    Both in um, in the camera's frame.
 
     Args:
         rig: pose of camera and lamps.
@@ -438,17 +448,22 @@ def mean_eye_um(rig: CameraRig) -> tuple[tuple[float, float, float], float]:
         name: torch.tensor([trait.mean], dtype=torch.float64)
         for name, trait in POPULATION.items()
     }
-    _, offset = _spheres(
+    _, cornea_centre = _limbus_and_cornea_um(
         *(mean[f"{name}_radius_um"] for name in ("sclera", "cornea", "limbus"))
     )
-    radius = offset + mean["cornea_radius_um"] - mean["pupil_behind_um"]
+    radius = cornea_centre + mean["cornea_radius_um"] - mean["pupil_behind_um"]
     x, y, z = _nominal_centre(rig, mean["depth_um"], radius)[0].tolist()
     return (x, y, z), float(radius)
 
 
-def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Tensor]:
-    """(n,) plane of the limbus, which lies on both spheres, and centre of the cornea,
-    from the sclera's centre.
+def _limbus_and_cornea_um(
+    sclera: Tensor, cornea: Tensor, limbus: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(n,) distances from the sclera's centre to the limbus plane and the cornea's
+    centre.
+
+    In um along the optic axis. The limbus circle lies on both spheres:
+    z_limbus = sqrt(sclera² - limbus²), z_cornea = z_limbus - sqrt(cornea² - limbus²).
     """
     ring = torch.sqrt((sclera**2 - limbus**2).clamp_min(1e6))
     return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
@@ -459,22 +474,25 @@ def eye_axes(
 ) -> tuple[Tensor, Tensor]:
     """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors.
 
+    The visual axis is the optic axis tilted by the angles kappa, nasal and upwards.
+
     Args:
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
         view: other cameras than the rig's.
     """
-    axis, across, down = _turned(_face(rig, states, view), states)
-    side = torch.tan(states.trait("kappa_x_rad"))
-    rise = torch.tan(states.trait("kappa_y_rad"))
+    axis, across, down = _rotated_axes(_face(rig, states, view), states)
+    tan_x = torch.tan(states.trait("kappa_x_rad"))
+    tan_y = torch.tan(states.trait("kappa_y_rad"))
     visual = (
-        axis - side[:, None] * across - rise[:, None] * down
+        axis - tan_x[:, None] * across - tan_y[:, None] * down
     )  # nose to -x, up to -y
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
-def _axes(rig: CameraRig, view: CameraView | None) -> Tensor:
-    """(3, 1 or n, 3) axes of the face before the camera, or before each of the cameras
-    of a view.
+def _face_axes(rig: CameraRig, view: CameraView | None) -> Tensor:
+    """(3, 1 or n, 3) axes of the face (right, down, out) in the camera's frame.
+
+    For the rig's camera, or for each of the n cameras of a view.
     """
     return (
         face_axes(rig.elevation_rad)[:, None]
@@ -486,9 +504,12 @@ def _axes(rig: CameraRig, view: CameraView | None) -> Tensor:
 def _face(
     rig: CameraRig, states: EyeStates, view: CameraView | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Axes of the face in the camera's frame: right, down, and out towards the viewer."""
+    """(n, 3) axes right, down and out of the face in the camera's frame, after the
+    mount.
+    """
     right, down, out = (
-        _turn(row.expand(len(states), 3), states.mount_rad) for row in _axes(rig, view)
+        _turn(row.expand(len(states), 3), states.mount_rad)
+        for row in _face_axes(rig, view)
     )
     return right, down, out
 
@@ -496,7 +517,11 @@ def _face(
 def _nominal_centre(
     rig: CameraRig, depth_um: Tensor, behind_um: Tensor, view: CameraView | None = None
 ) -> Tensor:
-    out = _axes(rig, view)[2]
+    """(n, 3) rotation centre of each eye without slip or mounting turn, um.
+
+    ``behind_um``: distance of the pupil before the centre.
+    """
+    out = _face_axes(rig, view)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out
@@ -509,8 +534,8 @@ def _exposure_depth(
     states: EyeStates,
     view: CameraView | None,
 ) -> Tensor:
-    """(n,) distance of the face for which exposure and edges are set, without
-    derivatives.
+    """(n,) depth in um of the eye's front for exposure and edge width, without
+    gradient.
     """
     centre = (
         _turn(_nominal_centre(rig, depth_um, behind_um, view), states.mount_rad)
@@ -519,30 +544,38 @@ def _exposure_depth(
     return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)
 
 
-def _turned(
+def _rotated_axes(
     face: tuple[Tensor, Tensor, Tensor], states: EyeStates
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Optic axis and iris axes after the least rotation that points the eye (Listing's
-    law), then torsion about it.
+    """Optic axis, iris x and iris y axis, (n, 3) each, of eyes at a gaze and torsion.
 
-    Smooth everywhere up to a turn of pi: no gimbal.
+    Rodrigues rotation by the gaze angle about an axis in the face plane (Listing's
+    law), then torsion about the optic axis. Smooth up to a rotation of pi: no gimbal
+    lock.
+
+    Args:
+        face: right, down and out axes of the face.
     """
     right, down, out = face
     gx, gy = states.gaze_rad[:, :1], states.gaze_rad[:, 1:]
     angle = torch.sqrt(gx**2 + gy**2 + 1e-24)
-    sine = torch.sin(angle) / angle
-    fall = 2 * (torch.sin(angle / 2) / angle) ** 2
-    toward = gx * right + gy * down
-    axis = torch.cos(angle) * out + sine * toward
-    across = right - gx * (fall * toward + sine * out)
-    below = down - gy * (fall * toward + sine * out)
+    sinc = torch.sin(angle) / angle
+    versine = 2 * (torch.sin(angle / 2) / angle) ** 2
+    gaze = gx * right + gy * down
+    axis = torch.cos(angle) * out + sinc * gaze
+    across = right - gx * (versine * gaze + sinc * out)
+    lower = down - gy * (versine * gaze + sinc * out)
     c = torch.cos(states.torsion_rad)[:, None]
     s = torch.sin(states.torsion_rad)[:, None]
-    return axis, c * across + s * below, c * below - s * across
+    return axis, c * across + s * lower, c * lower - s * across
 
 
 def _turn(vector: Tensor, mount_rad: Tensor) -> Tensor:
-    """(n, 3) vectors as a camera sees them that is turned about x, then about y."""
+    """(n, 3) vectors in the frame of a camera rotated about x, then about y.
+
+    Args:
+        vector: (n, 3). mount_rad: (n, 2) angles.
+    """
     cx, sx = torch.cos(mount_rad[:, 0]), torch.sin(mount_rad[:, 0])
     cy, sy = torch.cos(mount_rad[:, 1]), torch.sin(mount_rad[:, 1])
     x, y, z = vector.unbind(1)

@@ -122,17 +122,16 @@ def render(
     exposed: EyeStates | None = None,
     view: CameraView | None = None,
 ) -> RenderedFrames:
-    """Render states with labels, masks and depth (float32); compiled, on all threads of
+    """Render states with labels, pupil masks and depth, float32, on all threads of
     numba.
 
     Args:
-        exposed: states that the automatic exposure was set at, where it shall not
-            follow; by default these.
-        view: other cameras than the rig's. A picture that is ``wide`` times as wide is
-            that of an eye so much smaller
-            across at the same depth, as this rig's camera would see it: places of its
-            labels shrink with it.
-        texture_seed: of the textures.
+        states: subjects with gaze and slippage. rig: pose of camera and lamps.
+        camera: pixel grid; the defaults without both. texture_seed: of the textures.
+        exposed: states that the automatic exposure was set at; by default these.
+        view: other cameras than the rig's. A picture that is ``wide`` times as wide
+            equals that of an eye smaller by that factor across, at the same depth,
+            before the rig's camera: lateral positions of its labels shrink with it.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
@@ -146,13 +145,13 @@ def render(
         view=view,
     )
     wide = np.ones(len(states)) if view is None else view.wide.numpy()
-    frames, mask = _compiled(p, states.scale, rig, camera, texture_seed, wide)
+    frames, mask = _render_arrays(p, states.scale, rig, camera, texture_seed, wide)
     return RenderedFrames(
         frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view)
     )
 
 
-def _compiled(
+def _render_arrays(
     p: Tensor,
     scale: Tensor,
     rig: CameraRig,
@@ -160,21 +159,37 @@ def _compiled(
     seed: int,
     wide: Array,
 ) -> tuple[Frames, Tensor]:
+    """Frames and pupil masks from renderer parameters, by the compiled kernel in
+    float32.
+
+    Consecutive frames of one picture width are rendered together.
+
+    Args:
+        p: (n, COUNT) parameters. scale: (n,) factor of the depths.
+        wide: (n,) picture width over that of the rig's camera.
+    """
     n, size = len(p), camera.pixels
     light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
     pupil = np.empty((n, 1, size, size), np.float32)
-    values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    ends = [*np.flatnonzero(np.diff(wide)) + 1, n]  # of runs of frames that are as wide
-    for first, end in zip([0, *ends], ends, strict=False):
-        t = (camera.tangents(rig) * wide[first]).astype(np.float32)
+    values, scales = (a.detach().numpy().astype(np.float32) for a in (p, scale))
+    run_ends = [
+        *np.flatnonzero(np.diff(wide)) + 1,
+        n,
+    ]  # of runs of frames that are as wide
+    for first, end in zip([0, *run_ends], run_ends, strict=False):
+        tangents = (camera.tangents(rig) * wide[first]).astype(np.float32)
         run = slice(first, end)
         out = (light[run], cover[run], depth[run], pupil[run])
         kernel.render_rows(
-            values[run], factor[run], textures.packed_bank(seed), t, t, *out
+            values[run],
+            scales[run],
+            textures.packed_bank(seed),
+            tangents,
+            tangents,
+            *out,
         )
-    return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(
-        pupil[:, 0]
-    )
+    sheets = Frames(*map(torch.from_numpy, (light, cover, depth)))
+    return sheets, torch.from_numpy(pupil[:, 0])
 
 
 def _labels(
@@ -186,13 +201,22 @@ def _labels(
     camera: PinholeCamera,
     view: CameraView | None,
 ) -> FrameLabels:
-    p, scale = p.detach(), states.scale[:, None]
+    """Labels of frames from states, renderer parameters and pupil masks.
+
+    Lengths across the axis shrink by the width of the view. The visible share is the
+    mask's area over that of the refracted pupil's outline (shoelace formula).
+
+    Args:
+        p: (n, COUNT) parameters. mask: (n, y, x) visible share of pupil.
+    """
+    p = p.detach()
+    scale = states.scale[:, None]
     wide = torch.ones_like(states.scale) if view is None else view.wide
-    across = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
+    shrink = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
     centre = p[:, model.CENTRE : model.CENTRE + 3]
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
     optic, visual = eye_axes(states, rig, view)
-    here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
+    nominal = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     middle_and_rim = camera.position_px(
         iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig
     )
@@ -200,27 +224,31 @@ def _labels(
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
     rows, columns = mask.sum(2).double(), mask.sum(1).double()
-    weight = rows.sum(1)
-    grid = torch.arange(camera.pixels, dtype=torch.float64)
-    sums = [(line * grid).sum(1) / weight.clamp_min(1e-9) for line in (columns, rows)]
-    centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
+    visible_area = rows.sum(1)
+    index = torch.arange(camera.pixels, dtype=torch.float64)
+    sums = [
+        (line * index).sum(1) / visible_area.clamp_min(1e-9) for line in (columns, rows)
+    ]
+    centroid = torch.where(visible_area[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return FrameLabels(
-        slip_um=scale * across * (here + states.slip_um) - here,
-        shift_um=scale * across * (_seen_place(states, rig) + states.slip_um) - here,
+        slip_um=scale * shrink * (nominal + states.slip_um) - nominal,
+        shift_um=scale * shrink * (_unslipped_place_um(states, rig) + states.slip_um)
+        - nominal,
         optic_axis=optic.detach(),
         visual_axis=visual.detach(),
-        centre_um=scale * across * centre,
-        pupil_um=scale * across * pupil,
+        centre_um=scale * shrink * centre,
+        pupil_um=scale * shrink * pupil,
         pupil_px=middle,
         centroid_px=centroid,
-        visible=(weight / area.clamp_min(1e-6)).clamp(0, 1),
+        visible=(visible_area / area.clamp_min(1e-6)).clamp(0, 1),
         landmarks_px=camera.position_px(landmark_points(p) / wide[:, None, None], rig),
     )
 
 
-def _seen_place(states: EyeStates, rig: CameraRig) -> Tensor:
-    """(n, 3) where a pupil that looks straight ahead stands before a camera turned by
-    its mounting; not slipped.
+def _unslipped_place_um(states: EyeStates, rig: CameraRig) -> Tensor:
+    """(n, 3) pupil position of an eye that looks straight ahead, without slip, um.
+
+    In the frame of a camera turned by its mounting.
     """
     depth = (
         torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

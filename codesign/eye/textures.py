@@ -18,8 +18,10 @@ KINDS = ("iris", "vein", "skin", "fine", "lash")
 
 @functools.lru_cache(maxsize=2)
 def texture_bank(seed: int = 0) -> Array:
-    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants
-    of a kind together; about 1 s.
+    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 textures in [-1, 1], in steps of 1 /
+    STEPS.
+
+    The variants of a kind are consecutive. Takes about 1 s.
 
     Args:
         seed: of the random generator.
@@ -56,11 +58,12 @@ def periodic_noise(
     stretch: float = 1.0,
     shape: tuple[int, int] = (SIZE, SIZE),
 ) -> Array:
-    """Periodic Gaussian noise of unit deviation, amplitude 1 / f^power, ``stretch``
-    times longer along y.
+    """Periodic Gaussian noise of unit deviation and spectral amplitude 1 / f^power.
+
+    ``stretch`` times longer along y.
 
     Args:
-        rng: of the draws. shape: (y, x) of the noise.
+        rng: of the draws. power: exponent. shape: (y, x) of the noise.
     """
     fy = np.fft.fftfreq(shape[0])[:, None] * shape[0] * stretch
     fx = np.fft.rfftfreq(shape[1])[None] * shape[1]
@@ -73,39 +76,23 @@ def periodic_noise(
 
 
 def _iris(rng: np.random.Generator) -> Array:
-    """Fibres, collarette, crypts and furrows in the plane of the iris: pupil margin at
-    radius 40, limbus at 124.
+    """(SIZE, SIZE) fibres, collarette, crypts and furrows of an iris, in [-1, 1].
+
+    Drawn in polar coordinates, then sampled on the plane of the iris: pupil margin at
+    radius 40 pixels, limbus at 124.
     """
     rings, turns = 96, 1024
     rho = (np.arange(rings) / (rings - 1))[:, None]
-    fibres = np.tanh(
-        0.9
-        * periodic_noise(
-            rng, power=0.7, stretch=rng.uniform(5, 11), shape=(2 * rings, turns)
-        )[:rings]
-    )
-    clouds = periodic_noise(rng, power=1.4, stretch=2.0, shape=(2 * rings, turns))[
-        :rings
-    ]
+    shape = (2 * rings, turns)
+    noise = periodic_noise(rng, power=0.7, stretch=rng.uniform(5, 11), shape=shape)
+    fibres = np.tanh(0.9 * noise[:rings])
+    clouds = periodic_noise(rng, power=1.4, stretch=2.0, shape=shape)[:rings]
     wave = 0.28 + 0.05 * np.tanh(periodic_noise(rng, power=1.2, shape=(4, turns))[:1])
     collarette = np.exp(-(((rho - wave) / 0.045) ** 2))
-    furrows = sum(
-        np.exp(
-            -(
-                (
-                    (
-                        rho
-                        - at
-                        - 0.02
-                        * np.tanh(periodic_noise(rng, power=1.5, shape=(4, turns))[:1])
-                    )
-                    / 0.016
-                )
-                ** 2
-            )
-        )
-        for at in rng.uniform(0.55, 0.9, rng.integers(1, 4))
-    )
+    furrows: Array = np.zeros((rings, turns))
+    for radius in rng.uniform(0.55, 0.9, rng.integers(1, 4)):
+        wobble = 0.02 * np.tanh(periodic_noise(rng, power=1.5, shape=(4, turns))[:1])
+        furrows = furrows + np.exp(-(((rho - radius - wobble) / 0.016) ** 2))
     polar = (
         0.6 * fibres
         + 0.35 * clouds
@@ -113,7 +100,7 @@ def _iris(rng: np.random.Generator) -> Array:
         - rng.uniform(0, 0.6) * furrows
     )
     for _ in range(int(rng.integers(3, 14))):
-        polar -= _crypt(rng, rho, turns)
+        polar -= _crypt_depth(rng, rho, turns)
     y, x = np.meshgrid(
         np.arange(SIZE) - SIZE / 2, np.arange(SIZE) - SIZE / 2, indexing="ij"
     )
@@ -122,25 +109,30 @@ def _iris(rng: np.random.Generator) -> Array:
     return _bilinear(np.tanh(polar), row, column)
 
 
-def _crypt(rng: np.random.Generator, rho: Array, turns: int) -> Array:
-    """A dark lozenge with a soft border beside the collarette."""
-    at, where = rng.uniform(0.32, 0.6), rng.uniform(0, 1)
-    turn = (np.arange(turns) / turns - where + 0.5) % 1 - 0.5
-    distance = np.abs((rho - at) / rng.uniform(0.05, 0.13)) + np.abs(
-        turn / rng.uniform(0.006, 0.018)
+def _crypt_depth(rng: np.random.Generator, rho: Array, turns: int) -> Array:
+    """(rings, turns) depth of a dark lozenge with a soft border near the collarette."""
+    radius, angle = rng.uniform(0.32, 0.6), rng.uniform(0, 1)
+    offset = (np.arange(turns) / turns - angle + 0.5) % 1 - 0.5
+    distance = np.abs((rho - radius) / rng.uniform(0.05, 0.13)) + np.abs(
+        offset / rng.uniform(0.006, 0.018)
     )
     return np.asarray(rng.uniform(0.6, 1.3) / (1 + np.exp(6 * (distance - 1))))
 
 
 def _bilinear(picture: Array, row: Array, column: Array) -> Array:
-    r, c = np.floor(row).astype(int), np.floor(column).astype(int)
-    below = np.minimum(r + 1, picture.shape[0] - 1)
-    right = (c + 1) % picture.shape[1]
-    s, t = column - c, row - r
-    c = c % picture.shape[1]
-    top = picture[r, c] * (1 - s) + picture[r, right] * s
+    """Samples of a picture (row, column) by bilinear interpolation, periodic in
+    columns.
+    """
+    row0, column0 = np.floor(row).astype(int), np.floor(column).astype(int)
+    below = np.minimum(row0 + 1, picture.shape[0] - 1)
+    right = (column0 + 1) % picture.shape[1]
+    x_part, y_part = column - column0, row - row0
+    column0 = column0 % picture.shape[1]
+    top = picture[row0, column0] * (1 - x_part) + picture[row0, right] * x_part
     return np.asarray(
-        top * (1 - t) + (picture[below, c] * (1 - s) + picture[below, right] * s) * t
+        top * (1 - y_part)
+        + (picture[below, column0] * (1 - x_part) + picture[below, right] * x_part)
+        * y_part
     )
 
 
@@ -150,7 +142,7 @@ def _veins(rng: np.random.Generator) -> Array:
     for _ in range(int(rng.integers(5, 12))):
         start = np.array([rng.choice([0.0, SIZE]), rng.uniform(0, SIZE)])
         heading = (0.0 if start[0] == 0 else math.pi) + rng.normal(0, 0.5)
-        _vessel(
+        _draw_vessel(
             canvas,
             rng,
             start,
@@ -162,7 +154,7 @@ def _veins(rng: np.random.Generator) -> Array:
     return np.asarray(ndimage.gaussian_filter(canvas / 255.0, 0.8, mode="wrap"))
 
 
-def _vessel(
+def _draw_vessel(
     canvas: Array,
     rng: np.random.Generator,
     at: Array,
@@ -172,6 +164,10 @@ def _vessel(
     length: int,
     depth: int,
 ) -> None:
+    """Draw a random winding line from ``at`` with branches into ``canvas``, in place.
+
+    heading: rad. length: in steps of 2 pixels. depth: orders of branches.
+    """
     import cv2
 
     path = [at]
@@ -180,7 +176,7 @@ def _vessel(
         path.append(path[-1] + 2.0 * np.array([math.cos(heading), math.sin(heading)]))
         if depth and rng.random() < 0.03:
             angle = heading + rng.choice([-0.6, 0.6])
-            _vessel(
+            _draw_vessel(
                 canvas,
                 rng,
                 path[-1],
@@ -213,8 +209,10 @@ def _fine(rng: np.random.Generator) -> Array:
 
 
 def _lashes(rng: np.random.Generator) -> Array:
-    """Hairs that grow from row 0 (the lid's margin), bend to one side and taper, in [0,
-    1]; the last rows are empty.
+    """(SIZE, SIZE) opacity of hairs in [0, 1] that grow from row 0, the margin of the
+    lid.
+
+    They bend to one side and taper; the last 8 rows are empty.
     """
     import cv2
 
@@ -238,8 +236,10 @@ def _lashes(rng: np.random.Generator) -> Array:
                 cv2.LINE_AA,
                 4,
             )
-    folded = np.maximum.reduce([canvas[:, k * SIZE : (k + 1) * SIZE] for k in range(3)])
-    folded[-8:] = 0
+    wrapped = np.maximum.reduce(
+        [canvas[:, k * SIZE : (k + 1) * SIZE] for k in range(3)]
+    )
+    wrapped[-8:] = 0
     return np.asarray(
-        ndimage.gaussian_filter(folded / 255.0, 0.7, mode=("constant", "wrap"))
+        ndimage.gaussian_filter(wrapped / 255.0, 0.7, mode=("constant", "wrap"))
     )

@@ -38,8 +38,7 @@ class CameraView:
 
 
 def face_axes(elevation_rad: float) -> Tensor:
-    """(3, 3) rows right, down and out of the face in the frame of a camera that sees it
-    from this far below.
+    """(3, 3) rows right, down and out of the face in the frame of a camera below it.
 
     Args:
         elevation_rad: of the face's normal above the camera's direction.
@@ -51,19 +50,20 @@ def face_axes(elevation_rad: float) -> Tensor:
 
 
 def seen_axes(elevation_rad: float, view: CameraView) -> Tensor:
-    """(n, 3, 3) of :func:`face_axes` as these cameras see them: Rz(roll) [axes after
-    Ry(side) at elevation - tilt].
+    """(n, 3, 3) rows right, down and out of the face in the frames of n cameras.
+
+    Rz(roll) applied to the axes after Ry(side), at elevation - tilt.
 
     Args:
-        elevation_rad: of the face's normal above the camera's direction.
+        elevation_rad: of the face's normal above the rig camera's direction.
         view: cameras, one a frame.
     """
     elevation = elevation_rad - view.tilt_rad
-    (s, c), (a, b) = ((torch.sin(v), torch.cos(v)) for v in (elevation, view.side_rad))
+    s, c = torch.sin(elevation), torch.cos(elevation)
+    a, b = torch.sin(view.side_rad), torch.cos(view.side_rad)
     zero = torch.zeros_like(s)
-    right = torch.stack(
-        [b, -a * s, -a * c], 1
-    )  # cos(side) right + sin(side) out of a camera straight below
+    # cos(side) right + sin(side) out of a camera straight below
+    right = torch.stack([b, -a * s, -a * c], 1)
     down = torch.stack([zero, c, -s], 1)
     out = torch.stack([-a, -b * s, -b * c], 1)
     x, y, z = torch.stack([right, down, out], 1).unbind(2)

@@ -161,10 +161,8 @@ CAUSES: Mapping[str, FrameAugmentation] = {
 VIEWS = ("tilt", "side", "roll", "wide")  # of the view that frames are rendered from
 BEFORE = (*VIEWS, "iris")  # what frames are rendered with; all else is put on them
 RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
-WHITE, BLACK = (
-    0.99,
-    1e-3,
-)  # of a tone curve: share of the pixels below its white, and the least level of it
+# of a tone curve: fraction of the pixels below white, and the least relative level
+WHITE, BLACK = 0.99, 1e-3
 TAPS = 15  # of the kernel of a movement, at most its length
 
 
@@ -180,24 +178,26 @@ class DrawnAugmentations:
 
     def __getitem__(self, rows: Array | slice) -> "DrawnAugmentations":
         """Those of some frames."""
-        parts = (
-            {name: held[rows] for name, held in of.items()}
-            for of in (self.size, self.draws)
+        size, draws = (
+            {name: values[rows] for name, values in record.items()}
+            for record in (self.size, self.draws)
         )
-        return DrawnAugmentations(*parts)
+        return DrawnAugmentations(size, draws)
 
     def from_one_view(self) -> "DrawnAugmentations":
-        """The same before the stage's own camera: no cause of :data:`VIEWS`."""
-        still = {n: 0 * v if n in VIEWS else v for n, v in self.size.items()}
-        return DrawnAugmentations(still, self.draws)
+        """Copy for the stage's own camera: sizes of the causes in :data:`VIEWS` set
+        to 0.
+        """
+        size = {n: 0 * v if n in VIEWS else v for n, v in self.size.items()}
+        return DrawnAugmentations(size, self.draws)
 
 
 def drawn_of_people(
     who: Array, variety: float, seed: tuple[int, ...]
 ) -> DrawnAugmentations:
-    """What frames of some people have before the camera of one stage.
+    """Augmentations of frames of some people, before the fixed camera of one stage.
 
-    One draw a person, but movement, which is drawn for every frame.
+    One draw a person, except movement, which is drawn for every frame.
 
     Args:
         who: (n,) number of the person in each frame, from 0.
@@ -207,18 +207,23 @@ def drawn_of_people(
     people = draw_augmentations(
         int(who.max()) + 1, variety, np.random.default_rng((*seed, 0))
     ).from_one_view()
-    each = draw_augmentations(len(who), variety, np.random.default_rng((*seed, 1)))
-    worn = people[who]
-    size, draws = dict(worn.size), dict(worn.draws)
-    size["movement"], draws["movement"] = each.size["movement"], each.draws["movement"]
+    per_frame = draw_augmentations(len(who), variety, np.random.default_rng((*seed, 1)))
+    per_person = people[who]
+    size, draws = dict(per_person.size), dict(per_person.draws)
+    size["movement"], draws["movement"] = (
+        per_frame.size["movement"],
+        per_frame.draws["movement"],
+    )
     return DrawnAugmentations(size, draws)
 
 
 def draw_augmentations(
     count: int, variety: float, generator: np.random.Generator
 ) -> DrawnAugmentations:
-    """Causes of ``count`` frames; off everywhere up to variety 1. The same generator
-    draws the same at any variety.
+    """Augmentations of ``count`` frames, drawn independently by cause.
+
+    A cause is on with probability share * (variety - 1), limited to [0, 1]; none is on
+    up to variety 1. Generators of one seed draw the same sizes at any variety.
     """
     size, draws = {}, {}
     for name, cause in CAUSES.items():
@@ -235,7 +240,10 @@ def render_dressed(
     rig: CameraRig,
     camera: PinholeCamera,
 ) -> RenderedFrames:
-    """Frames of states with all that they have; bare ones where nothing is on.
+    """Rendered frames of states with their augmentations; plain frames where none is
+    on.
+
+    View and iris are set before rendering, all others painted on the frames.
 
     Args:
         worn: augmentations of every frame. rig: pose of camera and lamps.
@@ -243,13 +251,13 @@ def render_dressed(
     """
     if not any(size.any() for size in worn.size.values()):
         return render(states, rig=rig, camera=camera)
-    plain = render(
+    rendered = render(
         augment_irises(states, worn),
         rig=rig,
         camera=camera,
         view=augmented_cameras(worn),
     )
-    return apply_augmentations(plain, worn)
+    return apply_augmentations(rendered, worn)
 
 
 def augmented_cameras(worn: DrawnAugmentations) -> CameraView:
@@ -268,29 +276,30 @@ def augmented_cameras(worn: DrawnAugmentations) -> CameraView:
 
 
 def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
-    """The states with the irises that some frames have.
+    """States with the iris albedo multiplied by the size of cause "iris", where it is
+    on.
 
     Args:
         worn: augmentations of every frame.
     """
     traits = states.traits.clone()
-    size = torch.from_numpy(worn.size["iris"])
-    traits[:, list(POPULATION).index("iris")] *= torch.where(size > 0, size, 1.0)
+    factor = torch.from_numpy(worn.size["iris"])
+    traits[:, list(POPULATION).index("iris")] *= torch.where(factor > 0, factor, 1.0)
     return replace(states, traits=traits)
 
 
 def apply_augmentations(
     made: RenderedFrames, worn: DrawnAugmentations
 ) -> RenderedFrames:
-    """Rendered frames with what is worn but the causes of :func:`augmented_cameras` and
-    :func:`augment_irises`: those came before.
+    """Rendered frames with all causes that are painted on them.
 
-    Light, coverage and depth of both sheets change, and the pupil's mask where
-    something hides or moves it; of the
-    labels the centroid and the visible share of the pupil follow.
+    Those are all but :data:`BEFORE`, which :func:`augmented_cameras` and
+    :func:`augment_irises` apply. Light, coverage and depth of both sheets change, and
+    the pupil's mask where something covers or moves it. Of the labels the centroid and
+    the visible share of the pupil follow.
 
     Args:
-        made: rendered frames.
+        made: rendered frames. worn: augmentations of every frame.
     """
     if not any(worn.size[name].any() for name in CAUSES if name not in BEFORE):
         return made
@@ -298,24 +307,25 @@ def apply_augmentations(
         getattr(made.frames, name).clone() for name in Frames.__slots__
     )
     canvas = _Canvas(light, cover, depth, made.pupil.clone(), worn)
-    _make_up(canvas)
+    _apply_make_up(canvas)
     _darken(canvas)
     _add_glints(canvas, made.labels)
-    _light_unevenly(canvas)
+    _apply_uneven_light(canvas)
     _add_spectacles(canvas)
-    _move(canvas)
-    _record(canvas)
+    _apply_motion_blur(canvas)
+    _apply_camera_response(canvas)
     return RenderedFrames(
         Frames(light, cover, depth),
         canvas.pupil,
-        _labels(made.labels, made.pupil, canvas.pupil),
+        _updated_labels(made.labels, made.pupil, canvas.pupil),
     )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Canvas:
-    """Frames that are painted over in place: light, cover, depth (n, 2, y, x), pupil
-    (n, y, x), and what each of them has.
+    """Frames that are painted over in place, and the augmentations of each.
+
+    light, cover, depth: (n, 2, y, x). pupil: (n, y, x).
     """
 
     light: Tensor
@@ -326,43 +336,48 @@ class _Canvas:
 
     @property
     def pixels(self) -> int:
-        """Along a side."""
+        """Pixels along a side."""
         return int(self.light.shape[-1])
 
     @property
     def places(self) -> tuple[Tensor, Tensor]:
-        """(1, x) and (y, 1) places in frame widths from the middle."""
+        """(1, x) and (y, 1) coordinates in frame widths from the centre."""
         line = (torch.arange(self.pixels) + 0.5) / self.pixels - 0.5
         return line[None], line[:, None]
 
     def having(self, name: str) -> list[tuple[int, float, Array]]:
-        """(frame, size, draws) of every frame that has a cause."""
+        """(frame number, size, draws) of every frame that has the cause ``name``."""
         size, draws = self.worn.size[name], self.worn.draws[name]
         return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
 
 
-def _make_up(canvas: _Canvas) -> None:
-    """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin
-    above, up to 12 % of the frame.
+def _apply_make_up(canvas: _Canvas) -> None:
+    """Darken skin near the lid opening in place: liner and lid shadow.
+
+    Liner: within 1.5 to 4 % of the frame of the opening. Shadow: the skin above, up to
+    12 % of the frame.
     """
     pixels = canvas.pixels
     for i, opacity, draws in canvas.having("liner"):
-        wide = max(1, round((0.015 + 0.025 * draws[0]) * pixels))
-        near = _spread(canvas.cover[i, 1], up=wide, down=wide if draws[1] < 0.5 else 1)
-        canvas.light[i, 0] *= 1 - opacity * near
+        reach = max(1, round((0.015 + 0.025 * draws[0]) * pixels))
+        margin = _vertical_dilation(
+            canvas.cover[i, 1], up=reach, down=reach if draws[1] < 0.5 else 1
+        )
+        canvas.light[i, 0] *= 1 - opacity * margin
     for i, opacity, draws in canvas.having("lid_shadow"):
-        high = max(2, round((0.06 + 0.06 * draws[2]) * pixels))
-        canvas.light[i, 0] *= 1 - opacity * _soft(
-            _spread(canvas.cover[i, 1], up=high, down=0), high / 2
+        reach_up = max(2, round((0.06 + 0.06 * draws[2]) * pixels))
+        canvas.light[i, 0] *= 1 - opacity * _box_blur(
+            _vertical_dilation(canvas.cover[i, 1], up=reach_up, down=0), reach_up / 2
         )
 
 
 def _darken(canvas: _Canvas) -> None:
-    """A darker eye, light of the retina, dark places of the skin, lashes over both
-    sheets; masks stay outlines.
+    """Darken eyes, skin patches and lashes in place, and add the light of the retina.
+
+    Coverage and pupil mask do not change.
     """
-    for i, taken, _ in canvas.having("socket"):
-        canvas.light[i, 1] *= 1 - taken
+    for i, loss, _ in canvas.having("socket"):
+        canvas.light[i, 1] *= 1 - loss
     for i, radiance, _ in canvas.having("retina"):
         canvas.light[i, 1] += radiance * canvas.pupil[i]
     for i, opacity, draws in canvas.having("patch"):
@@ -371,7 +386,7 @@ def _darken(canvas: _Canvas) -> None:
         canvas.light[i] *= 1 - opacity * draw_lashes(canvas.cover[i, 1], draws)
 
 
-def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
+def _vertical_dilation(cover: Tensor, *, up: int, down: int) -> Tensor:
     """(y, x) largest coverage within ``up`` rows below each pixel and ``down`` rows
     above it.
     """
@@ -379,127 +394,138 @@ def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
     return F.max_pool2d(padded, (up + down + 1, 1), stride=1)[0, 0]
 
 
-def _soft(picture: Tensor, width: float) -> Tensor:
-    """(y, x) mean over a square of about this width."""
-    reach = max(1, round(width / 2))
-    padded = F.pad(picture[None, None], (reach,) * 4, mode="replicate")
-    return F.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
+def _box_blur(picture: Tensor, width: float) -> Tensor:
+    """(y, x) mean over a square of about ``width`` pixels, edges replicated."""
+    radius = max(1, round(width / 2))
+    padded = F.pad(picture[None, None], (radius,) * 4, mode="replicate")
+    return F.avg_pool2d(padded, 2 * radius + 1, stride=1)[0, 0]
 
 
 def _add_glints(canvas: _Canvas, labels: FrameLabels) -> None:
-    """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is
-    seen of the eye.
+    """Add one to four bright spots near the pupil to the far sheet, in place.
+
+    Profile 1 / (1 + (r / size)⁴), size 0.5 to 4 % of the frame, times the coverage.
     """
-    pixels, (x, y) = canvas.pixels, canvas.places
+    x, y = canvas.places
     for i, radiance, draws in canvas.having("glints"):
-        px, py = ((labels.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
-        turn, apart = 6.283 * draws[3], 0.02 + 0.07 * draws[4]
+        px, py = ((labels.pupil_px[i] + 0.5) / canvas.pixels - 0.5).tolist()
+        first_angle = 6.283 * draws[3]
+        distance = 0.02 + 0.07 * draws[4]
         for k in range(1 + int(4 * draws[5])):
-            at = turn + 1.7 * k
+            angle = first_angle + 1.7 * k
             size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
-            dx = x - px - apart * np.cos(at)
-            dy = y - py - apart * np.sin(at)
+            dx = x - px - distance * np.cos(angle)
+            dy = y - py - distance * np.sin(angle)
             canvas.light[i, 1] += (
                 radiance * canvas.cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
             )
 
 
-def _light_unevenly(canvas: _Canvas) -> None:
-    """Uneven light and shadows: a factor on both sheets."""
+def _apply_uneven_light(canvas: _Canvas) -> None:
+    """Multiply both sheets by a linear gradient, and by a shadow of sigmoid edge, in
+    place.
+    """
     x, y = canvas.places
     for i, change, draws in canvas.having("gradient"):
-        at = 6.283 * draws[7]
-        canvas.light[i] *= (
-            1 + change * 2 * (x * np.cos(at) + y * np.sin(at))
-        ).clamp_min(0.1)
-    for i, taken, draws in canvas.having("shade"):
-        at, edge = 6.283 * draws[8], 0.02 + 0.1 * draws[9]
-        away = x * np.cos(at) + y * np.sin(at) - (draws[10] - 0.5) * 0.6
-        canvas.light[i] *= 1 - taken * torch.sigmoid(away / edge)
+        angle = 6.283 * draws[7]
+        ramp = x * np.cos(angle) + y * np.sin(angle)
+        canvas.light[i] *= (1 + change * 2 * ramp).clamp_min(0.1)
+    for i, loss, draws in canvas.having("shade"):
+        angle = 6.283 * draws[8]
+        edge = 0.02 + 0.1 * draws[9]
+        distance = x * np.cos(angle) + y * np.sin(angle) - (draws[10] - 0.5) * 0.6
+        canvas.light[i] *= 1 - loss * torch.sigmoid(distance / edge)
 
 
 def _add_spectacles(canvas: _Canvas) -> None:
-    """Mirrored windows on the glass, then the rim before all: an arc that hides what is
-    behind it.
+    """Add reflections on spectacle glass, then an opaque rim before the face, in place.
+
+    Reflections: one to three blurred rectangles 1 / (1 + (u / a)⁶ + (v / b)⁶). Rim: a
+    band along a circular arc at RIM_DEPTH of the median depth.
     """
     x, y = canvas.places
     for i, radiance, draws in canvas.having("reflection"):
         for k in range(1 + int(3 * draws[0])):
-            at_x = (draws[1] + 0.61 * k) % 1 - 0.5
-            at_y = (draws[2] + 0.43 * k) % 1 - 0.5
+            centre_x = (draws[1] + 0.61 * k) % 1 - 0.5
+            centre_y = (draws[2] + 0.43 * k) % 1 - 0.5
             half_x = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1)
             half_y = 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
             lean = 0.6 * (draws[5] - 0.5)
-            u = (x - at_x) + lean * (y - at_y)
-            v = (y - at_y) - lean * (x - at_x)
+            u = (x - centre_x) + lean * (y - centre_y)
+            v = (y - centre_y) - lean * (x - centre_x)
             canvas.light[i] += (
                 radiance * canvas.cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
             )
     for i, width, draws in canvas.having("rim"):
         radius = 0.45 + 0.5 * draws[6]
-        at = 6.283 * draws[7]
+        angle = 6.283 * draws[7]
         gap = 0.30 + 0.17 * draws[8]
-        middle_x = (radius - gap) * np.cos(at)
-        middle_y = (radius - gap) * np.sin(at)
-        away = (
+        middle_x = (radius - gap) * np.cos(angle)
+        middle_y = (radius - gap) * np.sin(angle)
+        distance = (
             torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
         )
-        band = torch.sigmoid((width / 2 - (away - width / 2).abs()) * canvas.pixels * 2)
-        shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(away / width * 6.0))
-        eye = canvas.depth[i, 1][
-            canvas.depth[i, 1] > 0
-        ]  # 0 behind skin, which is most of many frames
-        far = (eye if len(eye) else canvas.depth[i, 0]).median() * RIM_DEPTH
-        _hide(canvas, i, band, band * shine, far)
+        band = torch.sigmoid(
+            (width / 2 - (distance - width / 2).abs()) * canvas.pixels * 2
+        )
+        shine = 0.02 + 0.5 * draws[10] ** 2 * (
+            1 + 0.6 * torch.cos(distance / width * 6.0)
+        )
+        # the far sheet's depth is 0 behind skin, most of many frames
+        eye_depths = canvas.depth[i, 1][canvas.depth[i, 1] > 0]
+        rim_depth = (
+            eye_depths if len(eye_depths) else canvas.depth[i, 0]
+        ).median() * RIM_DEPTH
+        _cover(canvas, i, band, band * shine, rim_depth)
 
 
-def _hide(
-    canvas: _Canvas, i: int, band: Tensor, shine: Tensor, depth_um: Tensor
+def _cover(
+    canvas: _Canvas, i: int, coverage: Tensor, shine: Tensor, depth_um: Tensor
 ) -> None:
-    """Put something of coverage ``band`` before frame ``i``, on its near sheet."""
-    canvas.light[i] *= 1 - band
-    canvas.cover[i] *= 1 - band
-    canvas.pupil[i] *= 1 - band
-    canvas.light[i, 0] += shine
-    canvas.cover[i, 0] += band
-    canvas.depth[i, 0] = torch.where(band > 0.5, depth_um, canvas.depth[i, 0])
+    """Put an object of (y, x) ``coverage`` before frame ``i``, on its near sheet, in
+    place.
 
-
-def _move(canvas: _Canvas) -> None:
-    """Both sheets and the mask averaged along a line: what the pixels collect while the
-    picture moves.
+    shine: (y, x) its light. depth_um: its depth.
     """
-    pixels = canvas.pixels
+    canvas.light[i] *= 1 - coverage
+    canvas.cover[i] *= 1 - coverage
+    canvas.pupil[i] *= 1 - coverage
+    canvas.light[i, 0] += shine
+    canvas.cover[i, 0] += coverage
+    canvas.depth[i, 0] = torch.where(coverage > 0.5, depth_um, canvas.depth[i, 0])
+
+
+def _apply_motion_blur(canvas: _Canvas) -> None:
+    """Average light, coverage, depth and pupil mask along a line, in place.
+
+    The mean of the depth is weighted by the coverage.
+    """
     for i, length, draws in canvas.having("movement"):
-        kernel = line_kernel(length * pixels, 3.1416 * draws[11])
-        kept = canvas.cover[i].clamp_min(1e-6)
-        stack = torch.cat(
+        kernel = line_kernel(length * canvas.pixels, 3.1416 * draws[11])
+        weight = canvas.cover[i].clamp_min(1e-6)
+        planes = torch.cat(
             [
                 canvas.light[i],
                 canvas.cover[i],
-                kept * canvas.depth[i],
-                kept,
+                weight * canvas.depth[i],
+                weight,
                 canvas.pupil[i][None],
             ]
         )
         reach = len(kernel) // 2
-        padded = F.pad(stack[:, None], (reach,) * 4, mode="replicate")
-        seen = F.conv2d(padded, kernel[None, None])[:, 0]
-        canvas.light[i], canvas.cover[i], canvas.depth[i], canvas.pupil[i] = (
-            seen[:2],
-            seen[2:4],
-            seen[4:6] / seen[6:8],
-            seen[8],
-        )
+        padded = F.pad(planes[:, None], (reach,) * 4, mode="replicate")
+        blurred = F.conv2d(padded, kernel[None, None])[:, 0]
+        canvas.light[i] = blurred[:2]
+        canvas.cover[i] = blurred[2:4]
+        canvas.depth[i] = blurred[4:6] / blurred[6:8]
+        canvas.pupil[i] = blurred[8]
 
 
-def _record(canvas: _Canvas) -> None:
-    """As another camera gives it: stray light, darker corners, white from some level
-    on, a curve from black to white.
+def _apply_camera_response(canvas: _Canvas) -> None:
+    """Stray light, vignetting, saturation and tone curve of another camera, in place.
 
-    A factor on both sheets alike. Curves are of the light before the lens, where frames
-    are dressed: blur and curve
-    change places only at edges.
+    A factor on both sheets. Curves act on the light before the lens, where frames are
+    augmented: exchanging blur and curve matters only at edges.
     """
     x, y = canvas.places
     for i, radiance, _ in canvas.having("veil"):
@@ -508,9 +534,8 @@ def _record(canvas: _Canvas) -> None:
         canvas.light[i] *= 1 - dark * 2 * (x**2 + y**2)
     for i, share, _ in canvas.having("saturation"):
         level = canvas.light[i].sum(0)
-        canvas.light[i] *= (
-            torch.quantile(level, 1 - share) / level.clamp_min(1e-9)
-        ).clamp(max=1.0)
+        white = torch.quantile(level, 1 - share)
+        canvas.light[i] *= (white / level.clamp_min(1e-9)).clamp(max=1.0)
     for i, log_gamma, _ in canvas.having("tone"):
         level = canvas.light[i].sum(0)
         white = torch.quantile(level, WHITE).clamp_min(1e-9)
@@ -518,18 +543,18 @@ def _record(canvas: _Canvas) -> None:
 
 
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:
-    """(k, k) weights, of sum 1, of a picture that moves evenly along a line of this
-    length through the middle.
+    """(k, k) weights of sum 1 for uniform motion blur along a centred line.
 
     Args:
-        length_px: length of the motion in pixels.
-        angle_rad: angle of the light to the axis, or of the line in the image.
+        length_px: length of the motion in pixels, limited to the kernel's TAPS.
+        angle_rad: angle of the line to the x axis.
     """
     reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
-    for along in ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach):
-        x = along * np.cos(angle_rad) + reach
-        y = along * np.sin(angle_rad) + reach
+    # 32 points of the line, each shared bilinearly between four pixels
+    for position in ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach):
+        x = position * np.cos(angle_rad) + reach
+        y = position * np.sin(angle_rad) + reach
         column, row = (min(int(v), 2 * reach - 1) if reach else 0 for v in (x, y))
         s, t = (x - column, y - row) if reach else (0.0, 0.0)
         for dy, dx, weight in (
@@ -543,14 +568,23 @@ def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     return torch.from_numpy(kernel / kernel.sum()).float()
 
 
-def _labels(labels: FrameLabels, before: Tensor, after: Tensor) -> FrameLabels:
-    """Centroid and visible share of the pupil as its mask is now."""
-    was, now = before.sum((1, 2)).double(), after.sum((1, 2)).double()
-    share = torch.where(was > 1e-6, now / was.clamp_min(1e-9), torch.ones_like(was))
-    place = torch.arange(after.shape[-1], dtype=torch.float64)
-    sums = torch.stack([(after.sum(k).double() * place).sum(1) for k in (1, 2)], 1)
+def _updated_labels(labels: FrameLabels, before: Tensor, after: Tensor) -> FrameLabels:
+    """Labels with centroid and visible share of the pupil recomputed for its new mask.
+
+    before, after: (n, y, x) masks. An empty mask has the centroid ``pupil_px``.
+    """
+    area_before, area_after = before.sum((1, 2)).double(), after.sum((1, 2)).double()
+    share = torch.where(
+        area_before > 1e-6,
+        area_after / area_before.clamp_min(1e-9),
+        torch.ones_like(area_before),
+    )
+    index = torch.arange(after.shape[-1], dtype=torch.float64)
+    sums = torch.stack([(after.sum(k).double() * index).sum(1) for k in (1, 2)], 1)
     centroid = torch.where(
-        now[:, None] > 1e-6, sums / now.clamp_min(1e-9)[:, None], labels.pupil_px
+        area_after[:, None] > 1e-6,
+        sums / area_after.clamp_min(1e-9)[:, None],
+        labels.pupil_px,
     )
     return replace(
         labels, visible=(labels.visible * share).clamp(max=1.0), centroid_px=centroid

@@ -56,16 +56,14 @@ def optical_axis(
     """Intersect the ray through the pupil's image with the sphere on which the pupil
     moves.
 
-    The slippage moves the camera, so the eye sits at centre - slip. With the unit ray u
-    and centre C the near
-    intersection is at t = u·C - sqrt((u·C)² - |C|² + R²); values and gradients stay
-    finite when the ray misses.
+    The slippage moves the camera, so the eye is at C = centre - slip. With the unit ray
+    u the first intersection is at t = u·C - sqrt((u·C)² - |C|² + R²). Values and
+    gradients are finite where the ray misses.
 
     Args:
         pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the
             lens axis.
-        slip_mm: (batch, 3) displacement of the camera.
-        geometry: of the person.
+        slip_mm: (batch, 3) displacement of the camera. geometry: of the person.
     """
     x, y = pupil_mm[..., 0], pupil_mm[..., 1]
     ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
@@ -74,24 +72,30 @@ def optical_axis(
         torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
     )
     along = (ray * centre).sum(-1)
-    beside = (
-        centre - along[..., None] * ray
-    )  # from the nearest point of the ray to the centre
-    inside = geometry.radius_mm**2 - (beside**2).sum(-1)
-    hit = inside > 0
-    depth = torch.sqrt(torch.where(hit, inside, torch.ones_like(inside))) * hit
-    offset = -beside - depth[..., None] * ray
+    # from the closest point of the ray to the centre
+    perpendicular = centre - along[..., None] * ray
+    discriminant = geometry.radius_mm**2 - (perpendicular**2).sum(-1)
+    hit = discriminant > 0
+    depth = (
+        torch.sqrt(torch.where(hit, discriminant, torch.ones_like(discriminant))) * hit
+    )
+    offset = -perpendicular - depth[..., None] * ray
     return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True), hit)
 
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:
-    """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|).
+    """(batch,) angle between directions, 2 atan2(|a - b|, |a + b|) of unit vectors,
+    rad.
+
+    Accurate and differentiable down to zero.
 
     Args:
-        one: to compare. other: the one it is compared with.
+        one: to compare. other: the reference.
     """
     a = one / one.norm(dim=-1, keepdim=True)
     b = other / other.norm(dim=-1, keepdim=True)
-    gap = ((a - b) ** 2).sum(-1)
-    near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
-    return 2 * torch.atan2(near, (a + b).norm(dim=-1))
+    square = ((a - b) ** 2).sum(-1)
+    distance = torch.sqrt(torch.where(square > 0, square, torch.ones_like(square))) * (
+        square > 0
+    )
+    return 2 * torch.atan2(distance, (a + b).norm(dim=-1))

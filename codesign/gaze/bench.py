@@ -35,57 +35,56 @@ class PeopleFrames(StateScenes):
 def simulate_people(
     scenes: EyeScenes, count: int, each: int, *, seed: int
 ) -> PeopleFrames:
-    """``count`` people who look and slip in ``each`` ways; one mounting of the camera a
-    person, no change of scale.
+    """Frames of ``count`` people in ``each`` random states of gaze and slip.
+
+    One mounting of the camera a person, and scale 1.
 
     Args:
-        scenes: frames by number. seed: of the random generator.
+        scenes: frames by number. count: people. each: frames of a person.
+        seed: of the random generator.
     """
     subjects = eye.draw_states(count, (seed, 21), motion=scenes.settings.motion)
     moves = eye.draw_states(count * each, (seed, 22), motion=scenes.settings.motion)
     rows = torch.arange(count).repeat_interleave(each)
-    mine = subjects[rows]
+    own = subjects[rows]
     states = replace(
-        moves, traits=mine.traits, textures=mine.textures, mount_rad=mine.mount_rad
+        moves, traits=own.traits, textures=own.textures, mount_rad=own.mount_rad
     )
     camera = replace(
         scenes.camera,
         pixels=32,
         pitch_um=scenes.camera.pitch_um * scenes.camera.pixels / 32,
     )
-    worn = drawn_of_people(rows.numpy(), scenes.settings.variety, (seed, 23))
+    augmentations = drawn_of_people(rows.numpy(), scenes.settings.variety, (seed, 23))
     labels = render(states, rig=scenes.rig, camera=camera).labels
-    return PeopleFrames(scenes, states, worn, STREAM, labels, count)
+    return PeopleFrames(scenes, states, augmentations, STREAM, labels, count)
 
 
 def read_of(
     test: PeopleFrames, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None
 ) -> NetworkReadings:
-    """What a network found in the frames, in the units that gaze is calibrated in.
+    """Predictions of a network for frames of people, in the units of gaze calibration.
 
     Args:
-        centre: (n, 2) pupil centre, fraction of the frame from its middle. slip_mm: (n,
-            3) of the head.
-        axis: (n, 3) optic axis in the camera's frame; None of a network that tells
-            none.
-        test: people, their frames and where they look.
+        test: people, their frames and gaze.
+        centre: (n, 2) pupil centre, fraction of the frame from its centre.
+        slip_mm: (n, 3) of the head.
+        axis: (n, 3) optic axis in the camera's frame; None of a network without one.
     """
     edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
-    angles = (
-        None
-        if axis is None
-        else face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
-    )
+    angles = None
+    if axis is not None:
+        angles = face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
     return NetworkReadings(
         centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles
     )
 
 
 def looked_deg(test: PeopleFrames) -> Array:
-    """(n, 2) angles of the visual axes, across and down in the frame of the face.
+    """(n, 2) angles of the visual axes, across and down in the frame of the face, deg.
 
     Args:
-        test: people, their frames and where they look.
+        test: people, their frames and gaze.
     """
     return face_angles(test.labels.visual_axis.numpy(), test.scenes.rig.elevation_rad)
 
@@ -115,21 +114,24 @@ def calibrated_error_deg(
     how: PersonCalibrator | None = None,
     share: float = 0.2,
 ) -> float:
-    """Mean angle between read and true visual axes, deg, over the frames that no
-    calibration used.
+    """Mean angle between predicted and true visual axes, deg, after personal
+    calibration.
+
+    Over the frames that no calibration used.
 
     Args:
-        how: people are calibrated; without it by the spherical-eye solver and residual
-            regressor (paper Sec. 3.3).
-        share: part of each person's frames that calibrates.
-        test: people, their frames and where they look.
+        test: people, their frames and gaze. read: readings of a network.
+        how: calibrates people; by default spherical-eye solver and residual regressor
+            (paper Sec. 3.3).
+        share: of each person's frames that calibrates, 3 frames at least.
     """
     how = how or SphereCalibrator(test.scenes.rig)
-    known = max(3, round(share * test.each))
-    looked, errors = looked_deg(test), []
+    calibrating = max(3, round(share * test.each))
+    true_deg = looked_deg(test)
+    errors = []
     for first in range(0, test.people * test.each, test.each):
-        mine = np.arange(first, first + known)
-        others = np.arange(first + known, first + test.each)
-        found = how.person(read[mine], looked[mine])(read[others])
-        errors.append(angle_deg(found, looked[others]))
+        calibration = np.arange(first, first + calibrating)
+        others = np.arange(first + calibrating, first + test.each)
+        gaze = how.person(read[calibration], true_deg[calibration])(read[others])
+        errors.append(angle_deg(gaze, true_deg[others]))
     return float(np.concatenate(errors).mean())

@@ -18,20 +18,15 @@ from codesign.gaze.regressor import ResidualRegressor
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
 
-# What people differ by, standard deviations: centre of the eye 1 mm each way (mounting
-# and head), its radius 0.6 mm
-# (size, and the cornea that magnifies), angles between sphere and gaze 5 degrees (kappa
-# and mounting), roll 0.05 rad.
+# Standard deviations between people: centre of the eye 1 mm each way (mounting and
+# head), its radius 0.6 mm (size, and magnification by the cornea), angles between sphere
+# and gaze 5 degrees (kappa and mounting), roll 0.05 rad.
 SPREAD = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
-# what a frame is trusted to at first, against SPREAD; then what the first fit leaves,
-# 0.3 at least
+# error of a frame in the first fit, weighed against SPREAD; in the second the residual
+# of the first, 0.3 at least
 READING_DEG = 1.0
-PENALTIES = (
-    0.01,
-    0.1,
-    1.0,
-    10.0,
-)  # of the regressor's weights: from ten clean points to eight noisy ones
+# of the regressor's weights: from ten clean points to eight noisy points
+PENALTIES = 0.01, 0.1, 1.0, 10.0
 FOLDS = 4  # that the penalty is chosen over
 TRIAL_STEPS = 40  # of a fit whose penalty is on trial
 
@@ -52,7 +47,10 @@ class PersonalGaze:
     rest: ResidualRegressor | None
 
     def sphere(self, pupil_mm: Array, slip_mm: Array) -> Array:
-        """(n, 2) gaze of the fitted sphere alone, deg.
+        """(n, 2) gaze of the fitted spherical eye alone, across and down, deg.
+
+        The optic axis through pupil and rotation centre, plus two angles, rotated by
+        the roll.
 
         Args:
             pupil_mm: (n, 2) pupil on the sensor. slip_mm: (n, 3) slippage.
@@ -69,7 +67,9 @@ class PersonalGaze:
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 
     def __call__(self, read: NetworkReadings) -> Array:
-        """(n, 2) gaze across and down, deg, of pupil and slippage."""
+        """(n, 2) gaze across and down, deg: sphere plus the regressor of its
+        residuals.
+        """
         first = self.sphere(read.pupil_mm, read.slip_mm)
         if self.rest is None:
             return first
@@ -126,15 +126,17 @@ def calibrate_person(
     hidden: int = 10,
     seed: int = 0,
 ) -> PersonalGaze:
-    """Calibrate a person: the sphere by regularised least squares, then a regressor of
-    what it leaves.
+    """Calibrate a person: spherical eye by regularised least squares, then a regressor.
+
+    Minimises |gaze error / reading|² + |parameters / SPREAD|² twice, the second time
+    with the residual of the first as reading error. The regressor learns the remaining
+    errors.
 
     Args:
-        pupil_mm: (n, 2) pupil on the sensor, from the lens axis. slip_mm: (n, 3)
-            displacement of the head.
-        gaze_deg: (n, 2) where the person looked, across and down. hidden: neurons of
-            the regressor; 0 for none.
-        rig: pose of camera and lamps. seed: of the random generator.
+        pupil_mm: (n, 2) pupil on the sensor, from the lens axis.
+        slip_mm: (n, 3) displacement of the head.
+        gaze_deg: (n, 2) true gaze, across and down. rig: pose of camera and lamps.
+        hidden: neurons of the regressor; 0 for none. seed: of the random generator.
 
     Raises:
         TrainingError: fewer than 3 points.
@@ -146,74 +148,80 @@ def calibrate_person(
     mean = mean_geometry(rig)
     pupil, slip = (np.ascontiguousarray(a, dtype=float) for a in (pupil_mm, slip_mm))
 
-    def of(own: Array) -> PersonalGaze:
+    def sphere_of(own: Array) -> PersonalGaze:
         return PersonalGaze(mean, rig.elevation_rad, own, None)
 
     def residual(unit: Array, reading_deg: float) -> Array:
-        miss = of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
-        return np.concatenate([miss.ravel() / reading_deg, unit])
+        error = sphere_of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
+        return np.concatenate([error.ravel() / reading_deg, unit])
 
     own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
-    freedom = max(1, 2 * len(pupil) - len(own))
-    left = max(
-        0.3, float(np.sqrt((residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum() / freedom))
-    )
-    person = of(least_squares(residual, own, args=(left,)).x * SPREAD)
+    degrees_of_freedom = max(1, 2 * len(pupil) - len(own))
+    square = (residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum()
+    reading_deg = max(0.3, float(np.sqrt(square / degrees_of_freedom)))
+    person = sphere_of(least_squares(residual, own, args=(reading_deg,)).x * SPREAD)
     if not hidden:
         return person
-    first = person.sphere(pupil, slip)
-    features = np.concatenate([first, slip], 1)
-    missed = gaze_deg - first
-    penalty = _penalty(features, missed, gaze_deg, hidden=hidden, seed=seed)
-    return replace(
-        person,
-        rest=regressor.fit_regressor(
-            features, missed, hidden=hidden, penalty=penalty, seed=seed
-        ),
+    sphere_deg = person.sphere(pupil, slip)
+    features = np.concatenate([sphere_deg, slip], 1)
+    errors = gaze_deg - sphere_deg
+    penalty = _cross_validated_penalty(
+        features, errors, gaze_deg, hidden=hidden, seed=seed
     )
+    rest = regressor.fit_regressor(
+        features, errors, hidden=hidden, penalty=penalty, seed=seed
+    )
+    return replace(person, rest=rest)
 
 
-def _penalty(
-    features: Array, missed: Array, gaze_deg: Array, *, hidden: int, seed: int
+def _cross_validated_penalty(
+    features: Array, errors: Array, gaze_deg: Array, *, hidden: int, seed: int
 ) -> float:
-    """The penalty under which points are best foretold by the others; frames of one
-    stimulus stay together.
+    """Penalty of least cross-validated error; all frames of one stimulus are in one
+    fold.
+
+    Args:
+        features: (n, 5). errors: (n, 2) errors of the sphere, deg.
     """
     _, stimulus = np.unique(gaze_deg, axis=0, return_inverse=True)
     fold: Array = np.ravel(stimulus) % FOLDS
 
-    def error(penalty: float) -> float:
+    def validation_error(penalty: float) -> float:
         total = 0.0
         for number in range(FOLDS):
-            out = fold == number
-            if out.any() and (~out).sum() >= 3:
-                made = regressor.fit_regressor(
-                    features[~out],
-                    missed[~out],
+            held_out = fold == number
+            if held_out.any() and (~held_out).sum() >= 3:
+                fitted = regressor.fit_regressor(
+                    features[~held_out],
+                    errors[~held_out],
                     hidden=hidden,
                     penalty=penalty,
                     seed=seed,
                     steps=TRIAL_STEPS,
                 )
-                total += float(((made(features[out]) - missed[out]) ** 2).sum())
+                total += float(
+                    ((fitted(features[held_out]) - errors[held_out]) ** 2).sum()
+                )
         return total
 
-    return min(PENALTIES, key=error)
+    return min(PENALTIES, key=validation_error)
 
 
 def angle_deg(one: Array, other: Array) -> Array:
-    """(n,) angle between directions given by their angles across and down, deg.
+    """(n,) angle between directions, deg, each (n, 2) angles across and down.
 
     Args:
-        one: to compare. other: the one it is compared with.
+        one: to compare. other: the reference.
     """
     a, b = (torch.from_numpy(gaze_direction(np.radians(v))) for v in (one, other))
     return np.asarray(np.degrees(angle_rad(a, b).numpy()))
 
 
 def gaze_direction(angles_rad: Array) -> Array:
-    """(n, 3) unit vectors right, down and out of the face, of angles (n, 2) across and
+    """(n, 3) unit vectors (right, down, out of the face) of angles x, y across and
     down.
+
+    (sin x cos y, sin y, cos x cos y).
 
     Args:
         angles_rad: (n, 2) across and down.

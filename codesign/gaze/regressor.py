@@ -42,14 +42,16 @@ def fit_regressor(
     seed: int = 0,
     steps: int = 200,
 ) -> ResidualRegressor:
-    """Least squares with a penalty on the weights, by Levenberg-Marquardt with exact
-    derivatives.
+    """Fit a one-hidden-layer tanh network by penalised least squares.
+
+    Minimises |outputs - targets|² + penalty n |weights|² on standardised data, by
+    Levenberg-Marquardt with the exact Jacobian.
 
     Args:
-        features: (n, f). targets: (n, t). penalty: of the squared weights, relative to
-            the squared error of a point.
-        steps: evaluations that the search may take.
-        hidden: neurons of the hidden layer. seed: of the random generator.
+        features: (n, f). targets: (n, t).
+        hidden: neurons of the hidden layer.
+        penalty: of the squared weights, relative to the squared error of a point.
+        seed: of the initial weights. steps: evaluations at most.
 
     Raises:
         TrainingError: fewer than 3 points.
@@ -60,7 +62,8 @@ def fit_regressor(
         np.stack([a.mean(0), np.maximum(a.std(0), 1e-9)]) for a in (features, targets)
     ]
     x, y = ((a - s[0]) / s[1] for a, s in zip((features, targets), scales, strict=True))
-    f, t = x.shape[1], y.shape[1]
+    f = x.shape[1]
+    t = y.shape[1]
     rng = np.random.default_rng(seed)
     start = np.concatenate(
         [
@@ -70,35 +73,37 @@ def fit_regressor(
     )
     weight = np.sqrt(penalty * len(x)) * np.ones(len(start))
 
-    def parts(v: Array) -> tuple[Array, Array]:
-        return v[: (f + 1) * hidden].reshape(f + 1, hidden), v[
-            (f + 1) * hidden :
-        ].reshape(hidden + 1, t)
+    def weights_of(v: Array) -> tuple[Array, Array]:
+        inside, outside = np.split(v, [(f + 1) * hidden])
+        return inside.reshape(f + 1, hidden), outside.reshape(hidden + 1, t)
 
     def residual(v: Array) -> Array:
-        return np.concatenate([(_forward(*parts(v), x) - y).ravel(), weight * v])
+        return np.concatenate([(_forward(*weights_of(v), x) - y).ravel(), weight * v])
 
-    def slope(v: Array) -> Array:
-        inside, outside = parts(v)
+    def jacobian(v: Array) -> Array:
+        inside, outside = weights_of(v)
         return np.concatenate([_jacobian(inside, outside, x), np.diag(weight)])
 
-    found = least_squares(residual, start, slope, method="lm", max_nfev=steps)
-    return ResidualRegressor(*parts(found.x), *scales)
+    fit = least_squares(residual, start, jacobian, method="lm", max_nfev=steps)
+    return ResidualRegressor(*weights_of(fit.x), *scales)
 
 
 def _forward(inside: Array, outside: Array, x: Array) -> Array:
+    """(n, targets) outputs tanh(x A + a) B + b; the last rows of the weights are a
+    and b.
+    """
     return np.asarray(
         np.tanh(x @ inside[:-1] + inside[-1]) @ outside[:-1] + outside[-1]
     )
 
 
 def _jacobian(inside: Array, outside: Array, x: Array) -> Array:
-    """(n t, parameters) derivatives of the outputs."""
+    """(n t, parameters) derivatives of the outputs by the weights of both layers."""
     n, t = len(x), outside.shape[1]
-    level = np.tanh(x @ inside[:-1] + inside[-1])
-    rise = (1 - level**2)[:, None, :] * outside[:-1].T  # (n, t, hidden)
-    wide = np.concatenate([x, np.ones((n, 1))], 1)
-    by_inside = np.einsum("nf,nth->ntfh", wide, rise).reshape(n * t, -1)
-    tall = np.concatenate([level, np.ones((n, 1))], 1)
-    by_outside = np.einsum("nh,tu->nthu", tall, np.eye(t)).reshape(n * t, -1)
+    activation = np.tanh(x @ inside[:-1] + inside[-1])
+    slope = (1 - activation**2)[:, None, :] * outside[:-1].T  # (n, t, hidden)
+    inputs = np.concatenate([x, np.ones((n, 1))], 1)
+    by_inside = np.einsum("nf,nth->ntfh", inputs, slope).reshape(n * t, -1)
+    hidden = np.concatenate([activation, np.ones((n, 1))], 1)
+    by_outside = np.einsum("nh,tu->nthu", hidden, np.eye(t)).reshape(n * t, -1)
     return np.concatenate([by_inside, by_outside], 1)

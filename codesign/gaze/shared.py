@@ -10,21 +10,18 @@ from codesign.gaze.readings import NetworkReadings
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
 
-# of expectation maximisation: answers stand by then, variances near 0 still fall
+# of expectation maximisation: predictions have converged, variances near 0 still fall
 ROUNDS = 40
-KAPPA_DEG, OTHERS_DEG = (
-    5.0,
-    1.0,
-)  # first guess of how people differ: by an offset, and by any other term a unit
-LEAST = 1e-9  # deg²: a variance that people do not show stays above 0
+# initial deviations between people: of the offset, and of any other term per unit
+KAPPA_DEG, OTHERS_DEG = 5.0, 1.0
+LEAST = 1e-9  # deg²: lower bound of variances
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MixedModel:
-    """What people have in common, and how far they differ.
+    """Linear mixed model: mean over people, and their variance.
 
-    mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of answers in
-    degrees.
+    mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of gaze in degrees.
     """
 
     mean: Array
@@ -32,34 +29,38 @@ class MixedModel:
     noise: Array
 
     def own(self, design: Array, answers: Array) -> Array:
-        """(terms, 2) coefficients β + u of one person, the mean under the prior given
-        its frames.
+        """(terms, 2) coefficients β + u of one person: posterior mean from that
+        person's frames.
 
         Args:
             design: (n, terms). answers: (n, 2).
         """
-        return np.stack(
-            [self.mean[:, k] + self._of(design, answers, k)[0] for k in range(2)], 1
-        )
+        columns = [
+            self.mean[:, k] + self._effects(design, answers, k)[0] for k in range(2)
+        ]
+        return np.stack(columns, 1)
 
-    def _of(self, design: Array, answers: Array, k: int) -> tuple[Array, Array]:
-        """Mean (terms,) and covariance (terms, terms) of u in one answer."""
+    def _effects(self, design: Array, answers: Array, k: int) -> tuple[Array, Array]:
+        """Posterior mean (terms,) and covariance (terms, terms) of u in component k.
+
+        C = (X^T X / σ² + diag(1 / τ²))⁻¹, u = C X^T (y - X β) / σ².
+        """
         cov = np.linalg.inv(
             design.T @ design / self.noise[k] + np.diag(1 / self.variance[:, k])
         )
-        return cov @ (
-            design.T @ (answers[:, k] - design @ self.mean[:, k])
-        ) / self.noise[k], cov
+        residual = answers[:, k] - design @ self.mean[:, k]
+        return cov @ (design.T @ residual) / self.noise[k], cov
 
 
 def fit_mixed_model(
     design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS
 ) -> MixedModel:
-    """The model of greatest likelihood, from ``rounds`` of expectation maximisation.
+    """Linear mixed model of largest likelihood, by ``rounds`` of expectation
+    maximisation.
 
     Args:
         design: (n, terms). answers: (n, 2), deg. person: (n,) numbers of people.
-        first: (terms,) variances to begin from.
+        first: (terms,) initial variances. rounds: of expectation maximisation.
 
     Raises:
         TrainingError: fewer than two people, or fewer frames than terms.
@@ -71,40 +72,45 @@ def fit_mixed_model(
             "two people or more, and more frames than terms"
         )
     mean = np.linalg.lstsq(design, answers, rcond=None)[0]
-    found = MixedModel(
+    model = MixedModel(
         mean,
         np.repeat(first[:, None], 2, 1),
         np.maximum((answers - design @ mean).var(0), LEAST),
     )
     for _ in range(rounds):
-        found = _again(found, design, answers, people)
-    return found
+        model = _em_step(model, design, answers, people)
+    return model
 
 
-def _again(
-    found: MixedModel, design: Array, answers: Array, people: list[Array]
+def _em_step(
+    model: MixedModel, design: Array, answers: Array, people: list[Array]
 ) -> MixedModel:
-    """One round: u of everybody given the model, then the model given them (both with
-    their covariances).
+    """One round of expectation maximisation.
+
+    E: effects u of everybody by the model. M: mean, variances and noise by those
+    effects and their covariances.
+
+    Args:
+        people: rows of the design of each person.
     """
     mean, variance, noise = (
-        np.empty_like(v) for v in (found.mean, found.variance, found.noise)
+        np.empty_like(v) for v in (model.mean, model.variance, model.noise)
     )
     for k in range(2):
-        effects = [found._of(design[rows], answers[rows], k) for rows in people]
-        theirs = np.zeros(len(design))
+        effects = [model._effects(design[rows], answers[rows], k) for rows in people]
+        personal = np.zeros(len(design))
         for rows, (u, _) in zip(people, effects, strict=True):
-            theirs[rows] = design[rows] @ u
-        mean[:, k] = np.linalg.lstsq(design, answers[:, k] - theirs, rcond=None)[0]
+            personal[rows] = design[rows] @ u
+        mean[:, k] = np.linalg.lstsq(design, answers[:, k] - personal, rcond=None)[0]
         variance[:, k] = (
             np.mean([u**2 + np.diag(cov) for u, cov in effects], axis=0) + LEAST
         )
-        left = ((answers[:, k] - design @ mean[:, k] - theirs) ** 2).sum()
-        unsure = sum(
+        residual = ((answers[:, k] - design @ mean[:, k] - personal) ** 2).sum()
+        uncertainty = sum(
             np.sum((design[rows] @ cov) * design[rows])
             for rows, (_, cov) in zip(people, effects, strict=True)
         )
-        noise[k] = (left + unsure) / len(design) + LEAST
+        noise[k] = (residual + uncertainty) / len(design) + LEAST
     return MixedModel(mean, variance, noise)
 
 
@@ -126,7 +132,7 @@ class PopulationPrior:
         Args:
             read: pupil, slippage and axis as a network reads them.
         """
-        return _terms(_joined_readings(read), self.middle, self.spread)
+        return _quadratic_terms(_joined_readings(read), self.middle, self.spread)
 
     def person(self, read: NetworkReadings, gaze_deg: Array) -> "MixedModelPerson":
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
@@ -142,7 +148,7 @@ class PopulationPrior:
                 f"a personal calibration from {len(read)} points, need 3 or more"
             )
         return MixedModelPerson(
-            self, self.model.own(self.terms(read), gaze_deg - _axis(read))
+            self, self.model.own(self.terms(read), gaze_deg - _axis_deg(read))
         )
 
 
@@ -157,7 +163,7 @@ class MixedModelPerson:
 
     def __call__(self, read: NetworkReadings) -> Array:
         """(n, 2) gaze across and down, deg."""
-        return np.asarray(_axis(read) + self.people.terms(read) @ self.coefficients)
+        return np.asarray(_axis_deg(read) + self.people.terms(read) @ self.coefficients)
 
 
 def learn_population(
@@ -166,25 +172,30 @@ def learn_population(
     """Fit the mixed-effects prior of gaze to the readings of many people.
 
     Args:
-        read: of n frames. gaze_deg: (n, 2) where was looked, across and down. person:
-            (n,) whose frame it is.
+        read: of n frames. gaze_deg: (n, 2) true gaze, across and down.
+        person: (n,) whose frame it is.
 
     Raises:
         TrainingError: too few people or frames, or readings without an axis.
     """
-    together = _joined_readings(read)
-    middle, spread = together.mean(0), np.maximum(together.std(0), 1e-9)
-    design = _terms(together, middle, spread)
+    readings = _joined_readings(read)
+    middle, spread = readings.mean(0), np.maximum(readings.std(0), 1e-9)
+    design = _quadratic_terms(readings, middle, spread)
     first = np.full(design.shape[1], OTHERS_DEG**2)
     first[0] = KAPPA_DEG**2
     return PopulationPrior(
-        fit_mixed_model(design, gaze_deg - _axis(read), person, first=first),
+        fit_mixed_model(design, gaze_deg - _axis_deg(read), person, first=first),
         middle,
         spread,
     )
 
 
-def _axis(read: NetworkReadings) -> Array:
+def _axis_deg(read: NetworkReadings) -> Array:
+    """(n, 2) angles of the optic axis, deg.
+
+    Raises:
+        TrainingError: readings without an axis.
+    """
     if read.axis_deg is None:
         raise TrainingError(
             "the readings hold no optic axis, which gaze is told from here; calibrate by the sphere"
@@ -193,10 +204,12 @@ def _axis(read: NetworkReadings) -> Array:
 
 
 def _joined_readings(read: NetworkReadings) -> Array:
-    return np.concatenate([_axis(read), read.pupil_mm, read.slip_mm], 1)
+    """(n, 7) axis in deg, pupil and slippage in mm."""
+    return np.concatenate([_axis_deg(read), read.pupil_mm, read.slip_mm], 1)
 
 
-def _terms(together: Array, middle: Array, spread: Array) -> Array:
-    x = (together - middle) / spread
-    one, other = np.triu_indices(x.shape[1])
-    return np.concatenate([np.ones((len(x), 1)), x, x[:, one] * x[:, other]], 1)
+def _quadratic_terms(readings: Array, middle: Array, spread: Array) -> Array:
+    """(n, 36) constant, 7 normalised readings x, and their 28 products."""
+    x = (readings - middle) / spread
+    first, second = np.triu_indices(x.shape[1])
+    return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], 1)

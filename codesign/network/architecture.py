@@ -122,28 +122,28 @@ class Architecture:
 
 
 def round_channels(channels: float, divisor: int = 8) -> int:
-    """Channels rounded to a multiple of ``divisor``, never losing more than a tenth
+    """Channels rounded to a multiple of ``divisor``, at least 0.9 of the given number
     (MobileNet convention).
 
     Args:
-        channels: wanted number of channels.
+        channels: number before rounding. divisor: of the result.
     """
     rounded = max(divisor, int(channels + divisor / 2) // divisor * divisor)
     return rounded + divisor if rounded < 0.9 * channels else rounded
 
 
 def check_architecture(space: SearchSpace, architecture: Architecture) -> Architecture:
-    """``architecture`` if it belongs to ``space``.
+    """``architecture`` itself if it belongs to ``space``.
 
     Raises:
         ConfigError: naming the entry that does not.
     """
-    wanted = {
+    lengths = {
         "depths": len(space.stages),
         "kernels": space.slots,
         "expansions": space.slots,
     }
-    for name, count in wanted.items():
+    for name, count in lengths.items():
         values = getattr(architecture, name)
         if len(values) != count:
             raise ConfigError(f"architecture has {len(values)} {name}, need {count}")
@@ -176,7 +176,9 @@ def stem_channels(space: SearchSpace, architecture: Architecture) -> int:
 def active_blocks(
     space: SearchSpace, architecture: Architecture
 ) -> list[list[BlockSpec]]:
-    """The active blocks, stage by stage.
+    """Sizes of the active blocks, a list for each stage.
+
+    The first block of a stage has its stride; channels are rounded to multiples of 8.
 
     Args:
         space: architectures to choose from. architecture: member of the search space.
@@ -254,20 +256,23 @@ def mutate_architecture(
     *,
     rate: float = 0.15,
 ) -> Architecture:
-    """A neighbour: every entry is drawn anew with probability ``rate``.
+    """A mutation: every entry is drawn anew with probability ``rate``.
 
-    Where no active entry changed, one that can change is drawn from its other values.
-    The only member of a space is its own neighbour.
+    Where no active entry changed, a random neighbour that differs in one active entry.
+    The only member of a space is returned itself.
 
     Args:
-        architecture: member of the search space. generator: of the draws.
+        space: architectures to choose from. architecture: member of the search space.
+        generator: of the draws. rate: probability per entry.
     """
     other = sample_architecture(space, generator)
     child = replace(
         architecture,
-        depths=_mix(architecture.depths, other.depths, generator, rate),
-        kernels=_mix(architecture.kernels, other.kernels, generator, rate),
-        expansions=_mix(architecture.expansions, other.expansions, generator, rate),
+        depths=_recombine(architecture.depths, other.depths, generator, rate),
+        kernels=_recombine(architecture.kernels, other.kernels, generator, rate),
+        expansions=_recombine(
+            architecture.expansions, other.expansions, generator, rate
+        ),
         width=other.width if generator.random() < rate else architecture.width,
         resolution=other.resolution
         if generator.random() < rate
@@ -284,8 +289,10 @@ def mutate_architecture(
 
 
 def _neighbours(space: SearchSpace, architecture: Architecture) -> list[Architecture]:
-    """Every other network that differs from this one in a single entry."""
-    found = []
+    """Every member of the space that differs from an architecture in one active
+    entry.
+    """
+    neighbours = []
     choices: dict[str, tuple[Any, ...]] = {
         "depths": space.depths,
         "kernels": space.kernels,
@@ -296,11 +303,13 @@ def _neighbours(space: SearchSpace, architecture: Architecture) -> list[Architec
         for i in range(len(row)):
             for value in values:
                 changed: Any = {name: (*row[:i], value, *row[i + 1 :])}
-                found.append(replace(architecture, **changed))
-    found += [replace(architecture, width=width) for width in space.widths]
-    found += [replace(architecture, resolution=r) for r in search_resolutions(space)]
-    here = canonical_architecture(space, architecture)
-    return [one for one in found if canonical_architecture(space, one) != here]
+                neighbours.append(replace(architecture, **changed))
+    neighbours += [replace(architecture, width=width) for width in space.widths]
+    neighbours += [
+        replace(architecture, resolution=r) for r in search_resolutions(space)
+    ]
+    own = canonical_architecture(space, architecture)
+    return [a for a in neighbours if canonical_architecture(space, a) != own]
 
 
 def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
@@ -317,8 +326,9 @@ def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
 def canonical_architecture(
     space: SearchSpace, architecture: Architecture
 ) -> Architecture:
-    """The same network with every idle slot set to the least choice: equal networks
-    compare equal.
+    """The same network with every idle slot set to the smallest choice.
+
+    Equal networks then compare equal.
 
     Args:
         space: architectures to choose from. architecture: member of the search space.
@@ -340,6 +350,7 @@ def canonical_architecture(
 
 
 def _uniform(space: SearchSpace, pick: Callable[[Any], Any]) -> Architecture:
+    """The member with ``pick`` (max or min) of every choice."""
     return Architecture(
         depths=(pick(space.depths),) * len(space.stages),
         kernels=(pick(space.kernels),) * space.slots,
@@ -349,12 +360,13 @@ def _uniform(space: SearchSpace, pick: Callable[[Any], Any]) -> Architecture:
     )
 
 
-def _mix(
+def _recombine(
     mine: tuple[int, ...],
     others: tuple[int, ...],
     generator: np.random.Generator,
     rate: float,
 ) -> tuple[int, ...]:
+    """Entries of ``others`` with probability ``rate`` each, else of ``mine``."""
     return tuple(
         b if generator.random() < rate else a for a, b in zip(mine, others, strict=True)
     )

@@ -23,36 +23,35 @@ from codesign.network.windows import (
     window_spectra,
 )
 
-FEATURES = (
-    COLUMNS * ROWS + 1 + STEP_FEATURES
-)  # powers, the mean of the window, steps of brightness
-PLACES = 5  # polynomials of the place in the frame
+# powers, the mean of the window, statistics of brightness steps
+FEATURES = COLUMNS * ROWS + 1 + STEP_FEATURES
+PLACES = 5  # polynomials of the position in the frame
 HIDDEN = (48, 32)
-# windows along a side that a block reads together: a face is smooth, and neighbours
-# tell of a window
+# windows along a side that a block mixes: faces are smooth, so neighbours inform a
+# window
 REACH = 5
-BLOCKS = 2  # one after the other
-# numbers that a window tells the slippage beside its depth: where the eye is in it, how
-# sure its texture is
+BLOCKS = 2  # in sequence
+# unlabelled features of a window for the slippage, in addition to its depth: position of
+# the eye, confidence in the texture
 BESIDE = 8
-SLIP_FEATURES = (
-    3 + BESIDE
-) * GRID**2 + 2  # vergence, its spread, the mean and these of every window; means
+# vergence, its spread, the mean and BESIDE features of every window; two means
+SLIP_FEATURES = (3 + BESIDE) * GRID**2 + 2
 
-VERGENCE_PER_M, VERGENCE_UNIT_PER_M = (
-    45.0,
-    8.0,
-)  # 1 / depth of a face before the camera: mean and spread
+# 1 / depth of a face before the camera: mean and spread
+VERGENCE_PER_M = 45.0
+VERGENCE_UNIT_PER_M = 8.0
 
 
 def blur_branch_macs(size: int) -> int:
-    """Multiply-accumulates of the branch for a square frame of ``size`` pixels: waves,
-    steps, layers.
+    """Multiply-accumulates of the branch for a square frame: spectra, steps, layers.
+
+    Args:
+        size: side of the frame in pixels.
     """
-    around = HIDDEN[0] * REACH**2 + HIDDEN[0] ** 2
+    block = HIDDEN[0] * REACH**2 + HIDDEN[0] ** 2
     layers = (
         (FEATURES + PLACES) * HIDDEN[0]
-        + BLOCKS * around
+        + BLOCKS * block
         + HIDDEN[0] * HIDDEN[1]
         + HIDDEN[1] * (2 + BESIDE)
     )
@@ -72,29 +71,31 @@ def content_macs(channels: int) -> int:
 
 @functools.lru_cache(maxsize=16)
 def window_weights(size: int) -> Tensor:
-    """(GRID, size) share of every pixel of a line in each window: the square of the
-    weight, which power has; sum 1.
+    """(GRID, size) weight of every pixel of a line in each window, sum 1 a window.
+
+    sin⁴, the square of the Hann weight sin², since power is quadratic.
+
+    Args:
+        size: side of the frame in pixels.
     """
     step = step_of(size)
     first = (size - (GRID + 1) * step) // 2
-    weight = (
-        torch.sin(
-            math.pi * (torch.arange(2 * step, dtype=torch.float64) + 0.5) / (2 * step)
-        )
-        ** 4
-    )
-    out = torch.zeros(GRID, size, dtype=torch.float64)
+    position = torch.arange(2 * step, dtype=torch.float64) + 0.5
+    weight = torch.sin(math.pi * position / (2 * step)) ** 4
+    weights = torch.zeros(GRID, size, dtype=torch.float64)
     for i in range(GRID):
-        out[i, first + i * step : first + (i + 2) * step] = weight / weight.sum()
-    return out.float()
+        weights[i, first + i * step : first + (i + 2) * step] = weight / weight.sum()
+    return weights.float()
 
 
 def window_vergence(depth_um: Tensor) -> Tensor:
-    """(batch, GRID, GRID) mean 1 / depth of every window, in the units of the branch,
-    from (batch, y, x) depths.
+    """(batch, GRID, GRID) weighted mean 1 / depth of every window, in units of the
+    branch.
+
+    (1 / depth - VERGENCE_PER_M) / VERGENCE_UNIT_PER_M.
 
     Args:
-        depth_um: (n, y, x) or (n,) depth before the lens.
+        depth_um: (batch, y, x) depth before the lens.
     """
     rows, columns = (window_weights(int(n)).to(depth_um) for n in depth_um.shape[-2:])
     vergence = (1e6 / depth_um - VERGENCE_PER_M) / VERGENCE_UNIT_PER_M
@@ -147,18 +148,14 @@ class BlurBranch(nn.Module):
     (depth, features)``.
 
     depth: (batch, 2, GRID, GRID) vergence in units of :data:`VERGENCE_UNIT_PER_M` about
-    :data:`VERGENCE_PER_M`, and
-    the logarithm of its standard deviation. features: (batch, SLIP_FEATURES) for the
-    slippage.
+    :data:`VERGENCE_PER_M`, and the logarithm of its standard deviation.
+    features: (batch, SLIP_FEATURES) for the slippage.
 
-    A PSF differs from window to window of the field, so every window weighs the spectra
-    that the first layer has
-    learned by gains and offsets of its own; they cost next to nothing. Its depth is
-    then read together with its
-    neighbours', twice, each time with what all windows of the frame hold. Beside it
-    every window tells the slippage a
-    few numbers that no label holds: depths alone, trained on their own, leave a fifth
-    more error.
+    PSFs differ between windows of the field, so every window weights the spectra of the
+    first layer by gains and offsets of its own. Its depth is then computed with those
+    of its neighbours and the context of the frame, in BLOCKS blocks. Every window also
+    contributes BESIDE features without labels to the slippage: depths alone leave a
+    fifth more error.
     """
 
     place: Tensor
@@ -185,35 +182,46 @@ class BlurBranch(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        weighed, mean = self._weighed(frames)
-        return self._read_windows(self.depth(self._read(weighed)), mean)
+        """Depth and features of frames (batch, 1, y, x); see the class."""
+        spectra, mean = self._weighted_spectra(frames)
+        return self._read_windows(self.depth(self._read(spectra)), mean)
 
-    def _weighed(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID,
-        GRID), and its mean.
+    def _weighted_spectra(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Spectra after the first layer with each window's gain and offset, and window
+        means.
+
+        (batch, HIDDEN[0], GRID, GRID) and (batch, 1, GRID, GRID).
         """
         power, mean = window_spectra(frames)
         features = self.norm(
             torch.cat([torch.log(power + FLOOR), mean, gradient_statistics(frames)], 1)
         )
-        features = torch.cat(
-            [features, self.place + torch.zeros_like(mean)], 1
-        )  # of as many frames, traced too
+        # broadcast over the frames by a sum, which export can trace
+        position = self.place + torch.zeros_like(mean)
+        features = torch.cat([features, position], 1)
         return self.first(features) * self.gain + self.offset, mean
 
-    def _read(self, weighed: Tensor) -> Tensor:
-        """(batch, HIDDEN[1], GRID, GRID) of every window with its neighbours."""
-        read: Tensor = F.hardswish(self.second(self.together(F.hardswish(weighed))))
-        return read
+    def _read(self, spectra: Tensor) -> Tensor:
+        """(batch, HIDDEN[1], GRID, GRID) features of every window mixed with its
+        neighbours.
+        """
+        mixed: Tensor = F.hardswish(self.second(self.together(F.hardswish(spectra))))
+        return mixed
 
     def _read_windows(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-        spread = out[:, 1].clamp(-3, 2)
-        depth = torch.stack([out[:, 0], spread], 1)
-        trust = torch.exp(-2 * spread)
-        total = trust.sum((1, 2))
-        means = torch.stack(
-            [(trust * depth[:, 0]).sum((1, 2)) / total, spread.mean((1, 2))], 1
-        )
+        """Depth (batch, 2, GRID, GRID) and features (batch, SLIP_FEATURES) from the
+        last layer.
+
+        The log standard deviation is clipped to [-3, 2]. The features are depths, means
+        and BESIDE features of every window, the precision-weighted mean vergence and
+        the mean log standard deviation.
+        """
+        log_sd = out[:, 1].clamp(-3, 2)
+        depth = torch.stack([out[:, 0], log_sd], 1)
+        precision = torch.exp(-2 * log_sd)
+        total = precision.sum((1, 2))
+        vergence = (precision * depth[:, 0]).sum((1, 2)) / total
+        means = torch.stack([vergence, log_sd.mean((1, 2))], 1)
         return depth, torch.cat(
             [depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1)], 1
         )
@@ -223,13 +231,11 @@ class InformedBranch(BlurBranch):
     """Blur branch conditioned on content: ``forward(frames, content) -> (depth,
     features, axial)``.
 
-    content: (batch, channels, y, x) of the whole frame, as the pupil's mask is decoded
-    from. A power spectrum is that
-    of texture times blur; whoever knows a pupil's edge from a lash knows the texture,
-    and reads the blur from fewer
-    frames. axial: (batch,) axial slippage, in units of its scale: every window's own
-    estimate, with the shares that
-    the windows claim (their softmax). What the calibration head makes of the depths is
+    content: (batch, channels, y, x) of the whole frame, from which the pupil's mask is
+    decoded. A power spectrum is that of texture times blur; content tells a pupil's
+    edge from a lash, so the blur is learned from fewer frames. axial: (batch,) axial
+    slippage, in units of its scale: the mean of every window's estimate, weighted by
+    the softmax of their claims. The calibration head's estimate from the depths is
     added to it.
     """
 
@@ -240,8 +246,9 @@ class InformedBranch(BlurBranch):
         self.vote = nn.Conv2d(HIDDEN[1], 2, 1)
 
     def forward(self, frames: Tensor, content: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
-        weighed, mean = self._weighed(frames)
-        read = self._read(weighed + self.content(window_content(content)))
-        estimate, claim = self.vote(read).flatten(2).unbind(1)
-        depth, features = self._read_windows(self.depth(read), mean)
+        """Depth, features and axial slippage of frames and content; see the class."""
+        spectra, mean = self._weighted_spectra(frames)
+        mixed = self._read(spectra + self.content(window_content(content)))
+        estimate, claim = self.vote(mixed).flatten(2).unbind(1)
+        depth, features = self._read_windows(self.depth(mixed), mean)
         return depth, features, (torch.softmax(claim, 1) * estimate).sum(1)

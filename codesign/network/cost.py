@@ -20,11 +20,11 @@ from codesign.network.architecture import (
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 
-# widths of the heads; the networks and the count share them
 LEAST_SIZE = 16  # pixels along the edge of an input
+# widths of the heads; the networks and the count share them
 MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN = 24, 16, 8, 64
-POINTS = 10  # landmarks of the eye that are sought, and the pupil's middle
-POINT_FEATURES = 3 * POINTS  # their places, and how wide their maps are
+POINTS = 10  # landmarks of the eye, and the pupil's centre
+POINT_FEATURES = 3 * POINTS  # their coordinates, and the widths of their maps
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,13 @@ class MacPolynomial:
 def backbone_cost(
     stem: int, rows: Iterable[BlockSpec], *, inputs: int = 1, stem_kernel: int = 3
 ) -> MacPolynomial:
-    """Cost of a stem of stride 2 and the blocks behind it.
+    """Multiply-accumulates of a stem of stride 2 and the blocks after it, by stride.
+
+    The squeeze-and-excitation layers do not depend on the image size.
 
     Args:
-        rows: blocks in order. inputs: channels of the input.
+        stem: channels of the stem. rows: blocks in order. inputs: channels of the
+            input.
         stem_kernel: side of the stem's kernel.
     """
     per_pixel = {2: inputs * stem * stem_kernel**2}
@@ -74,7 +77,7 @@ def backbone_cost(
 
 
 def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomial:
-    """Cost of backbone, blur branch, perception head and calibration head.
+    """Multiply-accumulates of backbone, blur branch, perception and calibration head.
 
     Args:
         space: architectures to choose from. architecture: member of the search space.
@@ -90,9 +93,8 @@ def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomia
             per_pixel.get(stride, 0) + rows[stage][-1].outputs * MASK_CHANNELS
         )
     finest = laterals[0][1]
-    per_pixel[finest] += MASK_CHANNELS * (
-        9 + 1 + POINTS
-    )  # depthwise 3x3, then the mask itself and the landmarks
+    # depthwise 3x3, then the mask itself and the landmarks
+    per_pixel[finest] += MASK_CHANNELS * (9 + 1 + POINTS)
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
     features = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
@@ -102,8 +104,9 @@ def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomia
 
 
 def lateral_strides(space: SearchSpace) -> list[tuple[int, int]]:
-    """(stage, total stride) of the features that the mask is decoded from: the last
-    stage of every stride.
+    """(stage, total stride) of the features that the mask is decoded from.
+
+    The last stage of every stride, from fine to coarse.
 
     Args:
         space: architectures to choose from.
@@ -125,11 +128,11 @@ def total_stride(space: SearchSpace) -> int:
 
 
 def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
-    """Pixels along the edge of the network's input: window / pitch, scaled.
+    """Pixels along the edge of the network's input: window / pitch * resolution.
 
     Args:
-        window_um: edge of the image. pitch_um: of the pixels.
-        resolution: pixels that the network keeps, of the sensor's along a side.
+        window_um: side of the image. pitch_um: of the pixels.
+        resolution: scale of the input, in (0, 1].
 
     Raises:
         ConfigError: less than 16 pixels remain.
@@ -170,11 +173,10 @@ def macs_of_size(
 
 
 def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
-    """Counts at integer sizes continued to a continuous size, differentiable.
+    """Monotone cubic interpolation of integer-size counts at a continuous size.
 
-    A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more
-    pixels never cost less, and where
-    two counts are equal the gradient between them is zero.
+    Fritsch and Carlson 1980, differentiable: exact at integers, never decreasing, and
+    of zero gradient between equal counts.
 
     Args:
         at: exact counts at integer sizes. size: scalar.
@@ -182,20 +184,24 @@ def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Te
     size = torch.as_tensor(size, dtype=torch.float64)
     low = int(torch.floor(size.detach()))
     counts = at(np.arange(low - 1, low + 3)).astype(float)
-    before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
-    slope = _slope(here - before, after - here)
-    next_slope = _slope(after - here, beyond - after)
-    u = size - low
+    previous, left, right, next_count = (
+        torch.tensor(c, dtype=torch.float64) for c in counts
+    )
+    left_slope = _slope(left - previous, right - left)
+    right_slope = _slope(right - left, next_count - right)
+    fraction = size - low
     return (
-        here * (1 + 2 * u) * (1 - u) ** 2
-        + after * u**2 * (3 - 2 * u)
-        + slope * u * (1 - u) ** 2
-        + next_slope * u**2 * (u - 1)
+        left * (1 + 2 * fraction) * (1 - fraction) ** 2
+        + right * fraction**2 * (3 - 2 * fraction)
+        + left_slope * fraction * (1 - fraction) ** 2
+        + right_slope * fraction**2 * (fraction - 1)
     )
 
 
 def _slope(left: Tensor, right: Tensor) -> Tensor:
-    """Harmonic mean of two rises; zero where one of them is."""
+    """Slope of the monotone cubic: harmonic mean of both rises, 0 unless both are
+    above 0.
+    """
     return torch.where(
         (left > 0) & (right > 0),
         2 * left * right / (left + right).clamp_min(1),
@@ -210,13 +216,14 @@ def macs(
     window_um: float,
     space: SearchSpace | None = None,
 ) -> Tensor:
-    """Multiply-accumulates C_total of one inference as a function of the pixel pitch
-    (paper Eq. 9), differentiable.
+    """Multiply-accumulates C_total of one inference at a pixel pitch (paper Eq. 9).
+
+    Differentiable in the pitch.
 
     Args:
-        pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on
-            the sensor.
         architecture: member of the search space.
+        pitch_um: effective pixel pitch, scalar.
+        window_um: side of the square image on the sensor.
         space: architectures to choose from; the default space without it.
 
     Raises:
@@ -225,8 +232,5 @@ def macs(
     input_size(
         window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution
     )
-    return macs_of_size(
-        space or SearchSpace(),
-        architecture,
-        window_um / pitch_um * architecture.resolution,
-    )
+    size = window_um / pitch_um * architecture.resolution
+    return macs_of_size(space or SearchSpace(), architecture, size)

@@ -60,44 +60,47 @@ class ExportedNetwork(nn.Module):
         self.eval()
 
     def forward(self, frames: Tensor) -> tuple[Tensor, ...]:
+        """Outputs of standardised frames (batch, 1, size, size) in mm and degrees."""
         centred = frames - frames.mean((-2, -1), keepdim=True)
         size = int(frames.shape[-1])
         deviation = torch.sqrt((centred**2).sum((-2, -1), keepdim=True) / (size**2 - 1))
-        found = self.net.net(centred / deviation.clamp_min(1e-6), self.net.architecture)
+        prediction = self.net.net(
+            centred / deviation.clamp_min(1e-6), self.net.architecture
+        )
         unit = torch.tensor(self.scale.slip_mm)
         outputs = {
-            "mask_logits": found.mask_logits,
-            "pupil_mm": found.centre * self.scale.frame_mm,
-            "slip_mm": found.slip * unit,
-            "slip_sd_mm": found.slip_log_sd.exp() * unit,
-            "points_mm": found.points * self.scale.frame_mm,
-            "axis_deg": self._angles(found.axis),
+            "mask_logits": prediction.mask_logits,
+            "pupil_mm": prediction.centre * self.scale.frame_mm,
+            "slip_mm": prediction.slip * unit,
+            "slip_sd_mm": prediction.slip_log_sd.exp() * unit,
+            "points_mm": prediction.points * self.scale.frame_mm,
+            "axis_deg": self._angles(prediction.axis),
         }
         return tuple(outputs[name] for name in self.scale.outputs)
 
     def _angles(self, axis: Tensor) -> Tensor:
-        """As :func:`codesign.gaze.face_angles`, of axes of any length."""
+        """(batch, 2) angles across and down, deg, of optic axes of any length."""
         right, down, out = (
             axis @ face_axes(self.scale.elevation_rad).to(axis).mT
         ).unbind(1)
-        level = torch.sqrt(right**2 + out**2)
-        return torch.stack([torch.atan2(right, out), torch.atan2(down, level)], 1) * (
-            180 / math.pi
-        )
+        horizontal = torch.sqrt(right**2 + out**2)
+        return torch.stack(
+            [torch.atan2(right, out), torch.atan2(down, horizontal)], 1
+        ) * (180 / math.pi)
 
 
 def write_onnx(
     path: str | Path, net: Subnet, scale: OutputScale, *, size: int, pitch_um: float
 ) -> None:
-    """Write an ONNX file (opset 17) for any number of square frames of ``size`` pixels,
-    ``pitch_um`` apart.
+    """Write an ONNX file (opset 17) of a network, for any number of square frames.
 
-    Every input and output says in the file what it is, in which unit; so do the file's
-    properties of the camera.
+    Inputs and outputs are described in the file with their units, and its properties
+    describe the camera.
 
     Args:
-        path: of the file. net: network of one architecture.
-        scale: units of the outputs.
+        path: of the file. net: network of one architecture. scale: units of the
+            outputs.
+        size: pixels along a side of a frame. pitch_um: of the pixels.
 
     Accuracy:
         onnxruntime against torch, float32 through some forty layers in another order:
@@ -106,26 +109,23 @@ def write_onnx(
     Raises:
         OSError: the target cannot be written.
     """
-    made = ExportedNetwork(net, scale)
+    network = ExportedNetwork(net, scale)
     example = torch.zeros(2, 1, size, size)
     names = scale.outputs
     with replace_atomically(path) as part:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # sizes are fixed on purpose; the exporter's own age is no news here
+            # of fixed sizes, which are intended, and of the exporter's age
+            warnings.simplefilter("ignore")
             torch.onnx.export(
-                made, (example,), str(part), dynamo=False, input_names=["frames"], output_names=list(names),
+                network, (example,), str(part), dynamo=False, input_names=["frames"], output_names=list(names),
                 opset_version=OPSET, dynamic_axes={name: {0: "batch"} for name in ("frames", *names)},
             )  # fmt: skip
         with torch.no_grad():
-            shapes = dict(
-                zip(
-                    names,
-                    (tuple(value.shape[1:]) for value in made(example)),
-                    strict=True,
-                )
-            )
+            values = network(example)
+        shapes = {
+            name: tuple(value.shape[1:])
+            for name, value in zip(names, values, strict=True)
+        }
         camera = {
             "pixels": size,
             "pitch_um": pitch_um,
@@ -138,17 +138,17 @@ def write_onnx(
 def _describe(
     path: Path, shapes: dict[str, tuple[int, ...]], about: dict[str, str]
 ) -> None:
-    """Say in the file what its inputs and outputs are, and of which camera."""
+    """Write descriptions of input, outputs and camera into an ONNX file."""
     import onnx
 
-    made = onnx.load(str(path))
-    made.graph.input[0].doc_string = FRAMES
-    for value in made.graph.output:
+    graph_file = onnx.load(str(path))
+    graph_file.graph.input[0].doc_string = FRAMES
+    for value in graph_file.graph.output:
         shape: list[str | int | None] = ["batch", *shapes[value.name]]
         value.CopyFrom(
             onnx.helper.make_tensor_value_info(
                 value.name, onnx.TensorProto.FLOAT, shape, OUTPUTS[value.name]
             )
         )
-    onnx.helper.set_model_props(made, about)
-    path.write_bytes(made.SerializeToString())
+    onnx.helper.set_model_props(graph_file, about)
+    path.write_bytes(graph_file.SerializeToString())

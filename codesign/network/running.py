@@ -6,9 +6,8 @@ from torch import Tensor, nn
 from codesign.batches import parallel
 
 REACH = 100  # batches that the means reach back over
-EPSILON = (
-    1e-2  # of the variance: a wave that no frame holds is not blown up when one does
-)
+# added to the variance: a wave that is rare in frames is not amplified without bound
+EPSILON = 1e-2
 
 
 class RunningNorm(nn.Module):
@@ -42,19 +41,20 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def _follow(self, x: Tensor) -> None:
-        exact = x.double()
-        found = torch.stack([exact.mean((0, 2, 3)), (exact**2).mean((0, 2, 3))])
+        """Update the running moments by a batch; unchanged where it is not finite."""
+        values = x.double()
+        moments = torch.stack([values.mean((0, 2, 3)), (values**2).mean((0, 2, 3))])
         if parallel.process_count() > 1:
-            found = (
-                torch.tensor(parallel.mean_of(found.flatten().tolist()))
-                .to(found)
-                .view_as(found)
+            moments = (
+                torch.tensor(parallel.mean_of(moments.flatten().tolist()))
+                .to(moments)
+                .view_as(moments)
             )
-        if bool(torch.isfinite(found).all()):
+        if bool(torch.isfinite(moments).all()):
             self.batches += 1
             share = 1 / min(int(self.batches), REACH)
-            self.mean.lerp_(found[0], share)
-            self.square.lerp_(found[1], share)
+            self.mean.lerp_(moments[0], share)
+            self.square.lerp_(moments[1], share)
 
 
 def keep_running_means(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
@@ -64,13 +64,13 @@ def keep_running_means(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
     Args:
         net: network.
     """
-    found = [
+    buffers = [
         b for m in net.modules() if isinstance(m, RunningNorm) for b in m.buffers()
     ]
-    return [(b, b.clone()) for b in found]
+    return [(b, b.clone()) for b in buffers]
 
 
 def put_back(means: list[tuple[Tensor, Tensor]]) -> None:
-    """Running means as they were: a step that is skipped moves nothing."""
+    """Restore running means of :func:`keep_running_means`, for a skipped step."""
     for mean, before in means:
         mean.copy_(before)

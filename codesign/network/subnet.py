@@ -41,38 +41,37 @@ class Subnet(nn.Module):
 
 
 def restore_weights(net: Supernet, state: Mapping[str, Tensor]) -> None:
-    """Put the weights of a kept :class:`Subnet` back into the supernet it was cut from.
+    """Copy the weights of a saved :class:`Subnet` into the supernet it was cut from.
 
-    Channels are the leading ones and kernels the central ones, as they were cut; what
-    the architecture does not use stays as it is.
+    To the leading channels and central kernels, as they were cut; all other weights
+    stay.
 
     Args:
-        state: weights by name as :meth:`Subnet.state_dict` has them.
-        net: elastic network.
+        net: elastic network. state: weights by name of :meth:`Subnet.state_dict`.
 
     Raises:
         TrainingError: a weight that the supernet lacks, or one larger than its own.
     """
-    whole = net.state_dict()
-    for name, part in state.items():
-        own = name.removeprefix("net.")
-        place = whole.get(own)
-        fits = place is not None and place.dim() == part.dim()
-        if place is None or not fits or any(map(gt, part.shape, place.shape)):
+    weights = net.state_dict()
+    for name, saved in state.items():
+        own_name = name.removeprefix("net.")
+        target = weights.get(own_name)
+        fits = target is not None and target.dim() == saved.dim()
+        if target is None or not fits or any(map(gt, saved.shape, target.shape)):
             raise TrainingError(
-                f"weight {own!r} is no part of this run's network: its space differs"
+                f"weight {own_name!r} is no part of this run's network: its space differs"
             )
-        leading = [slice(0, n) for n in part.shape[:2]]
+        leading = [slice(0, n) for n in saved.shape[:2]]
         central = [
             slice((most - n) // 2, (most - n) // 2 + n)
-            for most, n in zip(place.shape[2:], part.shape[2:], strict=True)
+            for most, n in zip(target.shape[2:], saved.shape[2:], strict=True)
         ]
-        place[(*leading, *central)] = part
-    net.load_state_dict(whole)
+        target[(*leading, *central)] = saved
+    net.load_state_dict(weights)
 
 
 def _trim(net: Supernet, architecture: Architecture) -> None:
-    """Drop the weights that ``architecture`` does not use."""
+    """Cut all weights of a supernet to those that ``architecture`` uses, in place."""
     rows = active_blocks(net.space, architecture)
     stem = stem_channels(net.space, architecture)
     _trim_conv(net.stem, 1, stem, 3)
@@ -81,13 +80,18 @@ def _trim(net: Supernet, architecture: Architecture) -> None:
         for module, block in zip(modules, row, strict=False):
             _trim_block(module, block)
         del stage[len(row) :]  # type: ignore[operator]
-    kept = [rows[stage][-1].outputs for stage, _ in lateral_strides(net.space)]
-    for lateral, channels in zip(net.perception.laterals, kept, strict=True):
+    channels_of_stages = [
+        rows[stage][-1].outputs for stage, _ in lateral_strides(net.space)
+    ]
+    for lateral, channels in zip(
+        net.perception.laterals, channels_of_stages, strict=True
+    ):
         _trim_conv(lateral, channels, MASK_CHANNELS, 1)
     _trim_conv(net.calibration.reduce, rows[-1][-1].outputs, SLIP_CHANNELS, 1)
 
 
 def _trim_block(module: ElasticBlock, block: BlockSpec) -> None:
+    """Cut the weights of a block to the sizes of ``block``, in place."""
     _trim_conv(module.expand, block.inputs, block.hidden, 1)
     _trim_conv(module.depthwise, 1, block.hidden, block.kernel)
     _trim_conv(module.project, block.hidden, block.outputs, 1)
@@ -106,9 +110,10 @@ def _trim_block(module: ElasticBlock, block: BlockSpec) -> None:
 
 
 def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
-    trim = (conv.weight.shape[-1] - kernel) // 2
-    inside = slice(trim, trim + kernel)
-    _keep(conv, weight=conv.weight[:outputs, :inputs, inside, inside])
+    """Cut a convolution to its leading channels and central kernel, in place."""
+    border = (conv.weight.shape[-1] - kernel) // 2
+    window = slice(border, border + kernel)
+    _keep(conv, weight=conv.weight[:outputs, :inputs, window, window])
     norm = conv.norm
     _keep(norm, weight=norm.weight[:outputs], bias=norm.bias[:outputs])
     norm.mean, norm.variance = (
@@ -118,5 +123,6 @@ def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
 
 
 def _keep(module: nn.Module, **tensors: Tensor) -> None:
+    """Replace parameters of a module by copies of ``tensors``."""
     for name, tensor in tensors.items():
         setattr(module, name, nn.Parameter(tensor.detach().clone()))

@@ -35,25 +35,21 @@ from metalens.core.errors import TrainingError
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Prediction:
-    """What the network says of a frame.
+    """Predictions of the network for a batch of frames. Fields that it does not predict
+    are None.
 
     mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a
-    network that gives no mask.
-    centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle,
+    network without a mask.
+    centre: (batch, 2) pupil centre x, y as a fraction of the image from its centre,
     -0.5 at the left and top edge.
     slip: (batch, 3) camera displacement in units of the scale that the loss divides by
     (paper Eq. 7).
-    depth: (batch, 2, windows, windows) what blur tells of each window's depth
-    (:mod:`codesign.network.blur`): vergence
-        and the logarithm of its standard deviation; None of a network without that
-        branch.
-    slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``; None of a
-    network that does not tell it.
+    depth: (batch, 2, windows, windows) vergence of each window from its blur
+    (:mod:`codesign.network.blur`), and the logarithm of its standard deviation.
+    slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``.
     points: (batch, POINTS, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's
-    middle, as ``centre`` is told;
-        None of a network that seeks none.
-    axis: (batch, 3) optic axis of the eye in the camera's frame, not normalised;
-    likewise.
+    centre, in the coordinates of ``centre``.
+    axis: (batch, 3) optic axis of the eye in the camera's frame, not normalised.
     """
 
     mask_logits: Tensor
@@ -72,7 +68,9 @@ def apply_activation(x: Tensor, kind: Activation | None) -> Tensor:
         x: (batch, channels, y, x) features.
         kind: name of the activation; None for the identity.
     """
-    return x if kind is None else F.relu(x) if kind == "relu" else F.hardswish(x)
+    if kind is None:
+        return x
+    return F.relu(x) if kind == "relu" else F.hardswish(x)
 
 
 class SlicedNorm(nn.Module):
@@ -92,7 +90,10 @@ class SlicedNorm(nn.Module):
         self.measuring = False
 
     def forward(self, x: Tensor, act: Activation | None = None) -> Tensor:
-        """Normalised, and the activation of it.
+        """Batch normalisation of the leading channels, then the activation.
+
+        In training by the statistics of the batch (of all processes), otherwise by
+        those last measured; while ``measuring`` the running mean is updated too.
 
         Args:
             x: (batch, channels, y, x) features.
@@ -104,18 +105,23 @@ class SlicedNorm(nn.Module):
             self._measure(x)
         if self.training and not self.measuring and parallel.process_count() > 1:
             return apply_activation(parallel.batch_norm(x, weight, bias), act)
-        own = self.training or self.measuring  # statistics of this batch
-        mean, variance = (None, None) if own else (self.mean, self.variance)
+        batch_statistics = self.training or self.measuring
+        mean, variance = (
+            (None, None) if batch_statistics else (self.mean, self.variance)
+        )
         if mean is not None and variance is not None:
             mean, variance = mean[:count], variance[:count]
         return apply_activation(
-            F.batch_norm(x, mean, variance, weight, bias, training=own), act
+            F.batch_norm(x, mean, variance, weight, bias, training=batch_statistics),
+            act,
         )
 
     @torch.no_grad()
     def _measure(self, x: Tensor) -> None:
-        """Running mean over batches of equal weight, so the order of the batches does
-        not matter.
+        """Update the mean over batches of mean and variance; each batch has equal
+        weight.
+
+        So the order of the batches does not matter.
         """
         count = x.shape[1]
         self.batches += 1
@@ -148,10 +154,16 @@ class SlicedConv(nn.Module):
         stride: int = 1,
         act: Activation | None = None,
     ) -> Tensor:
-        trim = (self.weight.shape[-1] - kernel) // 2
-        inside = slice(trim, trim + kernel)
+        """Convolution with the first ``outputs`` filters, cropped to ``kernel``, norm,
+        activation.
+
+        Args:
+            x: (batch, channels, y, x), the leading channels of the inputs.
+        """
+        border = (self.weight.shape[-1] - kernel) // 2
+        window = slice(border, border + kernel)
         weight = self.weight[
-            :outputs, : 1 if self.depthwise else x.shape[1], inside, inside
+            :outputs, : 1 if self.depthwise else x.shape[1], window, window
         ]
         groups = outputs if self.depthwise else 1
         y: Tensor = self.norm(
@@ -169,15 +181,20 @@ class SqueezeExcite(nn.Module):
         self.up = nn.Linear(squeeze, channels)
 
     def forward(self, x: Tensor, squeeze: int) -> Tensor:
+        """x * hardsigmoid(up relu(down mean(x))): a gate for every channel.
+
+        Args:
+            x: (batch, channels, y, x). squeeze: hidden channels.
+        """
         count = x.shape[1]
         pooled = x.mean((2, 3))
-        inside = F.relu(
+        hidden = F.relu(
             F.linear(
                 pooled, self.down.weight[:squeeze, :count], self.down.bias[:squeeze]
             )
         )
         gate = F.hardsigmoid(
-            F.linear(inside, self.up.weight[:count, :squeeze], self.up.bias[:count])
+            F.linear(hidden, self.up.weight[:count, :squeeze], self.up.bias[:count])
         )
         gated: Tensor = x * gate[:, :, None, None]
         return gated
@@ -198,6 +215,11 @@ class ElasticBlock(nn.Module):
         self.project = SlicedConv(most.hidden, most.outputs)
 
     def forward(self, x: Tensor, block: BlockSpec) -> Tensor:
+        """Inverted residual: expand 1x1, depthwise k x k, squeeze-excite, project 1x1.
+
+        Args:
+            x: (batch, channels, y, x). block: sizes to use of the weights.
+        """
         act = block.activation
         y = self.expand(x, block.hidden, act=act) if block.hidden != block.inputs else x
         y = self.depthwise(
@@ -210,8 +232,8 @@ class ElasticBlock(nn.Module):
 
 
 class PerceptionHead(nn.Module):
-    """Pupil mask and maps of landmarks from the last features of every stride, added up
-    from coarse to fine.
+    """Pupil mask and landmark maps from the features of every stride, summed from
+    coarse to fine.
 
     ``forward(features) -> (mask, maps, decoded)``: the last is what both are decoded
     from.
@@ -225,6 +247,12 @@ class PerceptionHead(nn.Module):
         self.points = nn.Conv2d(MASK_CHANNELS, POINTS, 1)
 
     def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Mask logits (batch, y, x), landmark maps and decoded features at the finest
+        stride.
+
+        Args:
+            features: (batch, channels, y, x) each, from fine to coarse.
+        """
         total = self.laterals[-1](features[-1], MASK_CHANNELS, act="hardswish")
         for lateral, feature in zip(
             list(self.laterals)[-2::-1], features[-2::-1], strict=True
@@ -236,14 +264,13 @@ class PerceptionHead(nn.Module):
 
 
 class CalibrationHead(nn.Module):
-    """Slip and optic axis from the flattened last feature map, so that place in the
-    image is kept (paper Eq. 7), from
-    the depths and from the landmarks: ``forward(features, depths, points) -> (slip,
-    spread, axis)``.
+    """Slip, its log standard deviation and the optic axis: ``forward(features, depths,
+    points)``.
 
-    What no depth changes, the axis, is read without depths. The uncertainty is read
-    from what the slip is read from,
-    but does not shape it.
+    From the flattened last feature map, so that image position is retained (paper Eq.
+    7), from window depths and from landmarks. The axis does not depend on depth and is
+    read without it. The uncertainty is read from the features of the slip, without a
+    gradient to them.
     """
 
     def __init__(self, channels: int) -> None:
@@ -261,15 +288,21 @@ class CalibrationHead(nn.Module):
     def forward(
         self, features: Tensor, depths: Tensor, points: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """(slip, log standard deviation in [-4, 2], axis), (batch, 3) each.
+
+        Args:
+            features: (batch, channels, y, x). depths: (batch, SLIP_FEATURES).
+            points: (batch, POINT_FEATURES).
+        """
         reduced = self.reduce(features, SLIP_CHANNELS, act="hardswish")
         grid = resample_image(reduced, (SLIP_GRID, SLIP_GRID))
-        seen = F.hardswish(
+        appearance = F.hardswish(
             torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1)
         )
         joined = F.hardswish(
-            self.joined(torch.cat([seen, F.hardswish(self.depths(depths))], 1))
+            self.joined(torch.cat([appearance, F.hardswish(self.depths(depths))], 1))
         )
-        axis = self.axis(F.hardswish(self.turned(seen)))
+        axis = self.axis(F.hardswish(self.turned(appearance)))
         return self.slip(joined), self.spread(joined.detach()).clamp(-4, 2), axis
 
 
@@ -283,9 +316,9 @@ class Supernet(nn.Module):
     def __init__(self, space: SearchSpace | None = None) -> None:
         super().__init__()
         self.space = space or SearchSpace()
-        most = largest_architecture(self.space)
-        rows = active_blocks(self.space, most)
-        self.stem = SlicedConv(1, stem_channels(self.space, most), 3)
+        largest = largest_architecture(self.space)
+        rows = active_blocks(self.space, largest)
+        self.stem = SlicedConv(1, stem_channels(self.space, largest), 3)
         self.stages = nn.ModuleList(
             nn.ModuleList(ElasticBlock(b) for b in row) for row in rows
         )
@@ -296,27 +329,32 @@ class Supernet(nn.Module):
         self.blur = blur.InformedBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
-        seen = resize_frames(frames, architecture.resolution)
+        """Predictions of one member for standardised frames.
+
+        Args:
+            frames: (batch, 1, y, x). architecture: member of the search space.
+        """
+        resized = resize_frames(frames, architecture.resolution)
         channels = stem_channels(self.space, architecture)
-        x = self.stem(seen, channels, kernel=3, stride=2, act="hardswish")
-        kept = {stage for stage, _ in lateral_strides(self.space)}
+        x = self.stem(resized, channels, kernel=3, stride=2, act="hardswish")
+        lateral_stages = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(
             zip(self.stages, active_blocks(self.space, architecture), strict=True)
         ):
             for module, block in zip(modules_of(stage), row, strict=False):
                 x = module(x, block)
-            if i in kept:
+            if i in lateral_stages:
                 features.append(x)
         logits, maps, decoded = self.perception(features)
-        depth, blur_features, axial = self.blur(seen, decoded)
-        points, spread_out = soft_argmax_maps(maps)
-        slip, spread, axis = self.calibration(
-            x, blur_features, torch.cat([points.flatten(1), spread_out], 1)
+        depth, blur_features, axial = self.blur(resized, decoded)
+        points, widths = soft_argmax_maps(maps)
+        slip, slip_log_sd, axis = self.calibration(
+            x, blur_features, torch.cat([points.flatten(1), widths], 1)
         )
         slip = slip + F.pad(axial[:, None], (2, 0))
         return Prediction(
-            logits, soft_argmax(logits), slip, depth, spread, points, axis
+            logits, soft_argmax(logits), slip, depth, slip_log_sd, points, axis
         )
 
 
@@ -331,12 +369,10 @@ def resize_frames(frames: Tensor, resolution: float) -> Tensor:
 
 
 def soft_argmax(logits: Tensor) -> Tensor:
-    """(batch, 2) centre of mass x, y of the mask probability, as a fraction of the
-    image from its middle.
+    """(batch, 2) centre of mass x, y of the mask probability, fraction of the image.
 
-    Probabilities below 0.05 are left out, so that the sea of background does not pull
-    the centre; an empty mask
-    gives (0, 0) with a finite gradient.
+    From the image's centre. Weights are relu(p - 0.05), so that a large background does
+    not pull the centre; an empty mask gives (0, 0) with a finite gradient.
 
     Args:
         logits: (batch, y, x) log odds of the pupil.
@@ -347,16 +383,16 @@ def soft_argmax(logits: Tensor) -> Tensor:
     height, width = logits.shape[-2:]
     x = (torch.arange(width, device=logits.device) + 0.5) / width - 0.5
     y = (torch.arange(height, device=logits.device) + 0.5) / height - 0.5
-    return torch.stack(
-        [(weight.sum(1) * x).sum(1) / total, (weight.sum(2) * y).sum(1) / total], -1
-    )
+    centre_x = (weight.sum(1) * x).sum(1) / total
+    centre_y = (weight.sum(2) * y).sum(1) / total
+    return torch.stack([centre_x, centre_y], -1)
 
 
 def soft_argmax_maps(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """(batch, points, 2) centre of mass x, y of every map's softmax, fraction of the
-    image from its middle, and
-    (batch, points) its root mean square width: wide where the point is not seen, or out
-    of the image.
+    """Centre of mass (batch, points, 2) x, y of every map's softmax, and its RMS width.
+
+    Fractions of the image; centres from its centre. The width (batch, points) is large
+    where the point is hidden or outside the image.
 
     Args:
         maps: (batch, points, y, x).
@@ -368,28 +404,28 @@ def soft_argmax_maps(maps: Tensor) -> tuple[Tensor, Tensor]:
     y = (
         torch.arange(height, dtype=maps.dtype, device=maps.device) + 0.5
     ) / height - 0.5
-    middle = torch.stack([columns @ x, rows @ y], -1)
-    around = (columns * (x - middle[..., :1]) ** 2).sum(-1) + (
-        rows * (y - middle[..., 1:]) ** 2
-    ).sum(-1)
-    return middle, torch.sqrt(around + 1e-6)
+    centre = torch.stack([columns @ x, rows @ y], -1)
+    variance_x = (columns * (x - centre[..., :1]) ** 2).sum(-1)
+    variance_y = (rows * (y - centre[..., 1:]) ** 2).sum(-1)
+    return centre, torch.sqrt(variance_x + variance_y + 1e-6)
 
 
 @torch.no_grad()
 def recalibrate_batch_norm(
     net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]
 ) -> None:
-    """Measure the batch statistics of one architecture from a reset, on fixed batches;
-    leaves eval mode.
+    """Measure the batch statistics of one architecture anew on given batches, in place.
 
-    Running means (:class:`codesign.network.running.RunningNorm`) belong to all
-    architectures and stay.
+    Leaves the network in evaluation mode. Running means
+    (:class:`codesign.network.running.RunningNorm`) belong to all architectures and
+    stay.
 
     Args:
-        net: network.
+        net: network. architecture: whose statistics.
+        batches: (batch, 1, y, x) frames each.
 
     Raises:
-        TrainingError: no batch was given.
+        TrainingError: no batch.
     """
     net.eval()
     norms = [m for m in net.modules() if isinstance(m, SlicedNorm)]

@@ -14,9 +14,8 @@ WAVES = 8  # periods a window of the finest wave
 COLUMNS, ROWS = WAVES + 1, 2 * WAVES  # of frequencies: 0 … 8 along x, -7 … 8 along y
 FLOOR = 1e-2  # of the power, in units of the frame's variance a pixel
 
-SAMPLES = (
-    8 * (GRID + 1)
-)  # along a side, on which steps are taken: the finest wave is at their Nyquist frequency
+# along a side, on which steps are taken: the finest wave is at their Nyquist frequency
+SAMPLES = 8 * (GRID + 1)
 STEP_FLOOR = FLOOR / 4  # of a squared step, in units of the frame's variance
 STEPS: tuple[
     tuple[tuple[int, int, int], ...], ...
@@ -57,38 +56,39 @@ def spectra_macs(size: int) -> int:
 
 @functools.lru_cache(maxsize=64)
 def hann_filters(size: int) -> tuple[Tensor, Tensor]:
-    """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) under their Hann weight, on
-    the second half of a window.
+    """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) times the Hann weight.
 
-    From its middle on: cosines are even about it, sines are odd.
+    On the second half of a window, from its centre: cosines are even about it, sines
+    odd.
 
     Args:
         size: side of the frame in pixels.
     """
     step = step_of(size)
-    place = torch.arange(step, dtype=torch.float64)[:, None] + 0.5
-    weight = torch.cos(math.pi * place / (2 * step)) ** 2
+    position = torch.arange(step, dtype=torch.float64)[:, None] + 0.5
+    weight = torch.cos(math.pi * position / (2 * step)) ** 2
     weight = weight / (math.sqrt(2) * weight.norm())
-    period = size / (
-        (GRID + 1) / 2
-    )  # pixels of one wave a window, whatever the window was rounded to
+    # pixels of one wave a window, before rounding of the window
+    period = size / ((GRID + 1) / 2)
     frequency = torch.arange(WAVES + 1) / period
-    seen = (frequency <= 0.5 + 1e-9) * weight
-    turn = 2 * math.pi * frequency * place
-    return (seen * torch.cos(turn)).float(), (seen * torch.sin(turn))[:, 1:].float()
+    # frequencies above Nyquist are 0
+    window = (frequency <= 0.5 + 1e-9) * weight
+    phase = 2 * math.pi * frequency * position
+    return (window * torch.cos(phase)).float(), (window * torch.sin(phase))[
+        :, 1:
+    ].float()
 
 
 def window_spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID,
-    GRID) its mean under the weight.
+    """Hann-weighted power spectrum of every window, and its weighted mean.
 
-    Separable, and folded about the middle of a window: one product serves a pixel and
-    its mirror image, a frequency
-    and its negative.
+    (batch, COLUMNS ROWS, GRID, GRID) and (batch, 1, GRID, GRID). Separable, and folded
+    about the centre of a window: one product serves a pixel and its mirror image, a
+    frequency and its negative.
 
     Args:
-        frames: (batch, 1, size, size), standardised; the margin that no window covers
-            is cut off evenly.
+        frames: (batch, 1, size, size), standardised; the margin outside all windows is
+            cut off evenly.
     """
     size = int(frames.shape[-1])
     step = step_of(size)
@@ -96,39 +96,34 @@ def window_spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     inside = slice(first, first + (GRID + 1) * step)
     cosine, sine = (f.to(frames) for f in hann_filters(size))
     even, odd = _folded(frames[:, 0, inside, inside], 2)
-    real, imaginary = (
-        even @ cosine,
-        F.pad(odd @ sine, (1, 0)),
-    )  # (batch, rows, windows along x, COLUMNS)
+    # (batch, rows, windows along x, COLUMNS)
+    real = even @ cosine
+    imaginary = F.pad(odd @ sine, (1, 0))
     (real_even, real_odd), (imaginary_even, imaginary_odd) = (
         _folded(part, 1) for part in (real, imaginary)
     )
-    rc, ic = (
-        real_even @ cosine,
-        imaginary_even @ cosine,
-    )  # (batch, windows along y, along x, COLUMNS, frequencies)
+    # (batch, windows along y, along x, COLUMNS, frequencies)
+    rc = real_even @ cosine
+    ic = imaginary_even @ cosine
     rs, js = (F.pad(part @ sine, (1, 0)) for part in (real_odd, imaginary_odd))
     up = (rc - js) ** 2 + (ic + rs) ** 2
     down = (rc + js) ** 2 + (ic - rs) ** 2
     power = torch.cat([down[..., 1:WAVES].flip(-1), up], -1)
-    mean = rc[..., 0, 0] / (
-        4 / 3 * step
-    )  # frequency 0 along both axes; the weight's sum squared
-    return power.permute(0, 3, 4, 1, 2).reshape(-1, COLUMNS * ROWS, GRID, GRID), mean[
-        :, None
-    ]
+    # frequency 0 along both axes, over the squared sum of the weight
+    mean = rc[..., 0, 0] / (4 / 3 * step)
+    power = power.permute(0, 3, 4, 1, 2).reshape(-1, COLUMNS * ROWS, GRID, GRID)
+    return power, mean[:, None]
 
 
 def gradient_statistics(frames: Tensor) -> Tensor:
-    """(batch, STEP_FEATURES, GRID, GRID) how squared steps between neighbours are
-    spread over every window.
+    """(batch, STEP_FEATURES, GRID, GRID) statistics of squared brightness steps by
+    window.
 
-    By kind of step, in units of STEP_FLOOR: the mean of log(1 + square), its standard
-    deviation, and the logarithm of
-    1 + the fourth powers' mean, a fourth of it: the steepest rule it.
+    For every kind of step, squares s in units of STEP_FLOOR: mean of log(1 + s), its
+    standard deviation, and log(1 + mean s⁴) / 4, which the steepest steps dominate.
 
     Args:
-        frames: (batch, 1, size, size), standardised; brought to SAMPLES along a side.
+        frames: (batch, 1, size, size), standardised; resampled to SAMPLES along a side.
     """
     fine = resample_image(frames, (SAMPLES, SAMPLES))
     coarse = F.avg_pool2d(F.pad(fine, (0, 1, 0, 1), mode="replicate"), 2, 1)
@@ -138,11 +133,12 @@ def gradient_statistics(frames: Tensor) -> Tensor:
 
 
 def window_content(maps: Tensor) -> Tensor:
-    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y,
-    x) of the whole frame.
+    """(batch, channels, GRID, GRID) mean over every window of maps of the whole frame.
 
-    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is
-    two of them wide.
+    The frame is averaged to GRID + 1 steps; a window is two steps wide.
+
+    Args:
+        maps: (batch, channels, y, x).
     """
     height, width = (int(n) for n in maps.shape[-2:])
     steps = GRID + 1
@@ -156,11 +152,10 @@ def window_content(maps: Tensor) -> Tensor:
 
 
 def resample_image(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """(batch, channels, *size): averaged by whole factors, then interpolated where the
-    size is no divisor.
+    """(batch, channels, *size) resampled: averaged by whole factors, then interpolated.
 
     Args:
-        x: (batch, channels, y, x) features.
+        x: (batch, channels, y, x) features. size: (y, x) of the result.
     """
     factor = [
         max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)
@@ -172,8 +167,13 @@ def resample_image(x: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
-    """Windows along an axis, appended as the last one from their middle on: sums and
-    differences with their mirror.
+    """Windows along an axis, from their centre outwards: sums and differences with the
+    mirror.
+
+    The windows become an axis of GRID, the pixels of half a window the last axis.
+
+    Args:
+        x: (batch, y, x, ...). along: axis that is split.
     """
     sides = [int(n) for n in x.shape[1:]]
     sides[along - 1 : along] = [GRID + 1, sides[along - 1] // (GRID + 1)]
@@ -184,33 +184,35 @@ def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
 
 
 def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """(batch, kinds, y, x) of which windows have the means: log(1 + square), its
-    square, and the fourth power's.
+    """(batch, kinds, y, x) each: log(1 + s / STEP_FLOOR), its square, and s⁴.
+
+    s are the squared steps of :func:`_steps`; windows average the maps.
+
+    Args:
+        samples: (batch, 1, y, x) for each of REACHES.
     """
-    square = (
-        torch.cat(
-            [_steps(of, reach) for of, reach in zip(samples, REACHES, strict=True)], 1
-        )
-        ** 2
-    )
+    steps = [_steps(grid, reach) for grid, reach in zip(samples, REACHES, strict=True)]
+    square = torch.cat(steps, 1) ** 2
     logs = torch.log1p(square / STEP_FLOOR)
-    return (
-        logs,
-        logs**2,
-        (square**2) ** 2,
-    )  # squares twice: a power of four is a function call a number
+    # squared twice: a fourth power would be a function call for every number
+    return logs, logs**2, (square**2) ** 2
 
 
 def _steps(samples: Tensor, reach: int) -> Tensor:
-    """(batch, kinds, y, x) of (batch, 1, y, x), of variance 1 on white samples of it;
-    beyond the edge it goes on.
+    """(batch, kinds, y, x) differences of neighbours ``reach`` samples apart, edges
+    replicated.
+
+    Normalised to variance 1 on white noise.
+
+    Args:
+        samples: (batch, 1, y, x).
     """
     rows, columns = (int(n) for n in samples.shape[-2:])
-    wide = F.pad(samples, (reach,) * 4, mode="replicate")
+    padded = F.pad(samples, (reach,) * 4, mode="replicate")
 
     def shifted(x: int, y: int) -> Tensor:
         top, left = reach * (1 + y), reach * (1 + x)
-        return wide[..., top : top + rows, left : left + columns]
+        return padded[..., top : top + rows, left : left + columns]
 
     kinds = []
     for taps in STEPS:

@@ -11,11 +11,12 @@ Family = Literal["free", "radial"]
 
 
 def double_helix_phase(x: Tensor, y: Tensor, zones: int) -> Tensor:
-    """Vortices of order 1, 3, 5, ... in ``zones`` rings of equal area over the unit
-    disc, rad, float64; zero for none.
+    """Phase of a double helix over the unit disc, rad, float64; zero for no zones.
+
+    Vortices (2 k - 1) theta in k = 1 … ``zones`` rings of equal area.
 
     Args:
-        x, y: places over the radius of the lens. zones: rings.
+        x, y: coordinates over the radius of the lens. zones: rings.
     """
     x, y = x + torch.zeros_like(y), y + torch.zeros_like(x)
     if not zones:
@@ -25,35 +26,33 @@ def double_helix_phase(x: Tensor, y: Tensor, zones: int) -> Tensor:
 
 
 def phase_terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
-    """The first ``count`` terms over the unit disc, where x and y lie.
+    """The first ``count`` polynomial phase terms over the unit disc, not orthogonal.
 
     free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity
     of n. radial: rho^2, rho^4, …
 
     Args:
+        x, y: coordinates over the radius of the lens. count: of terms.
         family: "free" or "radial".
     """
     square = x**2 + y**2
-    rings = [
-        square
-    ]  # rho^2, rho^4, …; products of x and y cost a tenth of powers and cosines
-    cosine, sine = (
-        [torch.ones_like(square), x],
-        [torch.zeros_like(square), y],
-    )  # rho^m cos(m theta), rho^m sin(m theta)
+    # by recurrence: products of x and y cost a tenth of powers and cosines
+    radial_powers = [square]  # rho^2, rho^4, …
+    cosine = [torch.ones_like(square), x]  # rho^m cos(m theta)
+    sine = [torch.zeros_like(square), y]  # rho^m sin(m theta)
     if family == "radial":
-        while len(rings) < count:
-            rings.append(rings[-1] * square)
-        return rings[:count]
-    found: list[Tensor] = []
+        while len(radial_powers) < count:
+            radial_powers.append(radial_powers[-1] * square)
+        return radial_powers[:count]
+    terms: list[Tensor] = []
     order = 2
-    while len(found) < count:
+    while len(terms) < count:
         cosine.append(cosine[-1] * x - sine[-1] * y)
         sine.append(sine[-1] * x + cosine[-2] * y)
-        rings.append(rings[-1] * square)
+        radial_powers.append(radial_powers[-1] * square)
         for m in range(-order, order + 1, 2):
             wave = (cosine if m >= 0 else sine)[abs(m)]
-            ring = (order - abs(m)) // 2
-            found.append(rings[ring - 1] * wave if ring else wave)
+            index = (order - abs(m)) // 2
+            terms.append(radial_powers[index - 1] * wave if index else wave)
         order += 1
-    return found[:count]
+    return terms[:count]

@@ -27,9 +27,8 @@ from metalens.image import (
 from metalens.image import imager as field_imager
 from metalens.optics import Layers
 
-There = tuple[
-    int, int, torch.device
-]  # samples along a side of the frames, margin included; margin; where they are
+# samples along a side of the frames, margin included; margin; their device
+FrameGrid = tuple[int, int, torch.device]
 
 
 def lens_wave(
@@ -37,8 +36,9 @@ def lens_wave(
     coefficients_rad: Tensor,
     error: DrawnLensErrors | None = None,
 ) -> SmoothWave | PillarWave:
-    """The lens plane of these coefficients for :func:`metalens.image.imager`;
-    differentiable in them.
+    """Lens plane of these coefficients for :func:`metalens.image.imager`.
+
+    Differentiable in the coefficients: a smooth phase, or pillars by their diameters.
 
     Args:
         settings: of the lens and its image.
@@ -47,12 +47,11 @@ def lens_wave(
     """
     if settings.parameters == "diameters":
         return lens.pillar_wave(settings, coefficients_rad)
+    added = None
     if settings.polynomials or settings.zones or error is not None:
         added = functools.partial(
             lens.phase_at, settings, coefficients_rad, error=error
         )
-    else:
-        added = None
     return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
 
 
@@ -66,62 +65,69 @@ def make_imager(
     made: PixelPsfStack | None = None,
     device: torch.device | str = "cpu",
 ) -> Imager:
-    """What images frames of ``frame`` samples, margin included.
+    """Imager of square frames: shift-invariant PSFs, or the true image.
+
+    The true image is cached for a lens without error.
 
     Args:
-        error: one draw of the lenses that are made. made: a lens that is made in place
-            of the coefficients.
-        device: where the frames are imaged, and the true image's PSFs are computed.
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        frame: samples along a side, margin included. margin: samples around the frame.
+        error: one draw of the lens errors.
+        made: a fabricated lens in place of the coefficients.
+        device: where the frames are imaged, and the true image's PSFs are computed.
 
     Raises:
-        TrainingError: of the lens that is made only PSFs of one chief ray are known,
-            and the true image is asked for.
+        TrainingError: the true image of ``made`` is requested, whose PSFs are known for
+            one chief ray alone.
     """
     if settings.image == "uniform":
-        found = made or lens.lens_psf_stack(settings, coefficients_rad, error=error)
-        return lens.stack_imager(settings, found, frame, margin=margin).to(device)
-    there = frame, margin, torch.device(device)
+        stack = made or lens.lens_psf_stack(settings, coefficients_rad, error=error)
+        return lens.stack_imager(settings, stack, frame, margin=margin).to(device)
+    grid = frame, margin, torch.device(device)
     if made is not None:
-        return _made(settings, made, there)
-    key = tuple(coefficients_rad.detach().tolist())
+        return _imager_of_made_lens(settings, made, grid)
+    coefficients = tuple(coefficients_rad.detach().tolist())
     if error is None:
-        return _still(settings, key, there)
-    return _hazy(settings, _formed(settings, key, there, error), error)
+        return _cached_true_imager(settings, coefficients, grid)
+    return _with_scattered_light(
+        settings, _true_imager(settings, coefficients, grid, error), error
+    )
 
 
 @functools.lru_cache(maxsize=32)
-def _made(settings: OpticsConfig, made: PixelPsfStack, there: There) -> Imager:
-    """The true image of a lens that is made: formed once for all who look at it."""
+def _imager_of_made_lens(
+    settings: OpticsConfig, made: PixelPsfStack, grid: FrameGrid
+) -> Imager:
+    """True image of a fabricated lens, cached for all who use the same lens."""
     if made.plane is None:
         raise TrainingError(
             "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
             "use a run of optics.image = 'uniform' for it"
         )
-    frame, margin, device = there
+    frame, margin, device = grid
     return imager_through(settings, made.plane, frame, margin=margin, device=device)
 
 
 @functools.lru_cache(maxsize=3)
-def _still(
-    settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There
+def _cached_true_imager(
+    settings: OpticsConfig, coefficients_rad: tuple[float, ...], grid: FrameGrid
 ) -> Imager:
-    return _formed(settings, coefficients_rad, there, None)
+    return _true_imager(settings, coefficients_rad, grid, None)
 
 
 @torch.no_grad()
-def _formed(
+def _true_imager(
     settings: OpticsConfig,
     coefficients_rad: tuple[float, ...],
-    there: There,
+    grid: FrameGrid,
     error: DrawnLensErrors | None,
 ) -> Imager:
-    wave = lens_wave(
-        settings, torch.tensor(coefficients_rad, dtype=torch.float64), error
-    )
-    frame, margin, device = there
-    plane = _in_place(settings, wave)
+    """True image of the lens of these coefficients and error, without gradient."""
+    coefficients = torch.tensor(coefficients_rad, dtype=torch.float64)
+    wave = lens_wave(settings, coefficients, error)
+    frame, margin, device = grid
+    plane = _with_surroundings(settings, wave)
     return imager_through(settings, plane, frame, margin=margin, device=device)
 
 
@@ -134,16 +140,17 @@ def imager_through(
     margin: int,
     device: torch.device | str = "cpu",
 ) -> Imager:
-    """The image through a lens plane in its surroundings, in the settings' light.
+    """Imager through a lens plane with its films, in the settings' light and field.
 
     Args:
-        plane: wave, films and distance. frame: samples along a side, ``margin``
-            included. device: where frames are imaged.
+        settings: of the lens and its image. plane: wave, films and distance.
+        frame: samples along a side, margin included. margin: samples around the frame.
+        device: where frames are imaged.
 
     Raises:
         SceneError, PropagationError: as :func:`metalens.image.imager`.
     """
-    whole = field_imager(
+    imager = field_imager(
         plane.wave,
         lens.grid_of(settings, frame, margin),
         spectrum=settings.light,
@@ -153,29 +160,33 @@ def imager_through(
         distance_um=plane.distance_um,
         device=device,
     )
-    return whole if settings.passed == 1 else whole.scaled(settings.passed)
+    return imager if settings.passed == 1 else imager.scaled(settings.passed)
 
 
-def _hazy(settings: OpticsConfig, whole: Imager, error: DrawnLensErrors) -> Imager:
-    """See :func:`codesign.optics.stack.scatter_loss`; the shadow's light falls on all
-    samples
-    alike.
+def _with_scattered_light(
+    settings: OpticsConfig, imager: Imager, error: DrawnLensErrors
+) -> Imager:
+    """Imager with the light that pillars of wrong phase scatter over the shadow.
+
+    See :func:`codesign.optics.stack.scatter_loss`; the shadow's light is equal on all
+    samples. PSFs keep sum 1, the fraction multiplies the energy.
     """
-    light = lens.scatter_loss(
-        settings, whole.stack, variance_rad2(error.state(), settings.phase_rates)
+    variance = variance_rad2(error.state(), settings.phase_rates)
+    light = lens.scatter_loss(settings, imager.stack, variance)
+    fraction = light.sum((-2, -1))
+    return with_psfs(
+        imager, light / fraction[..., None, None], imager.energy * fraction
     )
-    total = light.sum((-2, -1))
-    return with_psfs(whole, light / total[..., None, None], whole.energy * total)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DifferentiableImager:
-    """A true image whose lens moves: the imager with the light of its nodes as a leaf.
+    """True image of a moving lens: an imager with the light of its nodes as a leaf
+    tensor.
 
-    light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes
-    that were asked for. ready:
-    the imager, differentiable in it. pairs: what was drawn of
-    :func:`metalens.image.drawn`; None for all nodes.
+    light: (rows, columns, depths, h, w), collects the gradient of the loss, of the
+    selected nodes. ready: the imager, differentiable in it. pairs: field points and
+    wavelengths of :func:`metalens.image.draw_nodes`; None for all nodes.
     """
 
     light: Tensor
@@ -183,8 +194,10 @@ class DifferentiableImager:
     pairs: tuple[Tensor, Tensor] | None = None
 
     def pass_on(self, settings: OpticsConfig, coefficients_rad: Tensor) -> None:
-        """Add to the gradient of the coefficients what the light gathered, from the
-        points and wavelengths drawn.
+        """Add the gradient of the light to that of the coefficients, by a surrogate
+        loss.
+
+        It is estimated from the drawn points and wavelengths.
 
         Args:
             settings: of the lens and its image.
@@ -200,36 +213,39 @@ class DifferentiableImager:
         if self.light.grad is None:
             return
         optics = optics_of(settings, coefficients_rad)
-        value = surrogate_loss(optics, self.ready.plan, self.light.grad, self.pairs)
-        value.backward()  # type: ignore[no-untyped-call]
+        loss = surrogate_loss(optics, self.ready.plan, self.light.grad, self.pairs)
+        loss.backward()  # type: ignore[no-untyped-call]
 
 
 def make_differentiable_imager(
     settings: OpticsConfig, whole: Imager, pairs: tuple[Tensor, Tensor] | None = None
 ) -> DifferentiableImager:
-    """An imager with its nodes' light as a leaf, of the nodes that were drawn or of
-    all; the relative illumination is
-    held, and the image is that of the kernels that there are.
+    """An imager with its nodes' light as a leaf tensor.
+
+    The PSFs are the light over its sum, so relative illumination is constant.
 
     Args:
         settings: of the lens and its image. whole: prepared image of the lens.
         pairs: field points and wavelengths that were drawn; None for all.
     """
     with torch.no_grad():
-        unit = normalise_psfs(
+        unit_energy = normalise_psfs(
             torch.ones_like(whole.stack[..., :1, :1]),
             optics_of(settings, torch.zeros(0)),
             whole.plan,
         )[1]
-        light = whole.stack * (whole.energy / unit)[..., None, None]
+        light = whole.stack * (whole.energy / unit_energy)[..., None, None]
     light.requires_grad_()
     psfs = light / light.sum((-2, -1), keepdim=True)
-    asked = None if pairs is None else set(pairs[0].tolist())
-    return DifferentiableImager(light, replace(whole, stack=psfs, asked=asked), pairs)
+    selected = None if pairs is None else set(pairs[0].tolist())
+    return DifferentiableImager(
+        light, replace(whole, stack=psfs, asked=selected), pairs
+    )
 
 
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
-    """Wave, surroundings and distance of the lens.
+    """Lens plane with its films and sensor distance; without coefficients the plain
+    focus.
 
     Args:
         settings: of the lens and its image.
@@ -237,10 +253,10 @@ def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
     """
     plain = replace(settings, polynomials=0, parameters="polynomials")
     moving = settings if coefficients_rad.numel() else plain
-    return _in_place(settings, lens_wave(moving, coefficients_rad))
+    return _with_surroundings(settings, lens_wave(moving, coefficients_rad))
 
 
-def _in_place(settings: OpticsConfig, wave: SmoothWave | PillarWave) -> Optics:
+def _with_surroundings(settings: OpticsConfig, wave: SmoothWave | PillarWave) -> Optics:
     return Optics(wave, settings.layers or Layers(), settings.sensor_distance_mm * 1e3)
 
 
@@ -248,43 +264,48 @@ def _in_place(settings: OpticsConfig, wave: SmoothWave | PillarWave) -> Optics:
 def uniform_image_error(
     settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
 ) -> float:
-    """Relative L2 difference of the uniform image of a texture in depth from its true
-    image: the error of 'uniform'.
+    """Error of 'uniform': relative L2 difference of its image of a texture from the
+    true one.
+
+    The texture extends in depth.
 
     Args:
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         frame: samples along a side, margin included.
-        margin: samples around the frame that are blurred in and not seen.
+        margin: samples around the frame that are imaged and then cut off.
     """
     true = make_imager(
         replace(settings, image="true"), coefficients_rad, frame, margin=margin
     )
-    one = make_imager(
+    uniform = make_imager(
         replace(settings, image="uniform", layers=None),
         coefficients_rad,
         frame,
         margin=margin,
     )
-    return relative_image_difference(one, true)
+    return relative_image_difference(uniform, true)
 
 
 @torch.no_grad()
 def relative_image_difference(one: Imager, true: Imager) -> float:
-    """Relative L2 difference of the image of a texture in depth through one PSF a depth
-    from its true image.
+    """Relative L2 difference of two images of a texture in depth, over its contrast.
 
-    Of the texture's contrast; both images of frames of one size, with the same margin.
+    |image - reference| / |reference - mean|; the reference without stray light. Both of
+    frames of one size, with the same margin.
     """
     frames = textured_frames(true.grid)
-    want = replace(true, stray=None)(frames)
-    return float((one(frames) - want).norm() / (want - want.mean()).norm())
+    reference = replace(true, stray=None)(frames)
+    return float(
+        (one(frames) - reference).norm() / (reference - reference.mean()).norm()
+    )
 
 
 def image_tolerance_problem(settings: OpticsConfig, found: Imager) -> str:
-    """Why the error of the true image is above ``optics.image_tolerance``; empty where
-    it is not, or the image is
-    uniform, whose distance from the true one is told instead.
+    """Why the error of the true image is above ``optics.image_tolerance``.
+
+    Empty where it is not, or the image is uniform, whose difference from the true one
+    is reported instead.
 
     Args:
         settings: of the lens and its image. found: what forms the images.
@@ -295,22 +316,21 @@ def image_tolerance_problem(settings: OpticsConfig, found: Imager) -> str:
 def describe_image(
     settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
 ) -> dict[str, Any]:
-    """What the images are and how wrong, for a report: kind, error, and the source's
-    width and filter.
+    """Record of the image model for a report: kind, error, spectral width and filter.
 
-    error: of the uniform image, :func:`uniform_image_error`; of the true image, its own estimate;
-    None where the true image of this
-    lens cannot be formed, for the reason under ``problem``. above: why the true image's
-    own estimate is above
-    ``optics.image_tolerance``; empty where it is not.
+    error: of the uniform image, :func:`uniform_image_error`; of the true image, its own
+    estimate; None where the true image cannot be formed, for the reason under
+    ``problem``.
+    above: why the true image's own estimate is above ``optics.image_tolerance``; empty
+    where it is not.
 
     Args:
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         frame: samples along a side, margin included.
-        margin: samples around the frame that are blurred in and not seen.
+        margin: samples around the frame that are imaged and then cut off.
     """
-    found: dict[str, Any] = {
+    record: dict[str, Any] = {
         "kind": settings.image,
         "fwhm_nm": settings.fwhm_nm,
         "passed": settings.passed,
@@ -318,18 +338,17 @@ def describe_image(
     }
     try:
         if settings.image == "uniform":
-            return found | {
-                "error": uniform_image_error(
-                    settings, coefficients_rad, frame, margin=margin
-                )
-            }
-        made = make_imager(settings, coefficients_rad, frame, margin=margin)
-        return found | {
-            "error": float(getattr(made, "error", math.nan)),
-            "above": image_tolerance_problem(settings, made),
+            error = uniform_image_error(
+                settings, coefficients_rad, frame, margin=margin
+            )
+            return record | {"error": error}
+        imager = make_imager(settings, coefficients_rad, frame, margin=margin)
+        return record | {
+            "error": float(getattr(imager, "error", math.nan)),
+            "above": image_tolerance_problem(settings, imager),
         }
     except (SceneError, PropagationError) as problem:
-        return found | {"error": None, "problem": str(problem)}
+        return record | {"error": None, "problem": str(problem)}
 
 
 def describe_image_text(found: dict[str, Any]) -> str:

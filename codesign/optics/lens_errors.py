@@ -21,10 +21,8 @@ from metalens.fabrication import DRAWN, Draw, State, effective_indices, response
 from metalens.library import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
-_FIRST = (
-    "bias_nm",
-    "height_nm",
-)  # of the process: the order that correlations are written in
+# of the process: the order of rows in a correlation matrix
+_FIRST = ("bias_nm", "height_nm")
 ENTRIES = (*ASSEMBLY, *_FIRST, *(name for name in DRAWN if name not in _FIRST))
 _Entries: Any = dataclasses.make_dataclass(
     "_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True
@@ -82,35 +80,38 @@ class LensErrors(_Entries):  # type: ignore[misc]
         return np.asarray(correlation * np.outer(self.deviations, self.deviations))
 
     def draw(self, generator: torch.Generator) -> "DrawnLensErrors | None":
-        """The errors of one lens; None where nothing varies.
+        """Errors of one lens from a normal distribution of this covariance.
+
+        The direction of gradients is uniform over a turn. None where nothing varies.
 
         Args:
             generator: of the draws.
         """
         if not any(self.deviations):
             return None
-        held = [
+        varying = [
             n
             for n, name in enumerate(ENTRIES)
             if name not in DRAWN or DRAWN[name].sigma or self.deviations[n]
         ]
-        values, vectors = np.linalg.eigh(self.covariance[np.ix_(held, held)])
+        values, vectors = np.linalg.eigh(self.covariance[np.ix_(varying, varying)])
         root = vectors * np.sqrt(values.clip(0))
-        normal = torch.randn(
-            len(held), generator=generator, dtype=torch.float64
+        normals = torch.randn(
+            len(varying), generator=generator, dtype=torch.float64
         ).numpy()
-        turn = (
+        turn_rad = (
             2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
         )
-        return DrawnLensErrors(
-            {
-                ENTRIES[n]: amount
-                for n, amount in zip(held, (root @ normal).tolist(), strict=True)
-            },
-            turn,
-        )
+        names = [ENTRIES[n] for n in varying]
+        amounts = dict(zip(names, (root @ normals).tolist(), strict=True))
+        return DrawnLensErrors(amounts, turn_rad)
 
     def _check(self) -> None:
+        """Refuse a correlation that is no k x k correlation matrix.
+
+        Raises:
+            ConfigError: wrong size, not symmetric, or not positive semi-definite.
+        """
         size = math.isqrt(len(self.correlation))
         if size**2 != len(self.correlation) or size > len(ENTRIES):
             raise ConfigError(
@@ -158,23 +159,27 @@ class PhaseRates:
 
 
 def wave_front_rad(state: State, u: Tensor, v: Tensor, rates: PhaseRates) -> Tensor:
-    """Phase at lens places over the radius that all pillars share: their mean answer,
-    and the causes that bend.
+    """Wave front error that all pillars share, rad: mean phase of the bias, and
+    aberrations.
+
+    The phase of the bias relative to that at the centre.
 
     Args:
         state: perturbations by the process. u: x over the radius of the lens.
         v: y over the radius of the lens. rates: phase rates of the unit cell.
     """
     x, y = u.cpu().numpy(), v.cpu().numpy()
-    shared = rates.mean[0] * (
+    mean_phase = rates.mean[0] * (
         state.bias_um(x, y) - state.bias_um(np.zeros(1), np.zeros(1))
     )
-    return torch.from_numpy(shared + state.phase_rad(x, y)).to(u.device)
+    return torch.from_numpy(mean_phase + state.phase_rad(x, y)).to(u.device)
 
 
 def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
-    """Variance of the pillars' phases about what they share, mean over the aperture
-    (Gauss nodes: exact).
+    """Variance of the pillar phases about their shared wave front, rad².
+
+    Mean over the aperture of r^T C r, r the bias and the other causes, C the covariance
+    of the phase rates. By Gauss nodes over the squared radius: exact for polynomials.
 
     Args:
         state: perturbations by the process. rates: phase rates of the unit cell.
@@ -182,15 +187,16 @@ def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
     """
     node, weight = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt((node[:, None] + 1) / 2)
-    turn = np.arange(2 * rings) * (math.pi / rings)
-    bias = state.bias_um(radius * np.cos(turn), radius * np.sin(turn))
+    angle = np.arange(2 * rings) * (math.pi / rings)
+    bias = state.bias_um(radius * np.cos(angle), radius * np.sin(angle))
     answers = state.answers()
+    # means over the aperture of the bias and its square
     mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
-    c = rates.covariance
+    covariance = rates.covariance
     return float(
-        c[0, 0] * square
-        + 2 * mean * (c[0, 1:] @ answers)
-        + answers @ c[1:, 1:] @ answers
+        covariance[0, 0] * square
+        + 2 * mean * (covariance[0, 1:] @ answers)
+        + answers @ covariance[1:, 1:] @ answers
     )
 
 
@@ -207,19 +213,21 @@ def pillar_proxy(cell: Cell, wavelength_um: float) -> Proxy:
 
 @functools.lru_cache(maxsize=8)
 def phase_rates(cell: Cell, wavelength_um: float) -> PhaseRates:
-    """Rates of a cell at a wavelength, over pillars whose phases fill a turn evenly.
+    """Mean and covariance of the phase rates of a cell's pillars at a wavelength.
+
+    Over 400 pillars whose phases are evenly spaced over a turn.
 
     Args:
-        wavelength_um: of the light.
+        cell: unit cell. wavelength_um: of the light.
 
-    Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 %
-    of the covariance with height.
+    Accuracy: by the diameter as the proxy, 1 %; by the other causes as an effective
+    index, 5 % of the covariance with height.
     """
     proxy = pillar_proxy(cell, wavelength_um)
-    start = proxy.phase_rad(np.array([proxy.domain_um[0]]), wavelength_um)[0]
-    even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
-    diameter = np.asarray(proxy.diameter_um(even, wavelength_um))
-    seen = effective_indices(cell, proxy, wavelength_um, diameter)
-    quick = [acts.quick(seen).imag for _, acts in response_errors()]
-    rates = np.stack([proxy.dphase_ddiameter(diameter, wavelength_um), *quick])
+    first_phase = proxy.phase_rad(np.array([proxy.domain_um[0]]), wavelength_um)[0]
+    phases = first_phase + np.linspace(0, 2 * math.pi, 400, endpoint=False)
+    diameter = np.asarray(proxy.diameter_um(phases, wavelength_um))
+    indices = effective_indices(cell, proxy, wavelength_um, diameter)
+    cause_rates = [cause.quick(indices).imag for _, cause in response_errors()]
+    rates = np.stack([proxy.dphase_ddiameter(diameter, wavelength_um), *cause_rates])
     return PhaseRates(rates.mean(1), np.cov(rates))

@@ -183,11 +183,11 @@ class OpticsConfig:
 
     @property
     def fine(self) -> int:
-        """Samples of the intensity to one of ``sample_um``: at most lambda / (4 NA)
-        apart, an odd number.
+        """Intensity samples per ``sample_um``, an odd number: spacing at most lambda
+        / (4 NA).
         """
-        need = math.ceil(self.sample_um / (self.pupil.field_step_um / 2))
-        return need + 1 - need % 2
+        count = math.ceil(self.sample_um / (self.pupil.field_step_um / 2))
+        return count + 1 - count % 2
 
     @property
     def light(self) -> Source | None:
@@ -201,18 +201,19 @@ class OpticsConfig:
 
     @property
     def passed(self) -> float:
-        """Share of the source's light that the filter passes: both Gaussian, about the
-        same wavelength.
+        """Fraction b / √(a² + b²) of the source's light that the filter passes.
+
+        Both are Gaussian about the same wavelength, of widths a and b.
         """
-        return (
-            self.filter_nm / math.hypot(self.fwhm_nm, self.filter_nm)
-            if self.filter_nm
-            else 1.0
-        )
+        if not self.filter_nm:
+            return 1.0
+        return self.filter_nm / math.hypot(self.fwhm_nm, self.filter_nm)
 
     @property
     def pupil(self) -> Pupil:
-        """The aperture with as many nodes as the window of the PSFs needs."""
+        """Aperture with the number of nodes that the window of the PSFs needs, 64 or
+        more.
+        """
         rough = Pupil(
             self.aperture_mm * 500,
             self.sensor_distance_mm * 1e3,
@@ -253,9 +254,9 @@ class OpticsConfig:
 class PixelPsfStack:
     """PSFs over depth on the grid of the image.
 
-    intensity: (depths, h, w) share of the light. depths_um: (depths,). plane: of a lens
-    that is made, what forms its
-    true image; None of a lens whose PSFs on axis alone are known.
+    intensity: (depths, h, w) fraction of the light per sample. depths_um: (depths,).
+    plane: of a fabricated lens, what forms its true image; None of a lens whose PSFs
+    are known on axis alone.
     """
 
     intensity: Tensor
@@ -270,20 +271,17 @@ def lens_psf_stack(
     error: DrawnLensErrors | None = None,
     shared: bool = False,
 ) -> PixelPsfStack:
-    """PSFs of the lens whose polynomial coefficients are these, on samples of the
-    image; differentiable.
+    """PSFs over depth of the lens of these coefficients, on samples of the image.
 
-    Each is the light on square samples, low-passed to what the grid of the samples can
-    show: so it does not depend
-    on where a source falls on the grid, and no optimiser can exploit that. The low
-    frequencies of the intensity are
-    the autocorrelation of the pupil, exact from one padded transform of the pupil's
-    nodes a depth.
+    Each is the fraction of the light on a square sample, low-passed to the band of the
+    sample grid. So it does not depend on where a source falls on the grid.
+    Differentiable in the coefficients; see :func:`sampled_light`.
 
     Args:
+        settings: of the lens and its image.
         coefficients_rad: (polynomials,) in rad of root-mean-square phase over the
-            aperture.
-        error: one draw of ``settings.spread``.
+            aperture, or (pillars,).
+        error: one draw of ``settings.spread``; adds its wave front and scattered light.
         shared: every process of a training computes its part of the depths, and all
             get the whole stack; all of them must call.
 
@@ -294,33 +292,36 @@ def lens_psf_stack(
         raise TrainingError(
             "the optics left the finite numbers: lower the learning rate of the optics"
         )
-    carriers = _carriers(settings)
-    count = len(carriers)
+    waves = _carriers(settings)
+    count = len(waves)
     rows = parallel.shared_rows(count) if shared else torch.arange(count)
     if len(rows) < count:
-        carriers = carriers[rows]
-    grid = settings.sample_um, settings.window_samples
-    wave = carriers * _node_factor(settings, coefficients_rad, error)
-    light = sampled_light(wave, settings.pupil, *grid)
+        waves = waves[rows]
+    pupil_wave = waves * _node_factor(settings, coefficients_rad, error)
+    light = sampled_light(
+        pupil_wave, settings.pupil, settings.sample_um, settings.window_samples
+    )
     if shared:
         light = parallel.gather_rows(light, rows, count)
     if error is not None:
-        light = scatter_loss(
-            settings, light, variance_rad2(error.state(), settings.phase_rates)
-        )
+        variance = variance_rad2(error.state(), settings.phase_rates)
+        light = scatter_loss(settings, light, variance)
     return PixelPsfStack(light, settings.depths_um)
 
 
 def _node_factor(
     settings: OpticsConfig, coefficients_rad: Tensor, error: DrawnLensErrors | None
 ) -> Tensor:
-    """(nodes, nodes) complex transmission on top of the hyperbolic focus."""
+    """(nodes, nodes) complex transmission relative to the hyperbolic focus.
+
+    exp(i phase) of polynomials and error, or the response of the pillars.
+    """
     if settings.parameters == "diameters":
-        seen = _pupil_view(settings)
+        view = _pupil_view(settings)
         wave = pillar_wave(settings, coefficients_rad)
         angle = math.radians(settings.angle_deg)
-        found = wave.factor(seen.x_um, seen.y_um, settings.focus.wavelength_um, angle)
-        return torch.as_tensor(found)
+        factor = wave.factor(view.x_um, view.y_um, settings.focus.wavelength_um, angle)
+        return torch.as_tensor(factor)
     phase = added_phase(settings, coefficients_rad)
     if error is not None:
         phase = phase + _error_phase(settings, error)
@@ -331,8 +332,8 @@ def _node_factor(
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
-    """(nodes, nodes) phase on top of the hyperbolic focus: what the lens starts from,
-    and the polynomials.
+    """(nodes, nodes) phase added to the hyperbolic focus, rad: double helix and
+    polynomials.
 
     Args:
         settings: of the lens and its image.
@@ -347,8 +348,10 @@ def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
 
 
 def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
-    """The trained phase as a function of pillar positions, for
-    :func:`metalens.design.make`.
+    """The trained phase, rad, as a function of pillar positions in um.
+
+    The sum of the hyperbolic focus and :func:`phase_at`, for
+    :func:`metalens.design.make`; computed in blocks of ROWS rows.
 
     Args:
         settings: of the lens and its image.
@@ -357,12 +360,12 @@ def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
 
     def phase(x_um: Array, y_um: Array) -> Array:
         x, y = (torch.from_numpy(np.asarray(a, float)) for a in (x_um, y_um[:, None]))
-        added = [
+        blocks = [
             phase_at(settings, coefficients_rad, x, rows)
             for rows in torch.split(y, ROWS)
         ]
-        focused = profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
-        return np.asarray(focused + torch.cat(added).numpy())
+        focus = profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
+        return np.asarray(focus + torch.cat(blocks).numpy())
 
     return phase
 
@@ -372,16 +375,17 @@ def trained_lens(
     coefficients_rad: Tensor,
     provenance: Provenance | None = None,
 ) -> Lens:
-    """The lens of trained coefficients: of diameters these themselves, of polynomials
-    the pillars of their phase.
+    """The lens file of trained coefficients: pillars of a phase, or given diameters.
 
-    The pillars are known over the light of training: over 1.25 of the width of a line
-    to either side (0.3 % of a Gaussian lies beyond), over half of that where pillars
-    would cover less than a turn of phase, else at the middle alone.
+    For polynomials the pillars are chosen for their phase from a library over the light
+    of training. The library spans 1.25 line widths to either side (0.3 % of a Gaussian
+    lies outside). Where pillars then cover less than a turn of phase, it spans half of
+    that, and at last the central wavelength alone.
 
     Args:
-        coefficients_rad: (polynomials,) of the phase, or (pillars,).
-        settings: of the lens and its image. provenance: of the file.
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) of the phase, rad, or (pillars,).
+        provenance: of the file.
     """
     if settings.parameters == "diameters":
         start = starting_lens(settings)
@@ -391,28 +395,29 @@ def trained_lens(
             diameters=DiameterMap(sizes, start.diameters.pitch_um),
             provenance=provenance or Provenance(),
         )
-    middle_um, light = settings.focus.wavelength_um, settings.light
+    middle_um = settings.focus.wavelength_um
+    light = settings.light
     width_um = 0.0 if light is None else light.fwhm_nm * 1e-3
 
-    def over(half_um: float) -> Lens:
-        waves = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
-        waves_um = tuple((waves + middle_um).tolist())
-        swept = library.sweep(settings.cell, wavelengths_um=waves_um)
-        made, _ = make(
+    def lens_of_band(half_um: float) -> Lens:
+        offsets_um = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
+        wavelengths_um = tuple((offsets_um + middle_um).tolist())
+        cells = library.sweep(settings.cell, wavelengths_um=wavelengths_um)
+        lens, _ = make(
             pillar_phase(settings, coefficients_rad),
             settings.focus,
             aperture_um=settings.aperture_mm * 1e3,
-            cell=swept.cell,
-            proxy=library.proxy_of(swept),
+            cell=cells.cell,
+            proxy=library.proxy_of(cells),
             profile="codesign",
             provenance=provenance,
         )
-        return made
+        return lens
 
     for half_um in (1.25 * width_um, 0.625 * width_um) if width_um else ():
         with contextlib.suppress(LensError):
-            return over(half_um)
-    return over(0.0)
+            return lens_of_band(half_um)
+    return lens_of_band(0.0)
 
 
 @functools.lru_cache(maxsize=2)
@@ -440,8 +445,9 @@ def count_parameters(settings: OpticsConfig) -> int:
 def pillar_diameters(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
     """(y, x) diameter of every pillar in um, 0 where there is none; differentiable.
 
-    A coefficient of 1 moves a pillar by 1 rad of the proxy's mean slope. Diameters stay
-    in the proxy's domain and beside its resonances, where gradients pass unchanged.
+    A coefficient of 1 moves a pillar by 1 rad of the proxy's mean slope. Diameters are
+    clipped to the proxy's domain and moved to the nearest edge of its resonances; the
+    gradient is that without the clipping.
 
     Args:
         settings: of the lens and its image.
@@ -453,17 +459,20 @@ def pillar_diameters(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor
     low, high = domain_um
     ends = lens.proxy.phase_rad(np.array(domain_um), lens.wavelength_um)
     um_per_rad = (high - low) / float(ends[1] - ends[0])
-    moved = start[start > 0].double() + um_per_rad * coefficients_rad.double()
-    held = moved.detach().clamp(low, high)
+    diameter = start[start > 0].double() + um_per_rad * coefficients_rad.double()
+    clipped = diameter.detach().clamp(low, high)
     for first, last in lens.proxy.gaps_um:
-        nearer = torch.where(held - first < last - held, first, last)
-        held = torch.where((first < held) & (held < last), nearer, held)
-    held = held + moved - moved.detach()
-    return torch.zeros_like(start, dtype=torch.float64).masked_scatter(start > 0, held)
+        edge = torch.where(clipped - first < last - clipped, first, last)
+        clipped = torch.where((first < clipped) & (clipped < last), edge, clipped)
+    # value of the clipped diameter, gradient of the diameter itself
+    clipped = clipped + diameter - diameter.detach()
+    return torch.zeros_like(start, dtype=torch.float64).masked_scatter(
+        start > 0, clipped
+    )
 
 
 def pillar_wave(settings: OpticsConfig, coefficients_rad: Tensor) -> PillarWave:
-    """The lens plane of these diameters, phase and transmission by the proxy;
+    """Lens plane of these diameters, phase and transmission by the proxy;
     differentiable.
 
     Args:
@@ -471,9 +480,11 @@ def pillar_wave(settings: OpticsConfig, coefficients_rad: Tensor) -> PillarWave:
     """
     lens = starting_lens(settings)
     window_um = settings.window_samples * settings.sample_um
-    width = cell_um(lens.layers, lens.wavelength_um, window_um, lens.sensor_distance_um)
-    sizes = pillar_diameters(settings, coefficients_rad).float()
-    return PillarWave(lens, diameter_um=sizes, cell_um=width)
+    spacing_um = cell_um(
+        lens.layers, lens.wavelength_um, window_um, lens.sensor_distance_um
+    )
+    diameter_um = pillar_diameters(settings, coefficients_rad).float()
+    return PillarWave(lens, diameter_um=diameter_um, cell_um=spacing_um)
 
 
 def stack_imager(
@@ -509,8 +520,10 @@ def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
 def _polynomials(
     pupil: Pupil, count: int, family: Family = "free"
 ) -> tuple[Tensor, Tensor]:
-    """Terms on the nodes, orthonormal over the aperture (unit root mean square), and
-    their mix of the plain ones.
+    """(count, nodes, nodes) orthonormal phase terms, and their (count, count) mix.
+
+    Row n of the mix gives term n as a sum of the plain terms. The terms have unit root
+    mean square over the aperture, by a QR decomposition of the plain ones.
     """
     x, y = (c / pupil.radius_um for c in coordinates(pupil))
     raw = torch.stack(families.phase_terms(x, y, count, family))
@@ -523,29 +536,37 @@ def _polynomials(
 
 @functools.lru_cache(maxsize=8)
 def _modes(settings: OpticsConfig) -> Tensor:
-    """(polynomials, nodes, nodes) terms where the rays of the nodes leave the lens."""
+    """(polynomials, nodes, nodes) phase terms where the rays of the pupil nodes
+    leave.
+    """
     terms, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
     if not settings.angle_deg:
         return terms
-    seen, rim = _pupil_view(settings), settings.pupil.radius_um
+    view = _pupil_view(settings)
+    rim_um = settings.pupil.radius_um
     raw = torch.stack(
         families.phase_terms(
-            seen.x_um / rim, seen.y_um / rim, len(mix), settings.family
+            view.x_um / rim_um, view.y_um / rim_um, len(mix), settings.family
         )
     )
-    return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
+    return torch.einsum("nm,myx->nyx", mix, raw) * (view.weight > 0)
 
 
 @functools.lru_cache(maxsize=8)
 def _start(settings: OpticsConfig) -> Tensor:
-    seen, rim = _pupil_view(settings), settings.pupil.radius_um
-    return families.double_helix_phase(seen.x_um / rim, seen.y_um / rim, settings.zones)
+    """(nodes, nodes) phase of the double helix, rad."""
+    view = _pupil_view(settings)
+    rim_um = settings.pupil.radius_um
+    return families.double_helix_phase(
+        view.x_um / rim_um, view.y_um / rim_um, settings.zones
+    )
 
 
 @functools.lru_cache(maxsize=8)
 def _pupil_view(settings: OpticsConfig) -> PupilView:
-    """The pupil from where the chief ray meets the sensor; its nodes are those of the
-    lens on axis.
+    """The pupil as seen from the point where the chief ray meets the sensor.
+
+    Its nodes are those of the lens on axis.
     """
     return view_pupil(
         settings.pupil, Field(math.radians(settings.angle_deg)), settings.focus_mm * 1e3
@@ -554,26 +575,28 @@ def _pupil_view(settings: OpticsConfig) -> PupilView:
 
 @functools.lru_cache(maxsize=8)
 def _carriers(settings: OpticsConfig) -> Tensor:
-    """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic
-    lens, complex64.
+    """(depths, nodes, nodes) wave of every source behind the hyperbolic lens,
+    complex64.
+
+    Phase of lens and path, remainder of a turn; amplitude of the view's weight and the
+    shadow of the aperture stop.
     """
-    seen = _pupil_view(settings)
+    view = _pupil_view(settings)
     k = 2 * math.pi / settings.pupil.wavelength_um
     tangents = Field(math.radians(settings.angle_deg)).tangents
     paths = [
-        source_path(seen.x_um, seen.y_um, tangents, 1 / float(z))
+        source_path(view.x_um, view.y_um, tangents, 1 / float(z))
         for z in settings.depths_um
     ]
-    angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
-    light = torch.polar(seen.weight, angle)
+    phase = torch.remainder(view.lens_rad + k * torch.stack(paths), 2 * math.pi)
+    light = torch.polar(view.weight, phase)
     if settings.layers is not None and settings.layers.stop is not None:
-        about = (
-            settings.pupil.wavelength_um,
-            (seen.x_um.numpy(), seen.y_um.numpy()),
-            settings.pupil.step_um,
-        )
+        nodes_um = view.x_um.numpy(), view.y_um.numpy()
+        pupil = settings.pupil
         shadows = [
-            settings.layers.shadow(tangents, float(z), *about)
+            settings.layers.shadow(
+                tangents, float(z), pupil.wavelength_um, nodes_um, pupil.step_um
+            )
             for z in settings.depths_um
         ]
         light = light * torch.from_numpy(np.stack(shadows))
@@ -581,11 +604,11 @@ def _carriers(settings: OpticsConfig) -> Tensor:
 
 
 def sampled_light(wave: Tensor, pupil: Pupil, sample_um: float, samples: int) -> Tensor:
-    """(..., samples, samples) share of the aperture's light on square samples, low-passed
-    to what their grid can show.
+    """(..., samples, samples) fraction of the aperture's light on each square sample.
 
-    The low frequencies of the intensity are the autocorrelation of the pupil, from one
-    padded transform that leaves them free of wrap-around.
+    Low-passed to the band of the sample grid. The transfer function at low frequencies
+    is the autocorrelation of the pupil wave, from one zero-padded transform that leaves
+    them free of wrap-around; its inverse transform is evaluated at the samples.
 
     Args:
         wave: (..., nodes, nodes) complex64 on the nodes of the pupil.
@@ -596,8 +619,8 @@ def sampled_light(wave: Tensor, pupil: Pupil, sample_um: float, samples: int) ->
     field = torch.fft.fft2(wave, s=(size, size))
     transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
     low = len(to_columns)
-    kept = torch.cat([transfer[..., :low, :low], transfer[..., 1 - low :, :low]], -2)
-    light: Tensor = (to_rows @ (kept @ to_columns)).real
+    band = torch.cat([transfer[..., :low, :low], transfer[..., 1 - low :, :low]], -2)
+    light: Tensor = (to_rows @ (band @ to_columns)).real
     return light
 
 
@@ -605,26 +628,31 @@ def sampled_light(wave: Tensor, pupil: Pupil, sample_um: float, samples: int) ->
 def _sample_rows(
     pupil: Pupil, sample_um: float, samples: int
 ) -> tuple[Tensor, Tensor, int]:
-    """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to
-    the light on each sample; size of the padded transform.
+    """Matrices from the transfer function to the light on each sample, and the padded
+    size.
+
+    Returns:
+        rows (samples, all frequencies) along y; columns (frequencies >= 0, samples)
+        along x; nodes of the padded transform. Each frequency carries exp(2 pi i f p)
+        at sample positions p, times the sinc of a square sample.
     """
     edge = pupil.period_um / (2 * sample_um)  # harmonics that the samples can show
     number = torch.arange(
         min(math.floor(edge + 0.5), pupil.nodes) + 1, dtype=torch.float64
     )
-    # the last in part, so that the width of the period does not matter
-    kept = (edge - number + 0.5).clamp(0, 1)
-    size = scipy.fft.next_fast_len(pupil.nodes + len(kept))
+    # the last harmonic has a partial weight, continuous in the period
+    weight = (edge - number + 0.5).clamp(0, 1)
+    size = scipy.fft.next_fast_len(pupil.nodes + len(weight))
     harmonic = number / pupil.period_um
-    place = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
-    half = torch.exp(2j * math.pi * sample_um * place[:, None] * harmonic) * (
-        kept * torch.sinc(harmonic * sample_um)
+    position = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
+    positive = torch.exp(2j * math.pi * sample_um * position[:, None] * harmonic) * (
+        weight * torch.sinc(harmonic * sample_um)
     )
-    rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
+    rows = torch.cat([positive, positive[:, 1:].flip(1).conj()], 1)
     # the other half of the frequencies is its conjugate
-    columns = half * torch.where(harmonic == 0, 1.0, 2.0)
-    given = aperture_light(pupil, samples * sample_um) * size**2
-    scale = (sample_um / pupil.period_um) ** 2 / given
+    columns = positive * torch.where(harmonic == 0, 1.0, 2.0)
+    total = aperture_light(pupil, samples * sample_um) * size**2
+    scale = (sample_um / pupil.period_um) ** 2 / total
     return (
         (rows * scale).to(torch.complex64),
         columns.mT.contiguous().to(torch.complex64),
@@ -640,8 +668,9 @@ def phase_at(
     *,
     error: DrawnLensErrors | None = None,
 ) -> Tensor:
-    """Phase on top of the hyperbolic focus at any places, float64; differentiable in
-    the coefficients.
+    """Phase added to the hyperbolic focus at any points of the lens, rad, float64.
+
+    Differentiable in the coefficients.
 
     Args:
         settings: of the lens and its image.
@@ -649,36 +678,39 @@ def phase_at(
         x_um: x on the lens. y_um: y on the lens.
         error: assembly and process error of one lens; None for none.
     """
-    rim = settings.aperture_mm * 500
-    total = families.double_helix_phase(x_um / rim, y_um / rim, settings.zones)
+    rim_um = settings.aperture_mm * 500
+    total = families.double_helix_phase(x_um / rim_um, y_um / rim_um, settings.zones)
     if settings.polynomials:
-        weights = (
-            _polynomials(settings.pupil, settings.polynomials, settings.family)[1].mT
-            @ coefficients_rad.double()
-        )
+        _, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
+        weights = mix.mT @ coefficients_rad.double()
         terms = torch.stack(
             families.phase_terms(
-                x_um / rim, y_um / rim, settings.polynomials, settings.family
+                x_um / rim_um, y_um / rim_um, settings.polynomials, settings.family
             )
         )
         total = total + torch.einsum("n,nyx->yx", weights.to(terms.device), terms)
-    return (
-        total
-        if error is None
-        else total + _wave_front(settings, error, x_um / rim, y_um / rim)
-    )
+    if error is None:
+        return total
+    return total + _wave_front(settings, error, x_um / rim_um, y_um / rim_um)
 
 
 def _error_phase(settings: OpticsConfig, error: DrawnLensErrors) -> Tensor:
-    seen, rim = _pupil_view(settings), settings.pupil.radius_um
-    return _wave_front(settings, error, seen.x_um / rim, seen.y_um / rim)
+    """(nodes, nodes) phase error of one lens at the pupil nodes, rad."""
+    view = _pupil_view(settings)
+    rim_um = settings.pupil.radius_um
+    return _wave_front(settings, error, view.x_um / rim_um, view.y_um / rim_um)
 
 
 def _wave_front(
     settings: OpticsConfig, error: DrawnLensErrors, x: Tensor, y: Tensor
 ) -> Tensor:
-    """Phase of one made lens less that of its design, at places in units of the rim's
-    radius.
+    """Phase of one fabricated lens minus that of its design, rad.
+
+    Defocus -k dz (R / s)² rho² / 2 by an error dz of the sensor distance s, coma and
+    astigmatism in waves, and the wave front of the process.
+
+    Args:
+        x, y: coordinates over the radius R of the rim.
     """
     pupil = settings.pupil
     rho2 = x**2 + y**2
@@ -692,16 +724,18 @@ def _wave_front(
 
 
 def scatter_loss(settings: OpticsConfig, light: Tensor, variance: float) -> Tensor:
-    """Light of pillars that the process made wrong: their phases differ by more than a
-    smooth wave front.
+    """PSFs with the light that unequal pillars scatter: s L + (1 - s) shadow, s =
+    exp(-V).
 
-    With the phases of a lens spread evenly over a turn, an error of variance V leaves
-    exp(-V) of the light in the
-    image (Marechal) and sends the rest straight on, over the shadow of the aperture.
+    With the phases of a lens spread evenly over a turn, a phase error of variance V
+    leaves exp(-V) of the light in the image (Marechal). The rest goes straight on, over
+    the shadow of the aperture.
 
     Args:
         settings: of the lens and its image.
+        light: (..., h, w) fraction of the light per sample.
+        variance: of the pillars' phases about a smooth wave front, rad².
     """
-    kept = math.exp(-variance)
+    strehl = math.exp(-variance)
     shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)
-    return kept * light + (1 - kept) * shadow
+    return strehl * light + (1 - strehl) * shadow

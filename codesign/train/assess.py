@@ -42,16 +42,15 @@ from metalens.image import Frames, Imager, Sensor
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SensorFrames:
-    """Frames as the sensor gave them, with their truth.
+    """Frames of the sensor with their labels.
 
-    frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm:
-    (n, 3). batch: frames at a time.
+    frames: (n, 1, y, x) standardised. mask: (n, y, x) pupil over the whole frame.
+    slip_mm: (n, 3). batch: frames at a time.
     wide: the frame's width over the image's (:func:`frame_wide`).
     vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`;
     None where it is not known.
     above: why the error of their images is above ``optics.image_tolerance``
-    (:func:`codesign.optics.formed.image_tolerance_problem`);
-        empty where it is not.
+    (:func:`codesign.optics.formed.image_tolerance_problem`); empty where it is not.
     """
 
     frames: Tensor
@@ -87,11 +86,13 @@ def finer_frames(
     stack: PixelPsfStack | None = None,
 ) -> SensorFrames | None:
     """:func:`sensor_frames` of the same scenes and noise on the :func:`finer_image`
-    image; None
-    where there is none, or this lens cannot be imaged so precisely.
+    image.
+
+    None where there is none, or this lens cannot be imaged so precisely.
 
     Args:
-        trainer: with lens, sensor and network as they are. batches: how many batches.
+        trainer: with lens, sensor and network as they are. scenes: frames by number.
+        batches: number of batches.
         stack: PSFs of a made lens in place of the trainer's own.
     """
     optics = finer_image(trainer.optics)
@@ -113,26 +114,27 @@ def read_batch(
     sensor: Sensor | None = None,
     quiet: bool = False,
 ) -> SensorFrames:
-    """One batch through an imager and a trainer's pixels, with noise of a seed.
+    """Sensor frames of one batch through an imager and a trainer's pixels.
 
     Args:
         trainer: with pitch and sensor as they are. batch: rendered frames.
         imager: what forms the images. seed: of the noise.
         sensor: in place of the trainer's. quiet: expected electrons, without noise.
     """
-    sample, pitch = trainer.optics.sample_um, trainer.model.pitch_um
+    sample_um = trainer.optics.sample_um
+    pitch_um = trainer.model.pitch_um
     light = sensor_irradiance(batch.frames, imager).cpu()
     noise = torch.Generator().manual_seed(seed)
     sensor = sensor or trainer.sensor
-    pixels = read_out(light, sample, pitch, sensor, generator=noise, quiet=quiet)
-    wide = frame_wide(light.shape[-1], sample, float(pitch.detach()))
+    pixels = read_out(light, sample_um, pitch_um, sensor, generator=noise, quiet=quiet)
+    frame_width = frame_wide(light.shape[-1], sample_um, float(pitch_um.detach()))
     return SensorFrames(
         pixels,
-        losses.mask_in_frame(batch.mask, wide),
+        losses.mask_in_frame(batch.mask, frame_width),
         batch.slip_mm,
         trainer.inner.batch,
         blur.window_vergence(depth_um(batch.frames, margin=imager.grid.margin)),
-        wide,
+        frame_width,
     )
 
 
@@ -147,18 +149,20 @@ def sensor_frames(
     first: int = 0,
     shift_um: float = 0.0,
 ) -> SensorFrames:
-    """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
-    with fixed noise.
+    """Frames of batches through a trainer's lens (or ``stack``) and sensor, with fixed
+    noise.
+
+    The noise depends on the stream and number of the batch alone.
 
     Args:
-        optics: how the image is formed; as in training without it. first: number of
-            the first batch.
-        shift_um: blurred as if everything stood so much farther away; places and sizes
-            stay.
         trainer: with lens, sensor and network as they are. scenes: frames by number.
-        batches: how many batches.
+        batches: number of batches.
+        stack: PSFs of a made lens in place of the trainer's own.
+        optics: how the image is formed; as in training without it.
+        first: number of the first batch.
+        shift_um: added to the depth of the blur; positions and sizes do not change.
     """
-    optics, margin = optics or trainer.optics, scenes.margin
+    optics = optics or trainer.optics
     imager: Imager | None = None
     stream = int(getattr(scenes, "stream", 0)) + 1
     parts: list[SensorFrames] = []
@@ -170,7 +174,7 @@ def sensor_frames(
             optics,
             trainer.model.coefficients_rad,
             frame_samples(batch.frames),
-            margin=margin,
+            margin=scenes.margin,
             made=stack,
             device=trainer.light.device,
         )
@@ -187,30 +191,32 @@ def sensor_frames(
 def displace_frames(
     frames: Frames | SingleSurfaceFrames, shift_um: float
 ) -> Frames | SingleSurfaceFrames:
-    """Frames with all depths larger by ``shift_um``.
+    """Frames with ``shift_um`` added to all depths.
+
+    Depths of one layer are stored at unit scale in whole um, 0 to 65535.
 
     Args:
         frames: rendered frames of two layers or of one.
     """
     if isinstance(frames, Frames):
         return replace(frames, depth_um=frames.depth_um + shift_um)
-    added = shift_um / frames.scale[:, None, None]
-    depth = (frames.depth_um + added).clip(0, 65535).round().astype(np.uint16)
+    steps = shift_um / frames.scale[:, None, None]
+    depth = (frames.depth_um + steps).clip(0, 65535).round().astype(np.uint16)
     return replace(frames, depth_um=depth)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Predictions:
-    """What a network said of frames.
+    """Predictions of a network for n frames. Fields that a network does not predict are
+    None.
 
-    slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle.
+    slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its centre.
     iou: (n,) of the pupil's mask, at the sensor's pixels.
-    slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of
-    one that gives none.
+    slip_sd_mm: (n, 3) predicted standard deviation of the slippage.
     depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its
-    spread; likewise.
-    mask: (n, y, x) logits of the pupil on the network's own grid; likewise.
-    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise, and where
+    standard deviation.
+    mask: (n, y, x) logits of the pupil on the network's own grid.
+    axis: (n, 3) optic axis in the camera's frame, a unit vector; None too where
     training gave it no weight.
     """
 
@@ -227,29 +233,32 @@ class Predictions:
 def predict_frames(
     net: Supernet, architecture: Architecture, seen: SensorFrames, inner: InnerConfig
 ) -> Predictions:
-    """Answers with the batch statistics that the network holds (see
-    :func:`codesign.network.supernet.recalibrate_batch_norm`).
+    """Predictions of a network for frames, in evaluation mode, in mm.
+
+    The batch statistics must be those of this architecture; see
+    :func:`codesign.network.supernet.recalibrate_batch_norm`.
 
     Args:
         net: elastic network. architecture: member of the search space.
-        seen: frames of the sensor with their truth. inner: settings of training.
+        seen: frames of the sensor with their labels. inner: settings of training.
     """
-    training = net.training
+    was_training = net.training
     net.eval()
-    found = [net(frames, architecture) for frames in batched_frames(seen)]
-    net.train(training)
-    slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
+    predictions = [net(frames, architecture) for frames in batched_frames(seen)]
+    net.train(was_training)
+    slip_scale = torch.tensor(inner.slip_scale_mm)
+    slip = torch.cat([f.slip for f in predictions]) * slip_scale
     pixels = int(seen.frames.shape[-1])
-    mask = torch.cat([f.mask_logits for f in found])
-    shared = losses.mask_iou(mask, seen.mask, pixels=pixels)
-    spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
-    depth = [f.depth for f in found if f.depth is not None]
-    axis = [f.axis for f in found if f.axis is not None and inner.axis_weight]
+    mask = torch.cat([f.mask_logits for f in predictions])
+    iou = losses.mask_iou(mask, seen.mask, pixels=pixels)
+    log_sd = [f.slip_log_sd for f in predictions if f.slip_log_sd is not None]
+    depth = [f.depth for f in predictions if f.depth is not None]
+    axis = [f.axis for f in predictions if f.axis is not None and inner.axis_weight]
     return Predictions(
         slip,
-        torch.cat([f.centre for f in found]) * seen.wide,
-        shared,
-        torch.cat(spread).exp() * torch.tensor(inner.slip_scale_mm) if spread else None,
+        torch.cat([f.centre for f in predictions]) * seen.wide,
+        iou,
+        torch.cat(log_sd).exp() * slip_scale if log_sd else None,
         torch.cat(depth) if depth else None,
         mask if mask.numel() else None,
         torch.nn.functional.normalize(torch.cat(axis), dim=1) if axis else None,
@@ -268,8 +277,10 @@ def batched_frames(seen: SensorFrames) -> list[Tensor]:
 
 
 def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
-    """Training frames through the lens as it is, or through the made lenses that
-    training draws: what batch statistics are measured on, never frames that are scored.
+    """Training frames in batches, to measure batch statistics on; never frames for
+    scores.
+
+    Through the lens as it is, or in turn through the made lenses that training draws.
 
     Args:
         trainer: with lens, sensor and network as they are. batches: how many.
@@ -294,15 +305,17 @@ def recalibrate_network(trainer: Trainer, architecture: Architecture) -> None:
 
 
 def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> StateScenes:
-    """Test frames on which only the blur tells depth (paper Sec. 3.6): the two states of
-    a pair have one pupil place, and sizes mean nothing.
+    """Test frames on which only the blur shows depth (paper Sec. 3.6).
+
+    The two states of a pair have the same pupil position, and every state a random
+    scale, so that sizes carry no depth.
 
     Args:
         scenes: rig, camera, ranges and looks. pairs: how many.
         seed: of states and scales.
 
     Raises:
-        SceneError: the ranges of ``scenes`` hold hardly any pair.
+        SceneError: the ranges of ``scenes`` contain hardly any pair.
     """
     states = ambiguity_pairs(
         pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion
@@ -314,9 +327,12 @@ def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> StateScenes:
         np.random.default_rng((seed, 8)),
     )
     generator = np.random.default_rng((seed, scenes.stream, 10))
-    worn = draw_augmentations(len(states), scenes.settings.variety, generator)
+    augmentations = draw_augmentations(len(states), scenes.settings.variety, generator)
     return StateScenes(
-        scenes, replace(states, scale=scale), worn.from_one_view(), scenes.stream
+        scenes,
+        replace(states, scale=scale),
+        augmentations.from_one_view(),
+        scenes.stream,
     )
 
 
@@ -342,20 +358,20 @@ def depth_response(
     batches: int,
     shift_um: float = 1000.0,
 ) -> DepthResponse:
-    """Shift the depth of the PSFs alone and see how far the prediction follows; the
-    noise is the same in both.
+    """Change of the predicted axial slippage per mm of added blur depth, mean over
+    frames.
 
-    A network that guesses depth from the size of what it sees answers 0, however well
-    it scores on natural frames.
-    The batch statistics must be measured
+    The PSFs alone are shifted in depth; the noise is the same in both. A network that
+    reads depth from apparent size has response 0, at any score on natural frames. The
+    batch statistics must be measured
     (:func:`codesign.network.supernet.recalibrate_batch_norm`).
 
     Args:
         trainer: with lens, sensor and network as they are. scenes: frames by number.
         net: elastic network. architecture: member of the search space.
-        batches: how many batches. shift_um: of the depth of the PSFs.
+        batches: number of batches. shift_um: of the depth of the PSFs.
     """
-    here, there = (
+    at_rest, shifted = (
         predict_frames(
             net,
             architecture,
@@ -364,17 +380,16 @@ def depth_response(
         ).slip_mm[:, 2]
         for shift in (0.0, shift_um)
     )
-    change = (there - here) / (shift_um * 1e-3)
-    return DepthResponse(
-        float(change.mean()), float(change.std() / len(change) ** 0.5), len(change)
-    )
+    response = (shifted - at_rest) / (shift_um * 1e-3)
+    error = float(response.std() / len(response) ** 0.5)
+    return DepthResponse(float(response.mean()), error, len(response))
 
 
 def frames_of(trainer: Trainer, people: bench.PeopleFrames) -> SensorFrames:
-    """Their frames through a trainer's lens and sensor.
+    """Sensor frames of people through a trainer's lens.
 
     Args:
-        people: people, their frames and where they look.
+        people: people, their frames and gaze.
     """
     size = trainer.inner.batch
     return sensor_frames(trainer, people, math.ceil(len(people.states) / size))
@@ -386,13 +401,14 @@ def gaze_error_deg(
     people: bench.PeopleFrames,
     seen: SensorFrames,
 ) -> float:
-    """Mean gaze error of a network whose batch statistics are measured.
+    """Mean gaze error, deg, after a personal calibration from the network's readings.
+
+    The batch statistics must be measured.
 
     Args:
         trainer: with lens, sensor and network as they are.
         architecture: member of the search space.
-        people: people, their frames and where they look.
-        seen: their frames on the sensor.
+        people: people, their frames and gaze. seen: their frames on the sensor.
     """
     answers = predict_frames(trainer.model.net, architecture, seen, trainer.inner)
     read = bench.read_of(people, answers.centre, answers.slip_mm)
@@ -402,8 +418,9 @@ def gaze_error_deg(
 def bootstrap_interval(
     values: Array, *, draws: int = 1000, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % percentile interval of the mean of (n,) values by the bootstrap; of a single
-    value the value itself.
+    """(low, high) 95 % percentile interval of the mean of (n,) values by the bootstrap.
+
+    Of a single value both are the value itself.
 
     Args:
         values: to average. draws: resamples. seed: of them.
@@ -419,22 +436,24 @@ def bootstrap_interval(
 def bootstrap_ratio(
     values: Array, reference: Array, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Ratio of two means and its 95 % percentile interval by the paired bootstrap; of a
-    single pair the ratio itself.
+    """(ratio, low, high): ratio of two means and its 95 % interval by the paired
+    bootstrap.
+
+    Percentile interval; of a single pair all three are the ratio.
 
     Args:
-        values, reference: (n,) of the same n subjects or scenes. draws: resamples.
-            seed: of them.
+        values, reference: (n,) of the same n subjects or scenes.
+        draws: resamples. seed: of them.
     """
 
-    def ratio(one: Array, other: Array, axis: int = -1) -> Array:
-        return np.asarray(one.mean(axis) / other.mean(axis))
+    def ratio_of_means(top: Array, bottom: Array, axis: int = -1) -> Array:
+        return np.asarray(top.mean(axis) / bottom.mean(axis))
 
-    whole = float(ratio(values, reference))
+    estimate = float(ratio_of_means(values, reference))
     if len(values) < 2:
-        return whole, whole, whole
+        return estimate, estimate, estimate
     ends = stats.bootstrap(
-        (values, reference), ratio, n_resamples=draws, paired=True,
+        (values, reference), ratio_of_means, n_resamples=draws, paired=True,
         method="percentile", rng=seed,
     ).confidence_interval  # fmt: skip
-    return whole, float(ends.low), float(ends.high)
+    return estimate, float(ends.low), float(ends.high)

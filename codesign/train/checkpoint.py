@@ -37,7 +37,7 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
         TrainingError: the state holds something else.
     """
     tensors: dict[str, Tensor] = {}
-    tree = _split(state, "", tensors)
+    tree = _separate_tensors(state, "", tensors)
     about = {
         "kind": "checkpoint",
         "version": VERSION,
@@ -50,11 +50,12 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
 def save_network(
     path: str | Path, net: nn.Module, *, beside: Mapping[str, Tensor] | None = None
 ) -> None:
-    """Write the weights of a network, and tensors ``beside`` them; the same weights
-    give the same bytes.
+    """Write the weights of a network, and the tensors ``beside``, to a file.
+
+    The same weights give the same bytes.
 
     Args:
-        path: of the file. net: network.
+        path: of the file. net: network. beside: further tensors by name.
 
     Raises:
         OSError: the target cannot be written, the disk is full (the old file stays).
@@ -91,8 +92,9 @@ def load_network(path: str | Path) -> dict[str, Tensor]:
 
 
 def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None:
-    """Of what is said about the tensors there is one entry: the writer puts several
-    into an order drawn by chance.
+    """Write tensors and one metadata entry to a safetensors file, atomically.
+
+    One entry, since the writer puts several in random order.
     """
     with replace_atomically(path) as part:
         try:
@@ -122,7 +124,7 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
             about = _about(file.metadata() or {})
             _check(path, about, settings)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        merged: dict[str, Any] = _merge(about["state"], tensors)
+        merged: dict[str, Any] = _insert_tensors(about["state"], tensors)
     except TrainingError:
         raise
     except (
@@ -141,17 +143,16 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
 
 
 def settings_difference(old: str, settings: object) -> str:
-    """What changed from settings in TOML to these, one ``key: old -> new`` a line; ''
-    for none.
+    """Lines ``key: old -> new`` of settings that differ from those in TOML; '' for
+    none.
 
-    A setting that the old ones do not know stands at its default there: one whose
-    default is not what was done before
-    needs another :data:`VERSION`.
+    A setting that the old ones lack is taken at its present default. One whose default
+    changes behaviour needs another :data:`VERSION`.
     """
-    before = _flat(old)
-    after = _flat(config.dumps(settings))
-    plain = _flat(config.dumps(_plain(settings)))
-    before = {key: value for key, value in plain.items() if key in after} | before
+    before = _flat_toml(old)
+    after = _flat_toml(config.dumps(settings))
+    defaults = _flat_toml(config.dumps(_with_defaults(settings)))
+    before = {key: value for key, value in defaults.items() if key in after} | before
     keys = sorted(before.keys() | after.keys())
     changed = [k for k in keys if before.get(k) != after.get(k)]
     return "\n".join(
@@ -159,16 +160,16 @@ def settings_difference(old: str, settings: object) -> str:
     )
 
 
-def _plain(settings: Any) -> Any:
-    """Settings of the same kind, all that have a default at it."""
-    held: dict[str, Any] = {}
+def _with_defaults(settings: Any) -> Any:
+    """Settings of the same kind, with every field that has a default at it."""
+    values: dict[str, Any] = {}
     for field in fields(settings):
         value = getattr(settings, field.name)
         if is_dataclass(value):
-            held[field.name] = _plain(value)
+            values[field.name] = _with_defaults(value)
         elif field.default is MISSING and field.default_factory is MISSING:
-            held[field.name] = value
-    return type(settings)(**held)
+            values[field.name] = value
+    return type(settings)(**values)
 
 
 def _about(metadata: dict[str, str]) -> dict[str, Any]:
@@ -180,6 +181,11 @@ def _about(metadata: dict[str, str]) -> dict[str, Any]:
 
 
 def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
+    """Refuse a file of another kind or version, or of other settings.
+
+    Raises:
+        TrainingError: with the difference.
+    """
     if metadata.get("kind") != "checkpoint" or metadata.get("version") != VERSION:
         found = metadata.get("kind", "no kind"), metadata.get("version", "no version")
         raise TrainingError(
@@ -193,7 +199,8 @@ def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
         )
 
 
-def _flat(text: str) -> dict[str, str]:
+def _flat_toml(text: str) -> dict[str, str]:
+    """Values of TOML text by ``table.key``, as text."""
     table, result = "", {}
     for line in text.splitlines():
         if line.startswith("["):
@@ -204,16 +211,26 @@ def _flat(text: str) -> dict[str, str]:
     return result
 
 
-def _split(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+def _separate_tensors(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+    """JSON tree of a state, with tensors replaced by names and put into ``tensors``.
+
+    Raises:
+        TrainingError: neither a container, a tensor nor a plain value.
+    """
     if isinstance(node, Tensor):
         tensors[name] = node.detach().contiguous().clone()
         return {_TENSOR: name}
     if isinstance(node, dict):
         return {
-            "items": [[k, _split(v, f"{name}/{k}", tensors)] for k, v in node.items()]
+            "items": [
+                [k, _separate_tensors(v, f"{name}/{k}", tensors)]
+                for k, v in node.items()
+            ]
         }
     if isinstance(node, list | tuple):
-        return [_split(v, f"{name}/{i}", tensors) for i, v in enumerate(node)]
+        return [
+            _separate_tensors(v, f"{name}/{i}", tensors) for i, v in enumerate(node)
+        ]
     if node is None or isinstance(node, bool | int | float | str):
         return node
     raise TrainingError(
@@ -221,13 +238,14 @@ def _split(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
     )
 
 
-def _merge(tree: Any, tensors: dict[str, Tensor]) -> Any:
+def _insert_tensors(tree: Any, tensors: dict[str, Tensor]) -> Any:
+    """The state of a JSON tree of :func:`_separate_tensors` and its tensors."""
     if isinstance(tree, list):
-        return [_merge(v, tensors) for v in tree]
+        return [_insert_tensors(v, tensors) for v in tree]
     if isinstance(tree, dict):
         if _TENSOR in tree:
             return tensors[tree[_TENSOR]]
-        return {k: _merge(v, tensors) for k, v in tree["items"]}
+        return {k: _insert_tensors(v, tensors) for k, v in tree["items"]}
     return tree
 
 

@@ -109,17 +109,18 @@ def evolve_population(
     seed: int,
     start: EvolutionState | None = None,
 ) -> Iterator[EvolutionState]:
-    """Search state after every round of births; give the last one as ``start`` to go on
-    exactly where it stopped.
+    """Regularised evolution: the search state after every round of births.
 
-    The first two candidates are those that :func:`sample_sandwich` trains at every step
+    Passing the last state as ``start`` continues exactly where the search stopped. The
+    first two candidates are those that :func:`sample_sandwich` trains at every step
     (:func:`largest_and_smallest`).
 
     Args:
+        space: architectures to choose from. plan: of the search.
         evaluate: error of an architecture; each different network is evaluated once.
-        count: its multiply-accumulates; only candidates within ``budget`` are
-            evaluated.
-        plan: of the search. seed: of the random generator.
+        count: multiply-accumulates of an architecture; only candidates within
+            ``budget`` are evaluated.
+        seed: of the random generator. start: state to continue from.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -128,37 +129,37 @@ def evolve_population(
     state = start or EvolutionState(
         generator=dict(np.random.default_rng(seed).bit_generator.state)
     )
-    known = {
+    errors = {
         canonical_architecture(space, c.architecture): c.error for c in state.history
     }
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
-        here = len(state.history)
-        births = min(plan.together, plan.rounds - here)
-        born = (
-            list(largest_and_smallest(space, count, budget)[here : here + births])
-            if here < 2
-            else []
-        )
-        while len(born) < births:
-            born.append(_next(space, plan, state, count, budget, generator))
-        fresh = {
-            canonical_architecture(space, a): a
-            for a in born
-            if canonical_architecture(space, a) not in known
-        }
-        known |= dict(
-            zip(fresh, parallel.share_work(evaluate, list(fresh.values())), strict=True)
-        )
-        judged = (
-            EvaluatedCandidate(
-                a, known[canonical_architecture(space, a)], float(count(a))
+        evaluated = len(state.history)
+        births = min(plan.together, plan.rounds - evaluated)
+        newborn: list[Architecture] = []
+        if evaluated < 2:
+            extremes = largest_and_smallest(space, count, budget)
+            newborn += extremes[evaluated : evaluated + births]
+        while len(newborn) < births:
+            newborn.append(
+                _next_candidate(space, plan, state, count, budget, generator)
             )
-            for a in born
+        new_networks = {
+            canonical_architecture(space, a): a
+            for a in newborn
+            if canonical_architecture(space, a) not in errors
+        }
+        values = parallel.share_work(evaluate, list(new_networks.values()))
+        errors |= dict(zip(new_networks, values, strict=True))
+        candidates = (
+            EvaluatedCandidate(
+                a, errors[canonical_architecture(space, a)], float(count(a))
+            )
+            for a in newborn
         )
         state = EvolutionState(
-            (*state.history, *judged), dict(generator.bit_generator.state)
+            (*state.history, *candidates), dict(generator.bit_generator.state)
         )
         yield state
 
@@ -207,7 +208,7 @@ def search(
     return state.history
 
 
-def _next(
+def _next_candidate(
     space: SearchSpace,
     plan: EvolutionSettings,
     state: EvolutionState,
@@ -215,31 +216,33 @@ def _next(
     budget: float,
     generator: np.random.Generator,
 ) -> Architecture:
-    """A random member while the first population grows, then a child of the best of a
-    tournament.
+    """The next architecture: random while the first population grows, later a mutation.
+
+    The parent is the best of a random tournament of the living; of equal errors the
+    cheapest. Where no draw is within the budget: the smallest network, or the parent.
     """
     if len(state.history) < plan.population:
-        return _within(
+        drawn = _draw_within_budget(
             lambda: sample_architecture(space, generator), count, budget
-        ) or smallest_architecture(space)
+        )
+        return drawn or smallest_architecture(space)
     alive = state.alive(plan)
     rivals = generator.choice(len(alive), plan.tournament, replace=False)
-    parent = min(
-        (alive[i] for i in rivals), key=lambda c: (_rank(c.error), c.macs)
-    ).architecture
-    return (
-        _within(
-            lambda: mutate_architecture(space, parent, generator, rate=plan.mutation),
-            count,
-            budget,
-        )
-        or parent
+    parent = best_candidate([alive[i] for i in rivals]).architecture
+    child = _draw_within_budget(
+        lambda: mutate_architecture(space, parent, generator, rate=plan.mutation),
+        count,
+        budget,
     )
+    return child or parent
 
 
-def _within(
+def _draw_within_budget(
     draw: Callable[[], Architecture], count: Count, budget: float, *, tries: int = 200
 ) -> Architecture | None:
+    """First drawn architecture within the budget; None after ``tries`` draws beyond
+    it.
+    """
     for _ in range(tries):
         drawn = draw()
         if count(drawn) <= budget:
@@ -248,7 +251,7 @@ def _within(
 
 
 def _rank(error: float) -> float:
-    """A non-finite error ranks last."""
+    """The error as a sort key: infinite where it is not finite."""
     return error if np.isfinite(error) else np.inf
 
 
@@ -265,6 +268,9 @@ def pareto_front(
     candidates: Sequence[EvaluatedCandidate],
 ) -> tuple[EvaluatedCandidate, ...]:
     """Candidates that no other beats in both error and cost, cheapest first.
+
+    In order of cost, each with a lower error than all before it; non-finite errors are
+    left out.
 
     Args:
         candidates: with error and cost.
@@ -286,16 +292,17 @@ def sample_sandwich(
     *,
     subnets: int,
 ) -> list[Architecture]:
-    """Members of one training step: the largest, the smallest and ``subnets`` drawn
-    ones.
+    """Members of one training step: the largest, the smallest and ``subnets`` random
+    members.
 
-    With a budget above 0 each sees its input at the highest resolution that the budget
-    allows (:func:`largest_and_smallest`): what is
-    never chosen is not trained. Where nothing fits, the smallest at least resolution.
+    With a budget above 0 each has the highest resolution that the budget allows
+    (:func:`largest_and_smallest`), so that training sees what the search can choose. A
+    draw that does not fit within 20 tries is replaced by the smallest.
 
     Args:
         space: architectures to choose from.
-        count: multiply-accumulates of an architecture. generator: of the draws.
+        count: multiply-accumulates of an architecture. budget: of them; 0 for none.
+        generator: of the draws. subnets: random members.
     """
     if not budget:
         return [
@@ -305,7 +312,7 @@ def sample_sandwich(
         ]
     large, small = largest_and_smallest(space, count, budget)
     drawn = [
-        _within(
+        _draw_within_budget(
             lambda: fit_resolution(
                 space, sample_architecture(space, generator), count, budget
             ),
@@ -315,44 +322,46 @@ def sample_sandwich(
         )
         for _ in range(subnets)
     ]
-    return [large, small, *(one or small for one in drawn)]
+    return [large, small, *(member or small for member in drawn)]
 
 
 def largest_and_smallest(
     space: SearchSpace, count: Count, budget: float
 ) -> tuple[Architecture, Architecture]:
-    """The largest uniform network that fits at any resolution, and the smallest: most
-    weights, most pixels.
+    """The largest uniform network that fits at any resolution, and the smallest
+    network.
 
     Both at the highest resolution that the budget allows; the smallest at least
     resolution where nothing fits.
 
     Args:
         space: architectures to choose from.
-        count: multiply-accumulates of an architecture.
+        count: multiply-accumulates of an architecture. budget: of them.
     """
     small = fit_resolution(space, smallest_architecture(space), count, budget)
-    made = (
+    fitted = (
         fit_resolution(space, candidate, count, budget)
         for candidate in uniform_architectures(space)
     )
-    return next((a for a in made if count(a) <= budget), small), small
+    large = next((a for a in fitted if count(a) <= budget), small)
+    return large, small
 
 
 def fit_resolution(
     space: SearchSpace, architecture: Architecture, count: Count, budget: float
 ) -> Architecture:
-    """The architecture at the highest resolution that the budget allows; at the least
-    if none does.
+    """The architecture at the highest resolution that the budget allows, by bisection.
+
+    At the least resolution if none is within the budget.
 
     Args:
         space: architectures to choose from.
-        count: multiply-accumulates of an architecture.
+        count: multiply-accumulates of an architecture. budget: of them.
     """
     low, high = space.resolution
-    whole = dataclasses.replace(architecture, resolution=high)
-    if count(whole) <= budget:
-        return whole
+    largest = dataclasses.replace(architecture, resolution=high)
+    if count(largest) <= budget:
+        return largest
     for _ in range(7):  # to a hundredth of the range
         middle = (low + high) / 2
         fits = count(dataclasses.replace(architecture, resolution=middle)) <= budget
@@ -367,12 +376,13 @@ def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
     Args:
         space: architectures to choose from.
     """
-    whole = largest_architecture(space)
-    least = smallest_architecture(space)
-    shallow = dataclasses.replace(whole, depths=least.depths)
+    largest = largest_architecture(space)
+    smallest = smallest_architecture(space)
+    shallow = dataclasses.replace(largest, depths=smallest.depths)
     for width in sorted(space.widths, reverse=True):
         yield from (
-            dataclasses.replace(part, width=width) for part in (whole, shallow, least)
+            dataclasses.replace(base, width=width)
+            for base in (largest, shallow, smallest)
         )
 
 
@@ -397,7 +407,7 @@ def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
     """
     try:
         raw = json.loads(text)
-        history = tuple(_candidate(entry, space) for entry in raw["history"])
+        history = tuple(_candidate_from_json(entry, space) for entry in raw["history"])
         return EvolutionState(history, raw["generator"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise TrainingError(
@@ -405,7 +415,14 @@ def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
         ) from error
 
 
-def _candidate(entry: dict[str, Any], space: SearchSpace) -> EvaluatedCandidate:
+def _candidate_from_json(
+    entry: dict[str, Any], space: SearchSpace
+) -> EvaluatedCandidate:
+    """Evaluated candidate from its entry in the state's JSON.
+
+    Raises:
+        TrainingError: an unknown entry. ConfigError: not of this space.
+    """
     values = dict(entry)
     error, macs = values.pop("error"), values.pop("macs")
     fields = {f.name for f in dataclasses.fields(Architecture)}
@@ -414,10 +431,10 @@ def _candidate(entry: dict[str, Any], space: SearchSpace) -> EvaluatedCandidate:
             raise TrainingError(
                 f"unknown entry {name!r} of an architecture{nearest_name_hint(name, fields)}"
             )
-    fixed: dict[str, Any] = {
+    sizes: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
     }
-    made = Architecture(**fixed)
+    architecture = Architecture(**sizes)
     return EvaluatedCandidate(
-        check_architecture(space, made), float(error), float(macs)
+        check_architecture(space, architecture), float(error), float(macs)
     )

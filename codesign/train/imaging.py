@@ -22,13 +22,13 @@ Draw = Callable[[int], DrawnLensErrors | None]
 
 
 class StepImaging:
-    """What images the frames of every step.
+    """Imager of the frames of every step: kept while the lens is fixed, renewed as it
+    moves.
 
-    One PSF a depth is formed at every step in which the lens moves. The true image is
-    formed anew every ``refresh``
-    steps and when the lens comes to rest: within a step its lens is that of the last
-    time, while the gradient goes to
-    the lens as it is (see :mod:`codesign.optics.formed`).
+    The uniform image is formed at every step in which the lens moves. The true image is
+    formed every ``refresh`` steps and when the lens stops. Between these it is that of
+    the last time, while the gradient is that of the present lens (see
+    :mod:`codesign.optics.formed`).
     """
 
     def __init__(
@@ -44,12 +44,16 @@ class StepImaging:
         """``stacks``: PSFs of a lens that is made, one of them a step. ``draw``: error
         of a made lens, by step.
         """
-        self.optics, self.stacks, self.draw = optics, tuple(stacks), draw
-        self.refresh, self.draws, self.seed = refresh, draws, seed
-        self.imaged_step, self.imaged_rad = -1, torch.zeros(0, dtype=torch.float64)
-        self.device = torch.device(
-            "cpu"
-        )  # of images and losses: see :func:`codesign.train.place_on_device`
+        self.optics = optics
+        self.stacks = tuple(stacks)
+        self.draw = draw
+        self.refresh = refresh
+        self.draws = draws
+        self.seed = seed
+        self.imaged_step = -1
+        self.imaged_rad = torch.zeros(0, dtype=torch.float64)
+        # of images and losses: see :func:`codesign.train.place_on_device`
+        self.device = torch.device("cpu")
         self._ready: Imager | None = None
         self._given: dict[int, Imager] = {}
         self._live: formed.DifferentiableImager | None = None
@@ -72,11 +76,14 @@ class StepImaging:
         *,
         live: bool,
     ) -> Imager:
-        """The imager of a step for frames of ``frame`` samples, margin included;
-        ``live``: the lens moves.
+        """Imager of a step for square frames; differentiable where ``live``.
 
         Args:
-            coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+            step: its number. coefficients_rad: (polynomials,) of the lens, rad.
+            frame: samples along a side, margin included. margin: samples around the
+                frame.
+            live: the lens moves: the gradient goes through ``draws`` random field
+                points and wavelengths.
         """
         self._live = None
         make = functools.partial(
@@ -90,18 +97,19 @@ class StepImaging:
             return self._drawn(step, coefficients_rad, make)
         if self.optics.image == "uniform":
             return self._uniform(step, coefficients_rad, frame, margin, live=live)
-        made = self._true(step, coefficients_rad.detach(), make, live=live)
+        imager = self._true(step, coefficients_rad.detach(), make, live=live)
         if not live:
-            return made
-        drawn = seeded_generator(self.seed, step, 9)  # field points and wavelengths
-        self._live = formed.make_differentiable_imager(
-            self.optics, made, draw_nodes(made.plan, self.draws, drawn)
-        )
+            return imager
+        generator = seeded_generator(self.seed, step, 9)
+        nodes = draw_nodes(imager.plan, self.draws, generator)
+        self._live = formed.make_differentiable_imager(self.optics, imager, nodes)
         return self._live.ready
 
     def pass_on(self, coefficients_rad: Tensor) -> None:
-        """After the loss went backward: its gradient from the light to the
-        coefficients, where it stopped there.
+        """Backward pass from the image to the coefficients, after that of the loss.
+
+        The loss's own stops at the light of the drawn nodes. Nothing where the lens is
+        fixed.
 
         Args:
             coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
@@ -119,17 +127,20 @@ class StepImaging:
         *,
         live: bool,
     ) -> Imager:
+        """Imager with one PSF a depth, cached while the lens is fixed and no error
+        is drawn.
+        """
         error = self.draw(step)
         if not live and error is None and self._ready is not None:
             return self._ready
-        made = lens.lens_psf_stack(
+        stack = lens.lens_psf_stack(
             self.optics, coefficients_rad, error=error, shared=True
         )
-        prepared = lens.stack_imager(self.optics, made, frame, margin=margin).to(
+        imager = lens.stack_imager(self.optics, stack, frame, margin=margin).to(
             self.device
         )
-        self._ready = None if live or error is not None else prepared
-        return prepared
+        self._ready = None if live or error is not None else imager
+        return imager
 
     def _true(
         self,
@@ -139,11 +150,16 @@ class StepImaging:
         *,
         live: bool,
     ) -> Imager:
-        first = self.imaged_step < 0
+        """True image of the lens, cached.
+
+        Formed anew at the first step, when a moving lens stops, and every ``refresh``
+        steps if the lens moved or its error is drawn.
+        """
+        is_first = self.imaged_step < 0
         moved = not torch.equal(coefficients_rad, self.imaged_rad)
-        drawn = not first and self.draw(self.imaged_step) is not None
-        waited = step - self.imaged_step >= self.refresh
-        if first or (moved and not live) or ((moved or drawn) and waited):
+        has_error = not is_first and self.draw(self.imaged_step) is not None
+        is_due = step - self.imaged_step >= self.refresh
+        if is_first or (moved and not live) or ((moved or has_error) and is_due):
             self.imaged_step, self.imaged_rad = step, coefficients_rad.clone()
             self._ready = None
         if self._ready is None:
@@ -154,12 +170,12 @@ class StepImaging:
     def _drawn(
         self, step: int, coefficients_rad: Tensor, make: Callable[..., Imager]
     ) -> Imager:
-        """The given PSFs that this step draws."""
+        """Imager of the PSF stack that this step draws; each is formed once."""
         generator = np.random.default_rng([self.seed, step, 4])
         number = int(generator.integers(len(self.stacks)))
         if number not in self._given:
-            made = self.stacks[number]
-            self._given[number] = make(coefficients_rad=coefficients_rad, made=made)
+            stack = self.stacks[number]
+            self._given[number] = make(coefficients_rad=coefficients_rad, made=stack)
         return self._given[number]
 
 
@@ -184,41 +200,41 @@ def read_out(
     resized: bool = False,
     quiet: bool = False,
 ) -> Tensor:
-    """(batch, 1, rows, columns) standardised frames as the network sees them: pixels,
-    noise, quantisation.
+    """(batch, 1, rows, columns) standardised sensor frames: pixels, noise,
+    quantisation.
 
-    The gradient in the pitch is that of a network whose own grid stays on the scene, so
-    of a fixed cost: the box of the
-    pixels widens, and an area of the sensor is read (pitch0 / pitch)^2 times; its light
-    and photon noise stay. (The
-    frame as such zooms while its pixels grow, until one drops off at the rim: a slope
-    that says nothing of the next
-    count of pixels.)
+    Mean 0 and variance 1 of every frame. The gradient in the pitch is that of a network
+    of fixed cost, whose own grid stays on the scene: the box of the pixels widens, and
+    an area is read (pitch0 / pitch)² times, while its light and photon noise stay. The
+    gradient of the zoom itself is left out: it says nothing of the next number of
+    pixels.
 
     Args:
-        exact: Poisson counts; otherwise their normal approximation, four times faster
-            (the skewness 1 / sqrt(mean)
-            is lost), still Poisson where the mean is below 20 electrons.
-        resized: the frames will be averaged to a coarser grid, whose cells, not the
-            pixels, are then the box: the
-            gradient in the pitch is that of the reads alone.
-        quiet: the expected electrons, without noise.
         irradiance: (batch, y, x) light on the image grid.
-        sample_um: distance of the samples. pitch_um: () pitch of the pixels, um.
-        generator: of the draws.
+        sample_um: spacing of the samples. pitch_um: () pitch of the pixels, um.
+        sensor: its noise, full well and quantisation. generator: of the draws.
+        exact: Poisson counts; otherwise their normal approximation, four times faster
+            (without the skewness 1 / sqrt(mean)), still Poisson where the mean is below
+            20 electrons.
+        resized: the frames will be averaged to a coarser grid, whose cells, not the
+            pixels, are then the box: the gradient in the pitch is that of the reads
+            alone.
+        quiet: the expected electrons, without noise.
     """
-    here, moves = float(pitch_um.detach()), pitch_um.requires_grad
-    pixel = replace(sensor, pitch_um=here)  # the full well is that of this pitch
-    box, grid_um = (
-        (pitch_um, here) if moves and not resized else (pitch_um.detach(), None)
-    )
+    pitch = float(pitch_um.detach())
+    pixel = replace(sensor, pitch_um=pitch)  # the full well is that of this pitch
+    box = pitch_um.detach()
+    grid_um = None
+    if pitch_um.requires_grad and not resized:
+        box = pitch_um
+        grid_um = pitch
     mean = camera.mean_electrons(
         irradiance, sample_um, sensor=pixel, pitch_um=box, grid_um=grid_um
     )
-    reads = (here / pitch_um) ** 2
+    reads = (pitch / pitch_um) ** 2
     if quiet:
         electrons = mean.clamp(
-            max=pixel.full_well_e * float(camera.kappa(here, pixel.base_pitch_um))
+            max=pixel.full_well_e * float(camera.kappa(pitch, pixel.base_pitch_um))
         )
     elif not exact and float(mean.detach().mean()) > 20:
         electrons = _normal(mean, pixel, generator, reads)
@@ -227,29 +243,28 @@ def read_out(
     frames = camera.digitise(electrons, sensor=pixel)
     centred = frames - frames.mean((-2, -1), keepdim=True)
     count = centred.shape[-2] * centred.shape[-1]
-    deviation = (
-        ((centred * centred).sum((-2, -1), keepdim=True) / max(count - 1, 1))
-        .clamp_min(1e-12)
-        .sqrt()
-    )
+    variance = (centred * centred).sum((-2, -1), keepdim=True) / max(count - 1, 1)
+    deviation = variance.clamp_min(1e-12).sqrt()
     return (centred / deviation)[:, None].to(torch.float32)
 
 
 def _normal(
     mean: Tensor, sensor: Sensor, generator: torch.Generator | None, reads: Tensor
 ) -> Tensor:
-    """Electrons of mean and variance as :func:`metalens.image.expose`, up to the full
-    well, from one normal draw.
+    """Electrons drawn from a normal distribution of the mean and variance of the
+    exposure.
+
+    Mean clipped to the full well, variance mean + read noise² * reads, as
+    :func:`metalens.image.expose`.
     """
     well = sensor.full_well_e * float(
         camera.kappa(sensor.pitch_um, sensor.base_pitch_um)
     )
     collected = mean.clamp(max=well)
-    share, size = (
-        parallel.process_count(),
-        len(mean),
-    )  # the noise of the whole batch, whoever takes which part of it
-    noise = camera.normal((share * size, *mean.shape[1:]), mean, generator)
+    # noise of the whole batch, of which every process takes its own frames
+    size = len(mean)
+    total = parallel.process_count() * size
+    noise = camera.normal((total, *mean.shape[1:]), mean, generator)
     noise = noise[parallel.process_rank() * size : (parallel.process_rank() + 1) * size]
     return collected + noise * torch.sqrt(
         collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6
@@ -257,16 +272,14 @@ def _normal(
 
 
 def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
-    """Width of the sensor's frame over that of its image: 1, or more where the pixels
-    do not divide the image.
+    """Width of the sensor's frame over that of its image.
 
-    The last pixels then reach beyond the image, by half a pixel at most; a network sees
-    the frame and tells places in
-    it, so its labels are those of the frame
+    1, or more where the pixels do not divide the image: the last pixels then reach past
+    it, by half a pixel at most. Labels are those of the frame
     (:func:`codesign.network.losses.mask_in_frame`).
 
     Args:
-        samples: of the image along a side. sample_um: distance of the samples.
+        samples: of the image along a side. sample_um: spacing of the samples.
         pitch_um: of the pixels.
     """
     wide = pixel_count(samples, sample_um, pitch_um) * pitch_um / (samples * sample_um)

@@ -30,13 +30,12 @@ from metalens.core.errors import TrainingError
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BudgetResult:
-    """What a budget ended in.
+    """Result of one compute budget.
 
-    row: of the result. trainer: with the model that reached it, lens, pitch and weights
-    of its own where that is asked for. seen, answers: test frames, and
-    what the model said of them. interval_mm: (n,) half width of its 90 % intervals of
-    the axial slippage; None of a
-    network that gives none.
+    row: of the result. trainer: with the final model, lens, pitch and weights of its
+    own where that is configured. seen, answers: test frames, and predictions for them.
+    interval_mm: (n,) half width of the 90 % intervals of the axial slippage; None of a
+    network without an uncertainty.
     """
 
     row: dict[str, Any]
@@ -47,41 +46,47 @@ class BudgetResult:
 
 
 def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
-    """The ends of :func:`finish_budgets`, a budget each.
+    """Results of all budgets of a finished run; rows have these columns.
 
-    ``gaze_deg``: mean gaze error on people whom training never saw, by spherical-eye
+    ``gaze_deg``: mean gaze error on people whom training never used, by spherical-eye
     solver and residual regressor. ``pitch_um``: of its own lens and sensor.
-    ``mmacs``: that run for a frame. A search holds its budget to the smooth count,
-    beside which it may lie where the
-    pitch does not divide the image, or a network's resolution the pixels.
-    ``effective_pitch_um``: distance of the cells that the network sees: of pixels
-    binned to its resolution.
-    ``axial_coverage_90``: share of test frames within the network's calibrated 90 %
-    interval, whose mean half width is
-    ``axial_interval_mm``. ``window_depth_mm``: mean error of the depth of the windows.
+    ``mmacs``: million multiply-accumulates of a frame. A search limits the smooth
+    count, from which it differs where the pitch does not divide the image, or a
+    network's resolution the pixels.
+    ``effective_pitch_um``: spacing of the network's input: of pixels binned to its
+    resolution.
+    ``axial_coverage_90``: fraction of test frames within the network's calibrated 90 %
+    interval, whose mean half width is ``axial_interval_mm``.
+    ``window_depth_mm``: mean error of the depth of the windows.
     ``finer_axial_slip_mm``, ``finer_lateral_slip_mm``, ``finer_iou``: the same frames
-    on
-    an image formed at a quarter of the training tolerance, and ``finer_ratio`` of the
-    axial errors: near 1 where the result does not depend on the tolerance.
+    on an image formed at a quarter of the training tolerance, and ``finer_ratio`` of
+    the axial errors: near 1 where the result does not depend on the tolerance.
     Batch statistics are measured on training frames through the final lens, never on
-    those that are judged.
+    test frames.
     """
     settings = run.settings
     people = people_of(run, TEST, settings.test_batches)
-    shared: _Frames | None = None
-    out = []
-    for budget, best in _chosen(run):
+    frames: _TestFrames | None = None
+    results = []
+    for budget, best in _best_by_budget(run):
         trainer = specialise_candidate(run, best.architecture, budget)
-        if shared is None or settings.search.inner_steps:
-            shared = _frames(replace(run, trainer=trainer), people)
-        out.append(_end(replace(run, trainer=trainer), budget, best, people, shared))
-    return out
+        if frames is None or settings.search.inner_steps:
+            frames = _test_frames(replace(run, trainer=trainer), people)
+        results.append(
+            _evaluate_budget(
+                replace(run, trainer=trainer), budget, best, people, frames
+            )
+        )
+    return results
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Frames:
-    """Frames through one lens: tests by prefix of their columns, on the finer image, of
-    people, to measure batch statistics on, to calibrate intervals with.
+class _TestFrames:
+    """Frames through one lens, for every budget that shares it.
+
+    tests: by prefix of their columns. fine: on the finer image. people: for gaze.
+    measured: to measure batch statistics on. apart: to calibrate intervals with.
+    response: scenes of the depth response.
     """
 
     tests: dict[str, SensorFrames]
@@ -92,7 +97,8 @@ class _Frames:
     response: SceneSource
 
 
-def _frames(run: CodesignRun, people: PeopleFrames) -> _Frames:
+def _test_frames(run: CodesignRun, people: PeopleFrames) -> _TestFrames:
+    """Test, calibration and training frames through the run's present lens."""
     settings, trainer = run.settings, run.trainer
     tests = {"": assess.sensor_frames(trainer, run.scenes(TEST), settings.test_batches)}
     response: SceneSource = run.scenes(TEST)
@@ -103,7 +109,7 @@ def _frames(run: CodesignRun, people: PeopleFrames) -> _Frames:
         batches = max(1, len(pairs.states) // settings.inner.batch)
         tests["ambiguous_"] = assess.sensor_frames(trainer, pairs, batches)
         response = pairs
-    return _Frames(
+    return _TestFrames(
         tests,
         assess.finer_frames(trainer, run.scenes(TEST), settings.test_batches),
         assess.frames_of(trainer, people),
@@ -115,57 +121,75 @@ def _frames(run: CodesignRun, people: PeopleFrames) -> _Frames:
     )
 
 
-def _end(
+def _evaluate_budget(
     run: CodesignRun,
     budget: float,
     best: EvaluatedCandidate,
     people: PeopleFrames,
-    shown: _Frames,
+    frames: _TestFrames,
 ) -> BudgetResult:
-    """The row of one budget; ``run`` holds the trainer that reached it."""
+    """Row of the result of one budget, with predictions; ``run`` holds its final
+    trainer.
+
+    Slippage and gaze errors, intervals, the finer image and the depth response.
+    """
     settings = run.settings
     trainer = run.trainer
     architecture = best.architecture
     net, inner = trainer.model.net, settings.inner
-    recalibrate_batch_norm(net, architecture, shown.measured)
+    recalibrate_batch_norm(net, architecture, frames.measured)
     row: dict[str, Any] = {
         "budget_mmacs": budget,
         "mmacs": run.macs(architecture) / 1e6,
     }
-    pitch = float(trainer.model.pitch_um.detach())
-    row["pitch_um"], row["effective_pitch_um"] = pitch, pitch / architecture.resolution
-    row["gaze_deg"] = assess.gaze_error_deg(trainer, architecture, people, shown.people)
-    reach = conformal_quantiles(
-        assess.predict_frames(net, architecture, shown.apart, inner), shown.apart
+    pitch_um = float(trainer.model.pitch_um.detach())
+    row["pitch_um"] = pitch_um
+    row["effective_pitch_um"] = pitch_um / architecture.resolution
+    row["gaze_deg"] = assess.gaze_error_deg(
+        trainer, architecture, people, frames.people
     )
-    plain = assess.predict_frames(net, architecture, shown.tests[""], inner)
-    for name, seen in shown.tests.items():
-        answers = (
-            assess.predict_frames(net, architecture, seen, inner) if name else plain
+    calibration = assess.predict_frames(net, architecture, frames.apart, inner)
+    quantile = conformal_quantiles(calibration, frames.apart)
+    test_predictions = assess.predict_frames(net, architecture, frames.tests[""], inner)
+    for name, seen in frames.tests.items():
+        predictions = (
+            assess.predict_frames(net, architecture, seen, inner)
+            if name
+            else test_predictions
         )
-        row |= _errors(name, answers, seen) | uncertainty_summary(
-            name, answers, seen, reach
+        row |= _errors(name, predictions, seen) | uncertainty_summary(
+            name, predictions, seen, quantile
         )
-    if shown.fine is not None:
-        on_fine = assess.predict_frames(net, architecture, shown.fine, inner)
-        row |= _errors("finer_", on_fine, shown.fine)
+    if frames.fine is not None:
+        fine_predictions = assess.predict_frames(net, architecture, frames.fine, inner)
+        row |= _errors("finer_", fine_predictions, frames.fine)
         row["finer_ratio"] = row["finer_axial_slip_mm"] / row["axial_slip_mm"]
     response = assess.depth_response(
         trainer,
-        shown.response,
+        frames.response,
         net,
         architecture,
         batches=max(1, settings.test_batches // 4),
     )
     row["depth_response_mm_per_mm"] = response.mean
     row["depth_response_error"] = response.standard_error
-    row["architecture"] = json.loads(evolution.state_to_json(EvolutionState((best,))))[
-        "history"
-    ][0]
-    return BudgetResult(row, trainer, shown.tests[""], plain, _wide(plain, reach))
+    state = json.loads(evolution.state_to_json(EvolutionState((best,))))
+    row["architecture"] = state["history"][0]
+    return BudgetResult(
+        row,
+        trainer,
+        frames.tests[""],
+        test_predictions,
+        _half_widths_mm(test_predictions, quantile),
+    )
 
 
-def _chosen(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
+def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
+    """(budget, best candidate of its search) of every budget.
+
+    Raises:
+        TrainingError: a search is missing.
+    """
     settings = run.settings
     if len(run.searches) < len(settings.run.budgets_mmacs):
         raise TrainingError(
@@ -179,69 +203,71 @@ def _chosen(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
 
 
 def _errors(
-    name: str, answers: Predictions, seen: SensorFrames
+    prefix: str, predictions: Predictions, seen: SensorFrames
 ) -> dict[str, float | None]:
-    error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
-    shared = float(answers.iou.mean())
+    """Mean axial and lateral slippage error in mm, and mask IoU; keys begin with
+    ``prefix``.
+    """
+    error = (predictions.slip_mm - seen.slip_mm).abs().mean(0)
+    iou = float(predictions.iou.mean())
     return {
-        f"{name}axial_slip_mm": float(error[2]),
-        f"{name}lateral_slip_mm": float(error[:2].mean()),
-        f"{name}iou": shared
-        if shared == shared
-        else None,  # a network without a mask has none
+        f"{prefix}axial_slip_mm": float(error[2]),
+        f"{prefix}lateral_slip_mm": float(error[:2].mean()),
+        # nan of a network without a mask
+        f"{prefix}iou": iou if iou == iou else None,
     }
 
 
 def conformal_quantiles(
     answers: Predictions, seen: SensorFrames, *, share: float = 0.9
 ) -> float | None:
-    """Half width, in its own standard deviations, of the interval that holds this share
-    of the axial slippages.
+    """Split-conformal quantile of |axial error| / predicted standard deviation.
 
-    From frames that training, search and test never use: with them the network's
-    uncertainty is calibrated (split conformal prediction).
+    The interval of so many standard deviations contains ``share`` of the axial
+    slippages, for any distribution of the errors. None of a network without an
+    uncertainty.
 
     Args:
-        answers: of the network. seen: frames of the sensor with their truth.
+        answers: predictions for ``seen``. seen: frames of the sensor with their labels,
+            that training, search and test never use. share: coverage of the interval.
     """
     if answers.slip_sd_mm is None:
         return None
     ratio = (answers.slip_mm - seen.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
-    rank = min(
-        math.ceil(share * (len(ratio) + 1)), len(ratio)
-    )  # conformal: holds whatever the distribution
+    rank = min(math.ceil(share * (len(ratio) + 1)), len(ratio))
     return float(ratio.sort().values[rank - 1])
 
 
-def _wide(answers: Predictions, reach: float | None) -> Tensor | None:
+def _half_widths_mm(answers: Predictions, reach: float | None) -> Tensor | None:
     """(n,) half width of the 90 % intervals of the axial slippage."""
-    return (
-        None
-        if answers.slip_sd_mm is None or reach is None
-        else reach * answers.slip_sd_mm[:, 2]
-    )
+    if answers.slip_sd_mm is None or reach is None:
+        return None
+    return reach * answers.slip_sd_mm[:, 2]
 
 
 def uncertainty_summary(
     name: str, answers: Predictions, seen: SensorFrames, reach: float | None
 ) -> dict[str, float]:
-    """Coverage and width of the 90 % intervals of the slippage, and depth error of the
-    windows.
+    """Coverage and mean half width in mm of the 90 % intervals, and window depth error
+    in mm.
+
+    Columns that the network cannot give are left out.
 
     Args:
         name: prefix of the keys. answers: of the network.
-        seen: frames of the sensor with their truth.
+        seen: frames of the sensor with their labels.
         reach: conformal quantile, in standard deviations.
     """
     row: dict[str, float] = {}
-    if (wide := _wide(answers, reach)) is not None:
+    if (half_width := _half_widths_mm(answers, reach)) is not None:
+        axial_error = (answers.slip_mm - seen.slip_mm)[:, 2].abs()
         row[f"{name}axial_coverage_90"] = float(
-            ((answers.slip_mm - seen.slip_mm)[:, 2].abs() <= wide).float().mean()
+            (axial_error <= half_width).float().mean()
         )
-        row[f"{name}axial_interval_mm"] = float(wide.mean())
+        row[f"{name}axial_interval_mm"] = float(half_width.mean())
     if answers.depth is not None and seen.vergence is not None:
-        miss = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(seen.vergence)
-        row[f"{name}window_depth_mm"] = float(miss.abs().mean())
+        error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(seen.vergence)
+        row[f"{name}window_depth_mm"] = float(error.abs().mean())
     return row
 
 
@@ -253,24 +279,29 @@ def run_pictures(run: CodesignRun) -> dict[str, bytes]:
     statistics are measured in evaluation mode on the frames that are shown.
     """
     trainer = run.trainer
-    made = lens.lens_psf_stack(trainer.optics, trainer.model.coefficients_rad)
-    chosen = torch.linspace(0, len(made.depths_um) - 1, 6).long().tolist()
-    titles = [f"{float(made.depths_um[i]) * 1e-3:.0f} mm" for i in chosen]
+    stack = lens.lens_psf_stack(trainer.optics, trainer.model.coefficients_rad)
+    indices = torch.linspace(0, len(stack.depths_um) - 1, 6).long().tolist()
+    titles = [f"{float(stack.depths_um[i]) * 1e-3:.0f} mm" for i in indices]
     pictures = {
-        "psf": _row([made.intensity[i].clamp_min(0).sqrt() for i in chosen], titles)
+        "psf": _picture_row(
+            [stack.intensity[i].clamp_min(0).sqrt() for i in indices], titles
+        )
     }
-    seen = assess.sensor_frames(trainer, run.scenes(VALIDATION), 1)
-    shown = min(6, len(seen.frames))
-    pictures["frames"] = _row(list(seen.frames[:shown, 0]), [""] * shown)
+    frames = assess.sensor_frames(trainer, run.scenes(VALIDATION), 1)
+    shown = min(6, len(frames.frames))
+    pictures["frames"] = _picture_row(list(frames.frames[:shown, 0]), [""] * shown)
     net = copy.deepcopy(trainer.model.net)  # the run's own statistics must not move
-    recalibrate_batch_norm(net, smallest_architecture(net.space), [seen.frames])
-    found = net(seen.frames, smallest_architecture(net.space)).mask_logits.cpu()
-    if found.numel():
-        pictures["masks"] = _row(list(torch.sigmoid(found[:shown])), [""] * shown)
+    recalibrate_batch_norm(net, smallest_architecture(net.space), [frames.frames])
+    logits = net(frames.frames, smallest_architecture(net.space)).mask_logits.cpu()
+    if logits.numel():
+        pictures["masks"] = _picture_row(
+            list(torch.sigmoid(logits[:shown])), [""] * shown
+        )
     return pictures
 
 
-def _row(images: list[Tensor], titles: list[str]) -> bytes:
+def _picture_row(images: list[Tensor], titles: list[str]) -> bytes:
+    """PNG of images side by side with titles, in grey."""
     figure, _ = report.make_figure(size=(1.6 * len(images), 1.8))
     figure.clear()
     for k, (image, title) in enumerate(zip(images, titles, strict=True)):
@@ -283,63 +314,68 @@ def _row(images: list[Tensor], titles: list[str]) -> bytes:
 
 @torch.no_grad()
 def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
-    """Least standard deviation, in mm, of a reader of the blur of one window, on axis,
-    over the depth.
+    """Cramér-Rao bound, in mm, on the depth of one window from its blur, on axis, by
+    depth.
 
-    Of a window of 1/f texture as wide as the PSFs, with noise of a thousandth of its
-    power: see
-    :func:`codesign.train.separability.depth_information`.
+    The window has 1/f texture and is as wide as the PSFs, with noise of a thousandth of
+    its power; see :func:`codesign.train.separability.depth_information`.
 
     Args:
         run: run with its model.
     """
-    made = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
-    information = depth_information(made)
-    middle = (made.depths_um[1:] + made.depths_um[:-1]) / 2
+    stack = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
+    information = depth_information(stack)
+    depth_um = (stack.depths_um[1:] + stack.depths_um[:-1]) / 2
     return {
-        "depth_mm": (1e-3 * middle).tolist(),
+        "depth_mm": (1e-3 * depth_um).tolist(),
         "window_depth_mm": information.clamp_min(1e-12).rsqrt().tolist(),
     }
 
 
 def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Array]:
-    """The first test frames and what each network said of them.
+    """Arrays of the first test frames, with labels and the predictions of each network.
 
     Args:
-        ends: one a compute budget. count: how many.
+        ends: one a compute budget. count: number of frames.
 
     Returns:
         frames (n, y, x) as the network sees them; pupil (n, y, x) and slip_um (n, 3),
-        true; told_pupil (networks, n, y,
-        x) share of the pixel, told_slip_um (networks, n, 3); interval_um (networks, n)
-        half width of the 90 % interval
-        of the distance, nan where none is given; window_um (n, windows, windows) true
-        depth and told_window_um
-        (networks, n, windows, windows). What no network tells is left out.
+        true; told_pupil (networks, n, y, x) probability, told_slip_um (networks, n, 3);
+        interval_um (networks, n) half width of the 90 % interval of the distance, nan
+        without one; window_um (n, windows, windows) true depth and told_window_um
+        (networks, n, windows, windows). What no network predicts is left out.
     """
-    seen, networks = ends[0].seen, [end.answers for end in ends]
-    pixels = int(seen.frames.shape[-1])
-    out = {"frames": seen.frames[:count, 0], "slip_um": 1e3 * seen.slip_mm[:count]}
-    out["told_slip_um"] = torch.stack([1e3 * a.slip_mm[:count] for a in networks])
-    none = torch.full((min(count, len(seen.frames)),), torch.nan)
-    wide = [
-        none if end.interval_mm is None else 1e3 * end.interval_mm[:count]
+    frames = ends[0].seen
+    predictions = [end.answers for end in ends]
+    pixels = int(frames.frames.shape[-1])
+    arrays = {
+        "frames": frames.frames[:count, 0],
+        "slip_um": 1e3 * frames.slip_mm[:count],
+    }
+    arrays["told_slip_um"] = torch.stack([1e3 * a.slip_mm[:count] for a in predictions])
+    missing = torch.full((min(count, len(frames.frames)),), torch.nan)
+    half_widths = [
+        missing if end.interval_mm is None else 1e3 * end.interval_mm[:count]
         for end in ends
     ]
-    out["interval_um"] = torch.stack(wide)
-    logits = [a.mask for a in networks if a.mask is not None]
-    if len(logits) == len(networks):
-        both = [
-            losses.at_pixels(mask[:count], seen.mask[:count], pixels) for mask in logits
+    arrays["interval_um"] = torch.stack(half_widths)
+    logits = [a.mask for a in predictions if a.mask is not None]
+    if len(logits) == len(predictions):
+        pairs = [
+            losses.at_pixels(mask[:count], frames.mask[:count], pixels)
+            for mask in logits
         ]
-        out |= {
-            "pupil": both[0][1],
-            "told_pupil": torch.stack([torch.sigmoid(found) for found, _ in both]),
+        arrays |= {
+            "pupil": pairs[0][1],
+            "told_pupil": torch.stack(
+                [torch.sigmoid(mask_logits) for mask_logits, _ in pairs]
+            ),
         }
-    windows = [a.depth[:count, 0] for a in networks if a.depth is not None]
-    if seen.vergence is not None and len(windows) == len(networks):
-        out["window_um"] = 1e3 * blur.depth_mm(seen.vergence[:count])
-        out["told_window_um"] = 1e3 * blur.depth_mm(torch.stack(windows))
+    windows = [a.depth[:count, 0] for a in predictions if a.depth is not None]
+    if frames.vergence is not None and len(windows) == len(predictions):
+        arrays["window_um"] = 1e3 * blur.depth_mm(frames.vergence[:count])
+        arrays["told_window_um"] = 1e3 * blur.depth_mm(torch.stack(windows))
     return {
-        name: np.asarray(value.cpu().numpy(), np.float32) for name, value in out.items()
+        name: np.asarray(value.cpu().numpy(), np.float32)
+        for name, value in arrays.items()
     }

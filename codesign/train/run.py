@@ -152,8 +152,9 @@ def load_run_settings(path: str | Path) -> RunConfig:
 
 
 def preset_table(name: str) -> dict[str, Any]:
-    """The settings of a preset; empty for "none" and for a name that is no preset,
-    which :func:`load_run_settings` then refuses.
+    """The settings of a preset; empty for "none" and for an unknown name.
+
+    :func:`load_run_settings` refuses unknown names.
     """
     if name == "none" or name not in get_args(Preset):
         return {}
@@ -165,7 +166,7 @@ def preset_table(name: str) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class CodesignRun:
-    """A run and where it stands: ``trainer`` first, then a search for every budget."""
+    """A run and its progress: ``trainer`` first, then a search for every budget."""
 
     settings: RunConfig
     trainer: Trainer
@@ -173,15 +174,14 @@ class CodesignRun:
 
     @property
     def window_um(self) -> float:
-        """Edge of the image."""
+        """Side of the image, um."""
         return self.settings.scenes.pixels * self.settings.optics.sample_um
 
     def macs(self, architecture: Architecture) -> float:
-        """Multiply-accumulates that run for a frame of whole pixels at the pitch that
-        was found.
+        """Multiply-accumulates for a frame of whole pixels at the present pitch.
 
-        Training counts smoothly with the pitch (:func:`codesign.network.cost.macs_of_size`), up to a row of
-        pixels less.
+        Training counts smoothly with the pitch
+        (:func:`codesign.network.cost.macs_of_size`), up to a row of pixels less.
 
         Args:
             architecture: member of the search space.
@@ -194,13 +194,13 @@ class CodesignRun:
         """Multiply-accumulates of an architecture for the whole pixels of any pitch.
 
         Args:
-            pitch_um: of the pixels.
+            architecture: member of the search space. pitch_um: of the pixels.
         """
         pixels = pixel_count(
             self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um
         )
-        sizes = np.array([round(pixels * architecture.resolution)])
-        return float(cost.network_cost(self.settings.space, architecture).at(sizes)[0])
+        size = np.array([round(pixels * architecture.resolution)])
+        return float(cost.network_cost(self.settings.space, architecture).at(size)[0])
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
@@ -208,8 +208,10 @@ class CodesignRun:
 
 
 def start_run(settings: RunConfig) -> CodesignRun:
-    """A fresh run; its pool of frames, where there is one, is rendered when the first
-    batch is asked for.
+    """A new run with an untrained model.
+
+    Its pool of frames, where there is one, is rendered when the first batch is
+    requested.
 
     Args:
         settings: of the run.
@@ -218,33 +220,34 @@ def start_run(settings: RunConfig) -> CodesignRun:
         TrainingError: a budget is below the smallest network at the pitch that the run
             begins with.
     """
-    seed, frozen = settings.inner.seed, settings.run.frozen
-    still: dict[str, Any] = {
+    seed = settings.inner.seed
+    frozen = settings.run.frozen
+    frozen_rates: dict[str, Any] = {
         part: LearningRateSchedule(0.0)
         for part in ("optics", "pitch")
         if part in frozen
     }
-    inner = replace(settings.inner, **still)
-    made = make_model(
+    inner = replace(settings.inner, **frozen_rates)
+    model = make_model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space
     )
-    fresh = eye_scenes(settings, TRAINING)
-    scenes: SceneSource = fresh
+    eyes = eye_scenes(settings, TRAINING)
+    scenes: SceneSource = eyes
     if settings.scenes.pool:
-        pool = functools.partial(_pool, fresh)
-        scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
+        pool = functools.partial(_pool, eyes)
+        scenes = PoolScenes(pool, eyes.margin, settings.scenes.scale, seed)
     trainer = Trainer(
         inner,
         settings.optics,
         settings.sensor,
         scenes,
-        made,
+        model,
         budgets_mmacs=settings.run.budgets_mmacs,
         largest_only="architecture" in frozen,
-        triplets=fresh,
+        triplets=eyes,
     )
     run = CodesignRun(settings, trainer, [])
-    made.finest_um = _affordable(run, moves=inner.pitch.rate > 0)
+    model.finest_um = _finest_affordable_pitch_um(run, moves=inner.pitch.rate > 0)
     return run
 
 
@@ -261,42 +264,47 @@ def eye_scenes(settings: RunConfig, stream: int) -> EyeScenes:
 
 @functools.lru_cache(maxsize=1)
 def _pool(scenes: EyeScenes) -> FramePool:
-    """The rendered frames of a run, a gigabyte; kept for whoever goes on with it in
-    this process, until another run asks for its own.
+    """Rendered frames of a run, a gigabyte; cached in this process until another run
+    asks.
     """
     return render_pool(scenes, scenes.settings.pool)
 
 
-def _affordable(run: CodesignRun, *, moves: bool) -> float:
-    """:func:`finest_pitch_um` of the smallest network under the least budget; 0 where
-    the pitch does not move.
+def _finest_affordable_pitch_um(run: CodesignRun, *, moves: bool) -> float:
+    """:func:`finest_pitch_um` of the smallest network under the least budget.
+
+    0 where the pitch does not move.
 
     Raises:
         TrainingError: it is coarser than the pitch that the run begins with.
     """
     settings = run.settings
-    least = smallest_architecture(settings.space)
+    smallest = smallest_architecture(settings.space)
     budget = min(settings.run.budgets_mmacs) * 1e6
-    begins = settings.run.pitch_um
-    count = _counter(run, least)
-    if count(begins) > budget:
-        coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])
-        coarser = finest_within(count, budget, begins, coarsest)
-        way = (
+    start_um = settings.run.pitch_um
+    count = _macs_by_pitch(run, smallest)
+    if count(start_um) > budget:
+        coarsest_um = cost.coarsest_um(run.window_um, settings.space.resolution[0])
+        affordable_um = finest_within(count, budget, start_um, coarsest_um)
+        advice = (
             ""
-            if coarser is None
-            else f", or begin with run.pitch_um = {math.ceil(coarser * 100) / 100:g} or more"
+            if affordable_um is None
+            else f", or begin with run.pitch_um = {math.ceil(affordable_um * 100) / 100:g} or more"
         )
         raise TrainingError(
-            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.2f} MMACs at "
-            f"run.pitch_um = {begins:g}: raise run.budgets_mmacs{way}"
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(start_um) / 1e6:.2f} MMACs at "
+            f"run.pitch_um = {start_um:g}: raise run.budgets_mmacs{advice}"
         )
-    return finest_pitch_um(run, least, budget, begins_um=begins) if moves else 0.0
+    return finest_pitch_um(run, smallest, budget, begins_um=start_um) if moves else 0.0
 
 
-def _counter(run: CodesignRun, architecture: Architecture) -> Callable[[float], float]:
-    """Multiply-accumulates of an architecture by pitch, um: the larger of the smooth
-    count, which training goes by, and that of whole pixels, which the search goes by.
+def _macs_by_pitch(
+    run: CodesignRun, architecture: Architecture
+) -> Callable[[float], float]:
+    """Multiply-accumulates of an architecture as a function of the pitch in um.
+
+    The larger of the smooth count, which training uses, and that of whole pixels, which
+    the search uses.
     """
 
     def count(pitch_um: float) -> float:
@@ -310,14 +318,15 @@ def _counter(run: CodesignRun, architecture: Architecture) -> Callable[[float], 
 def finest_pitch_um(
     run: CodesignRun, architecture: Architecture, budget: float, *, begins_um: float
 ) -> float:
-    """The finest pitch at which an architecture keeps its budget; 0 where the samples'
-    own does.
+    """The finest pitch in um at which an architecture is within its budget.
+
+    0 where it is within it even at the sampling of the image; at most ``begins_um``.
 
     Args:
         run: run with its model. architecture: member of the search space.
         budget: multiply-accumulates. begins_um: pitch that training begins with.
     """
-    count = _counter(run, architecture)
+    count = _macs_by_pitch(run, architecture)
     finest = min(run.settings.optics.sample_um, begins_um)
     if count(finest) <= budget:
         return 0.0
@@ -327,12 +336,14 @@ def finest_pitch_um(
 def finest_within(
     count: Callable[[float], float], budget: float, low_um: float, high_um: float
 ) -> float | None:
-    """The finest pitch within the budget, where the low one is beyond it; None where
-    the high one is too.
+    """The finest pitch in um within the budget, by geometric bisection over a range.
+
+    The low pitch is taken to be beyond the budget. None where the high one is too, or
+    the range is empty.
 
     Args:
-        count: multiply-accumulates at a pitch in um. low_um: finest pitch.
-        high_um: coarsest pitch.
+        count: multiply-accumulates at a pitch in um. budget: of them.
+        low_um: finest pitch. high_um: coarsest pitch.
     """
     if high_um <= low_um or count(high_um) > budget:
         return None
@@ -345,7 +356,8 @@ def finest_within(
 
 
 def save_run(path: Path, run: CodesignRun) -> None:
-    """Checkpoint: training state and the searches so far; written by one process alone.
+    """Write a checkpoint of the training state and the searches so far; by process 0
+    alone.
 
     Args:
         path: of the file. run: run with its model.
@@ -360,10 +372,10 @@ def save_run(path: Path, run: CodesignRun) -> None:
 
 
 def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
-    """Go on from a checkpoint.
+    """The run of a checkpoint, ready to continue.
 
     Args:
-        path: of the file.
+        path: of the file. settings: of the run.
 
     Raises:
         TrainingError: no checkpoint, a damaged one, or one of other settings (the
@@ -379,14 +391,15 @@ def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
 
 
 def train_run(run: CodesignRun, path: Path) -> Iterator[LogRecord]:
-    """Advance the training to its end, with checkpoints; a record a step.
+    """Train a run to its end with checkpoints, yielding a record a step.
+
+    A step is yielded before its checkpoint, so that the caller's log contains every
+    saved step.
 
     Args:
-        run: run with its model. path: of the file.
+        run: run with its model. path: of the checkpoint.
     """
     for record in run.trainer.run():
-        # first the caller's log, then the checkpoint: a log never lacks a step that is
-        # kept
         yield record
         if (
             record.step % run.settings.checkpoint_every == 0

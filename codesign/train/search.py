@@ -26,22 +26,24 @@ SLOWER = 4  # rates of the inner optimisation are those of training over this
 def specialise_candidate(
     run: CodesignRun, architecture: Architecture, budget_mmacs: float
 ) -> Trainer:
-    """A trainer whose model is θ*(α): a copy of the supernet's, trained on for this
-    architecture alone, then its weights alone (``finetune_steps``).
+    """Trainer of a copy of the supernet, fine-tuned for one architecture: θ*(α) of Eq.
+    10.
 
-    The same run, architecture and budget give the same result.
+    First ``inner_steps`` of optics, pitch and weights, then ``finetune_steps`` of the
+    weights alone. The same run, architecture and budget give the same result.
 
     Args:
+        run: run with its model. architecture: member of the search space.
         budget_mmacs: compute budget, million multiply-accumulates a frame.
     """
     settings, source = run.settings, run.trainer
     model = copy.deepcopy(source.model)
-    place = repr((architecture, budget_mmacs)).encode()
-    seed = source.inner.seed + 1000 + zlib.crc32(place) % 1_000_003
-    joint = _slower(source.inner, settings.search.inner_steps, seed)
+    key = repr((architecture, budget_mmacs)).encode()
+    seed = source.inner.seed + 1000 + zlib.crc32(key) % 1_000_003
+    joint = _fine_tuning(source.inner, settings.search.inner_steps, seed)
     joint = replace(joint, budget_mmacs=budget_mmacs)
     weights = replace(
-        _slower(source.inner, settings.run.finetune_steps, seed + 1),
+        _fine_tuning(source.inner, settings.run.finetune_steps, seed + 1),
         optics=LearningRateSchedule(0.0),
         pitch=LearningRateSchedule(0.0),
     )
@@ -57,7 +59,7 @@ def specialise_candidate(
             (joint, settings.search.inner_steps),
             (weights, settings.run.finetune_steps),
         ):
-            going = Trainer(
+            trainer = Trainer(
                 inner,
                 source.optics,
                 source.sensor,
@@ -67,14 +69,16 @@ def specialise_candidate(
                 stacks=source.light.stacks,
                 triplets=source.triplets,
             )
-            going.light.device = source.light.device  # where the network lies already
-            for _ in going.run() if steps else ():
+            trainer.light.device = source.light.device
+            for _ in trainer.run() if steps else ():
                 pass
-    return going
+    return trainer
 
 
-def _slower(inner: InnerConfig, steps: int, seed: int) -> InnerConfig:
-    """Settings of a fine-tuning: all groups from its first step on, at lower rates."""
+def _fine_tuning(inner: InnerConfig, steps: int, seed: int) -> InnerConfig:
+    """Settings of a fine-tuning: all groups move in every step, at 1 / SLOWER of the
+    rates.
+    """
     groups = {
         name: replace(schedule, rate=schedule.rate / SLOWER, start=0.0, end=1.0)
         for name, schedule in (
@@ -101,59 +105,64 @@ def people_of(run: CodesignRun, stream: int, batches: int) -> bench.PeopleFrames
 def search_architectures(
     run: CodesignRun, path: Path
 ) -> Iterator[tuple[float, EvaluatedCandidate]]:
-    """Advance the searches to their end, budget by budget, with a checkpoint after
-    every round of births: the outer problem of Eq. 10.
+    """Search architectures for every budget in turn: the outer problem of Eq. 10.
 
-    Candidates are judged by their gaze error in degrees, with the supernet's optics,
-    pitch and weights, or with their own (``search.inner_steps``).
+    Candidates are ranked by gaze error in degrees, with the supernet's optics, pitch
+    and weights, or with their own (``search.inner_steps``). A checkpoint is written
+    after every round of births.
 
     Args:
-        run: run with its model. path: of the file.
+        run: run with its model. path: of the checkpoint.
 
     Yields:
         (budget in MMACs, the candidate that was born).
     """
     settings = run.settings
     people = people_of(run, VALIDATION, settings.validation_batches)
-    shared = None if settings.search.inner_steps else _looks(run.trainer, people)
+    shared_frames = (
+        None
+        if settings.search.inner_steps
+        else _measuring_and_people_frames(run.trainer, people)
+    )
     plan = settings.search
     if "architecture" in settings.run.frozen:
         plan = EvolutionSettings(
             population=1, tournament=1, rounds=1, inner_steps=plan.inner_steps
         )
 
-    def error(architecture: Architecture, budget: float) -> float:
-        if shared is None:
+    def gaze_error(architecture: Architecture, budget: float) -> float:
+        if shared_frames is None:
             trainer = specialise_candidate(run, architecture, budget)
-            measured, seen = _looks(trainer, people)
+            measured, seen = _measuring_and_people_frames(trainer, people)
         else:
-            trainer, (measured, seen) = run.trainer, shared
+            trainer = run.trainer
+            measured, seen = shared_frames
         recalibrate_batch_norm(trainer.model.net, architecture, measured)
-        found = assess.gaze_error_deg(trainer, architecture, people, seen)
+        error_deg = assess.gaze_error_deg(trainer, architecture, people, seen)
         trainer.model.net.train()
-        return found
+        return error_deg
 
     for i, budget in enumerate(settings.run.budgets_mmacs):
-        before = run.searches[i] if i < len(run.searches) else None
+        previous = run.searches[i] if i < len(run.searches) else None
         states = evolution.evolve_population(
             settings.space,
             plan,
-            functools.partial(error, budget=budget),
+            functools.partial(gaze_error, budget=budget),
             run.macs,
             budget=budget * 1e6,
             seed=settings.inner.seed + i,
-            start=before,
+            start=previous,
         )
-        reported = len(before.history) if before else 0
+        reported = len(previous.history) if previous else 0
         for state in states:
-            yield from ((budget, born) for born in state.history[reported:])
+            yield from ((budget, candidate) for candidate in state.history[reported:])
             reported = len(state.history)
             run.searches[i:] = [state]
             save_run(path, run)
 
 
-def _looks(
+def _measuring_and_people_frames(
     trainer: Trainer, people: bench.PeopleFrames
 ) -> tuple[list[Tensor], assess.SensorFrames]:
-    """Training frames that batch statistics are measured on, and frames of people."""
+    """Training frames to measure batch statistics on, and frames of people."""
     return assess.training_frames(trainer), assess.frames_of(trainer, people)

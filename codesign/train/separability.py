@@ -88,26 +88,29 @@ class FisherSeparability:
 
     @property
     def angle_rad(self) -> Tensor:
-        """Span angle of Eq. 5 between gaze and axial slippage, in [0, pi]; from atan2,
-        so that it is exact near 0 and pi.
+        """Span angle of Eq. 5 between gaze and axial slippage, in [0, pi].
+
+        atan2(sqrt(F_gg F_zz - F_gz²), F_gz): accurate near 0 and pi.
         """
-        gaze, slip, both = (self.fisher[i, j] for i, j in ((0, 0), (-1, -1), (0, -1)))
-        return torch.atan2((gaze * slip - both**2).clamp_min(0).sqrt(), both)
+        gaze, slip, cross = (self.fisher[i, j] for i, j in ((0, 0), (-1, -1), (0, -1)))
+        return torch.atan2((gaze * slip - cross**2).clamp_min(0).sqrt(), cross)
 
 
 def triplet_frames(
     scenes: EyeScenes, config: SeparabilityConfig, step: int
 ) -> list[Frames]:
-    """Frames of the anchors of a training step and of every motion, at the anchors'
-    exposure.
+    """Frames of the anchors of a training step, then of every motion of them.
+
+    All at the anchors' exposure.
 
     Args:
         scenes: frames by number. config: motions, steps and weights of Eq. 6.
+        step: number of the training step.
     """
     anchors = replace(scenes, stream=STREAM).states(step, config.triplets)
     return [
-        render(one, rig=scenes.rig, camera=scenes.camera, exposed=anchors).frames
-        for one in moved_states(anchors, config.directions)
+        render(states, rig=scenes.rig, camera=scenes.camera, exposed=anchors).frames
+        for states in moved_states(anchors, config.directions)
     ]
 
 
@@ -120,25 +123,29 @@ def fisher_separability(
     sensor: Sensor,
     sample_um: float,
 ) -> FisherSeparability:
-    """Eqs. 4 to 6 of triplets through a lens and its sensor; differentiable in both.
+    """Fisher matrix and loss of Eqs. 4 to 6 for a lens and its sensor; differentiable.
+
+    F = J J^T / anchors, where J holds finite differences of the expected electrons over
+    their mean, per degree or mm.
 
     Args:
-        frames: of :func:`triplet_frames`. image: gives the irradiance (n, y, x) of
-            frames on samples ``sample_um`` apart.
-        encircled: share of the light that the lens keeps together, any shape.
-        sensor: its pixels; their expected electrons are compared, without noise.
+        frames: of :func:`triplet_frames`.
+        image: returns the irradiance (n, y, x) of frames on samples ``sample_um``
+            apart.
+        encircled: encircled energy of the lens, any shape.
         config: motions, steps and weights of Eq. 6.
+        sensor: its pixels; noise is left out. sample_um: spacing of the samples.
     """
     anchor, *moved = (
-        camera.mean_electrons(image(one), sample_um, sensor=sensor) for one in frames
+        camera.mean_electrons(image(f), sample_um, sensor=sensor) for f in frames
     )
-    level = anchor.mean((-2, -1), keepdim=True)
-    fields = [
-        (one - anchor) / (level * unit)
-        for one, unit in zip(moved, config.units, strict=True)
+    mean_level = anchor.mean((-2, -1), keepdim=True)
+    derivatives = [
+        (electrons - anchor) / (mean_level * unit)
+        for electrons, unit in zip(moved, config.units, strict=True)
     ]
-    along = torch.stack(fields).flatten(1)
-    fisher = along @ along.mT / len(anchor)
+    jacobian = torch.stack(derivatives).flatten(1)
+    fisher = jacobian @ jacobian.mT / len(anchor)
     loss = optics_loss(
         fisher,
         encircled.to(fisher),
@@ -149,14 +156,12 @@ def fisher_separability(
 
 
 def depth_information(made: PixelPsfStack) -> Tensor:
-    """(depths - 1,) information on depth between the depths, in the blur of a window of
-    1/f texture, per mm².
+    """(depths - 1,) Fisher information on depth between neighbouring depths, per mm².
 
-    The window is as wide as the PSFs; the noise is a thousandth of the texture's mean
-    power. One over its square root
-    is the least standard deviation of any reader that knows the statistics of the
-    texture and nothing else of it
-    (:func:`metalens.fisher.texture_information`): readers of real frames collect less.
+    From the blur of a window of 1/f texture as wide as the PSFs, with noise of a
+    thousandth of the texture's mean power. One over its square root is the Cramér-Rao
+    bound of a reader that knows only the statistics of the texture
+    (:func:`metalens.fisher.texture_information`).
 
     Args:
         made: PSFs over depth.
@@ -175,20 +180,21 @@ def depth_information(made: PixelPsfStack) -> Tensor:
 def texture_depth_loss(
     made: PixelPsfStack, settings: OpticsConfig, *, energy: float
 ) -> Tensor:
-    """-log of the information on depth in blurred texture, and a hinge on the encircled
-    energy (paper Eq. 6).
+    """Mean of -log(information on depth + 0.05), plus a hinge on the encircled energy.
 
-    A texture's blur is what the network reads; the information of the PSF alone ranks
-    lenses wrongly.
+    Replaces Eq. 6 of the paper: the network reads the blur of texture, and the
+    information of the PSF alone ranks lenses wrongly.
 
     Args:
         made: PSFs over depth. settings: of the lens and its image.
+        energy: least encircled energy within two samples.
     """
-    information, psfs = depth_information(made), made.intensity
-    share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
-    return (
-        -torch.log(information + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+    information = depth_information(made)
+    share = encircled_energy(
+        made.intensity, settings.sample_um, radius_um=2 * settings.sample_um
     )
+    depth_loss = -torch.log(information + 0.05).mean()
+    return depth_loss + 50 * torch.relu(energy - share).mean()
 
 
 def _texture(size: int) -> Tensor:

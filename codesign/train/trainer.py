@@ -77,28 +77,29 @@ class LearningRateSchedule:
             )
 
     def at(self, progress: float) -> float:
-        """Learning rate at this part of the run.
+        """Learning rate: linear warm-up, then cosine decay; 0 outside [start, end).
+
+        rate * min(1, x / 0.1 + 0.01) * (1 + cos(pi x)) / 2, x = (progress - start) /
+        (end - start).
 
         Args:
-            progress: part of the run that is over, 0 to 1.
+            progress: fraction of the run that is done, 0 to 1.
         """
         if not self.start <= progress < self.end:
             return 0.0
-        inside = (progress - self.start) / (self.end - self.start)
+        x = (progress - self.start) / (self.end - self.start)
         return (
-            self.rate
-            * min(1.0, inside / 0.1 + 0.01)
-            * (0.5 + 0.5 * math.cos(math.pi * inside))
+            self.rate * min(1.0, x / 0.1 + 0.01) * (0.5 + 0.5 * math.cos(math.pi * x))
         )
 
 
 @dataclass(eq=False)
 class TrainedModel:
-    """What training moves.
+    """Trainable parameters: network, lens coefficients and pixel pitch.
 
     coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel
-    pitch in um. finest_um: pitch below
-    which no network of the run keeps its budget; 0 for none.
+    pitch in um. finest_um: pitch below which no network of the run keeps its budget;
+    0 for none.
     """
 
     net: Supernet
@@ -112,22 +113,19 @@ class TrainedModel:
         return self.log_pitch.exp()
 
     def hold(self, finest_um: float, coarsest_um: float) -> float | None:
-        """Bring the pitch back between these; the one that it was held at, None where
-        it was between them.
+        """Clamp the pitch to a range in place; the limit that it was clamped to, in um.
+
+        None where the pitch was inside the range.
 
         Args:
             finest_um: least pitch. coarsest_um: largest pitch.
         """
-        wanted = float(self.pitch_um.detach())
+        pitch_um = float(self.pitch_um.detach())
         with torch.no_grad():
             self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
-        return (
-            finest_um
-            if wanted < finest_um
-            else coarsest_um
-            if wanted > coarsest_um
-            else None
-        )
+        if pitch_um < finest_um:
+            return finest_um
+        return coarsest_um if pitch_um > coarsest_um else None
 
 
 def make_model(
@@ -154,36 +152,38 @@ def make_model(
 
 
 def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether all gradients that there are have finite numbers alone; a device is asked
-    once.
+    """Whether every gradient is finite, by its largest absolute value on each device.
+
+    Parameters without a gradient are left out. A device is read once.
 
     Args:
         parameters: with gradients.
     """
     grads = [p.grad for p in parameters if p.grad is not None]
-    places = {g.device for g in grads}
-    largest = (
-        nn.utils.get_total_norm([g for g in grads if g.device == place], math.inf)
-        for place in places
+    devices = {g.device for g in grads}
+    norms = (
+        nn.utils.get_total_norm([g for g in grads if g.device == device], math.inf)
+        for device in devices
     )
-    return all(bool(torch.isfinite(one)) for one in largest)
+    return all(bool(torch.isfinite(norm)) for norm in norms)
 
 
 def align_moments(optimiser: torch.optim.Optimizer) -> None:
-    """Moments laid out in memory as their parameters: a fused step walks through both
-    in one order without asking.
+    """Copy the optimiser's moments to the memory layout of their parameters, in place.
+
+    A fused step then walks both in the same order.
 
     Args:
         optimiser: with its moments.
     """
-    for parameter, kept in optimiser.state.items():
-        for name, value in kept.items():
+    for parameter, moments in optimiser.state.items():
+        for name, value in moments.items():
             if (
                 isinstance(value, Tensor)
                 and name != "step"  # the count of a scalar is no moment of it
                 and value.shape == parameter.shape
             ):
-                kept[name] = torch.empty_like(parameter).copy_(value)
+                moments[name] = torch.empty_like(parameter).copy_(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,16 +254,19 @@ class InnerConfig:
 
 
 def _reading_layers(net: nn.Module) -> list[nn.Parameter]:
-    """Weights of the dense layers that read blur and slippage, which every member of an
-    elastic network uses whole, in the order of its parameters.
+    """Weight matrices of the linear and 1x1 layers of ``net.blur`` and
+    ``net.calibration``.
+
+    Every member of an elastic network uses these whole. Only layers whose two sides are
+    8 or more, in the order of the network's parameters.
     """
-    rooms = [
+    branches = [
         getattr(net, name) for name in ("blur", "calibration") if hasattr(net, name)
     ]
     layers = [
         m
-        for room in rooms
-        for m in room.modules()
+        for branch in branches
+        for m in branch.modules()
         if isinstance(m, nn.Linear | nn.Conv2d)
     ]
     weights: list[nn.Parameter] = [cast("nn.Parameter", m.weight) for m in layers]
@@ -271,38 +274,42 @@ def _reading_layers(net: nn.Module) -> list[nn.Parameter]:
 
 
 class _Soap(SOAP):
-    """SOAP whose axes lie in memory as a checkpoint gives them back: products of
-    other layouts round otherwise, and a resumed run would part from the whole one.
+    """SOAP with contiguous preconditioner axes, as a checkpoint restores them.
+
+    Products of other layouts round differently, and a resumed run would differ from an
+    uninterrupted one.
     """
 
     @staticmethod
     def get_orthogonal_matrix(mat: Any) -> list[Any]:
         return _contiguous(SOAP.get_orthogonal_matrix(mat))
 
-    def get_orthogonal_matrix_qr(self, *given: Any, **named: Any) -> list[Any]:
-        return _contiguous(super().get_orthogonal_matrix_qr(*given, **named))
+    def get_orthogonal_matrix_qr(self, *args: Any, **kwargs: Any) -> list[Any]:
+        return _contiguous(super().get_orthogonal_matrix_qr(*args, **kwargs))
 
 
 def _contiguous(axes: list[Any]) -> list[Any]:
-    return [one.contiguous() if isinstance(one, Tensor) else one for one in axes]
+    return [a.contiguous() if isinstance(a, Tensor) else a for a in axes]
 
 
 def _soap(weights: list[nn.Parameter]) -> torch.optim.Optimizer:
-    """SOAP; sides above 600 keep their own axes, whose moments would cost too much."""
-    made: torch.optim.Optimizer = _Soap(
+    """SOAP optimiser of weight matrices; sides above 600 are not preconditioned.
+
+    The preconditioner of a longer side would cost too much.
+    """
+    optimiser: torch.optim.Optimizer = _Soap(
         weights, betas=(0.9, 0.98), weight_decay=0.01, max_precondition_dim=600
     )
-    return made
+    return optimiser
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StepInputs:
-    """What a step trains on.
+    """Inputs of one training step.
 
-    light: (batch, y, x) on the sensor. vergence: (batch, windows, windows) of
-    :func:`blur.window_vergence`.
-    seen: (batch, 1, rows, columns) frames of the sensor; None where the pitch moves,
-    and members see it differently.
+    light: (batch, y, x) irradiance on the sensor. vergence: (batch, windows, windows)
+    of :func:`blur.window_vergence`. seen: (batch, 1, rows, columns) frames of the
+    sensor; None where the pitch moves, and members read different frames.
     """
 
     step: int
@@ -315,9 +322,11 @@ class StepInputs:
 
 @dataclass(frozen=True, slots=True)
 class LogRecord:
-    """One line of the log.
+    """One line of the log: losses, pitch in um and million multiply-accumulates of a
+    step.
 
-    skipped: steps so far whose gradient was not finite.
+    loss: total. task, optics: terms of it, before weights. skipped: steps so far whose
+    gradient was not finite.
     """
 
     step: int
@@ -351,23 +360,26 @@ class Trainer:
         """One training.
 
         Args:
-            stacks: PSFs of a lens that is already made; every step draws one of them,
-                and no optics move.
+            inner: settings of the loop. optics: of the lens and its image.
+            sensor: its pixels and noise. scenes: frames by step number.
+            made: network, lens and pitch to train.
+            architecture: the only member that is trained; None trains sampled members.
+            stacks: PSFs of a fabricated lens; every step draws one of them, and no
+                optics move.
             budgets_mmacs: one a step, in turn, where ``inner`` names none.
-            largest_only: of a step's members.
+            largest_only: train the largest member alone.
             triplets: scenes that the triplets of Eq. 6 are drawn from.
         """
-        self.largest_only, self.triplets = largest_only, triplets
+        self.largest_only = largest_only
+        self.triplets = triplets
         self.budgets_mmacs = (
             (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
         )
-        self.inner, self.optics, self.sensor, self.scenes, self.model = (
-            inner,
-            optics,
-            sensor,
-            scenes,
-            made,
-        )
+        self.inner = inner
+        self.optics = optics
+        self.sensor = sensor
+        self.scenes = scenes
+        self.model = made
         self.architecture = architecture
         self.light = StepImaging(
             optics,
@@ -397,15 +409,17 @@ class Trainer:
             for name, (_, parameters) in self.groups.items()
             if parameters
         }
-        self.step, self.skipped, self.bad_run = 0, 0, 0
-        self.pitch_held_um: float | None = (
-            None  # where the last step was held back from a finer or coarser pitch
-        )
+        self.step = 0
+        self.skipped = 0
+        self.bad_run = 0  # consecutive steps without a finite gradient
+        # limit that the last step clamped the pitch to; None inside the range
+        self.pitch_held_um: float | None = None
         self._begins_um = float(made.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
     def run(self, *, until: int | None = None) -> Iterator[LogRecord]:
-        """Train to ``until`` (the end of the run without it), yielding a record a step.
+        """Train up to step ``until`` (the end of the run without it), yielding a record
+        a step.
 
         Raises:
             TrainingError: no finite gradient for ``patience`` steps, with the cause.
@@ -418,7 +432,7 @@ class Trainer:
             yield self._advance(batch)
 
     def state(self) -> dict[str, object]:
-        """Everything that the next step depends on."""
+        """Everything that the next step depends on, for :meth:`restore`."""
         return {
             "net": self.model.net.state_dict(),
             "coefficients_rad": self.model.coefficients_rad.detach(),
@@ -430,7 +444,9 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, object]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore what :meth:`state` returned: parameters, moments, counters and the
+        image.
+        """
         self.model.net.load_state_dict(state["net"])  # type: ignore[arg-type]
         with torch.no_grad():
             self.model.coefficients_rad.copy_(state["coefficients_rad"])  # type: ignore[arg-type]
@@ -443,28 +459,38 @@ class Trainer:
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
     def _advance(self, batch: FrameBatch) -> LogRecord:
+        """One training step on a batch, with the learning rates at this part of the
+        run.
+        """
         progress = self.step / self.inner.steps
         rates = {
             name: schedule.at(progress) for name, (schedule, _) in self.groups.items()
         }
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        moves = rates["pitch"] > 0
-        live = rates["optics"] > 0 and "optics" in self.optimisers
-        return self._take_step(
-            self._prepare_step(self.step, batch, live=live, seen=not moves), rates
+        pitch_moves = rates["pitch"] > 0
+        lens_moves = rates["optics"] > 0 and "optics" in self.optimisers
+        inputs = self._prepare_step(
+            self.step, batch, live=lens_moves, read_frames=not pitch_moves
         )
+        return self._take_step(inputs, rates)
 
-    def _take_step(self, given: StepInputs, rates: dict[str, float]) -> LogRecord:
-        """A step of every optimiser on what is given."""
+    def _take_step(self, inputs: StepInputs, rates: dict[str, float]) -> LogRecord:
+        """Backward pass of Eq. 10 and one step of every optimiser, by learning rate of
+        a group.
+
+        L = L_task + w_optics L_optics + w_budget mean [C / C_budget - 1]_+. Gradients
+        are averaged over the processes. A step without finite gradients changes no
+        parameter.
+        """
         means = running.keep_running_means(self.model.net)
-        task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
-        optics_loss = given.optics_loss
+        task, macs_of_members = self._losses(inputs, pitch_moves=rates["pitch"] > 0)
+        optics_loss = inputs.optics_loss
         total = task + self.inner.optics_weight * optics_loss.to(self.light.device)
-        macs = each.mean()
+        macs = macs_of_members.mean()
         if self._budget:
-            over = losses.over_budget(each, self._budget).mean()
-            total = total + self.inner.budget_weight * over.to(self.light.device)
+            excess = losses.over_budget(macs_of_members, self._budget).mean()
+            total = total + self.inner.budget_weight * excess.to(self.light.device)
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.model.coefficients_rad)
         parallel.average_gradients(p for _, ps in self.groups.values() for p in ps)
@@ -489,10 +515,13 @@ class Trainer:
         return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
 
     def _prepare_step(
-        self, step: int, batch: FrameBatch, *, live: bool, seen: bool
+        self, step: int, batch: FrameBatch, *, live: bool, read_frames: bool
     ) -> StepInputs:
-        """What a step trains on; ``seen``: as the pixels give it, which takes a pitch
-        that does not move.
+        """Irradiance, labels and optics loss of a step.
+
+        Args:
+            live: the lens moves, and the light is differentiable in it.
+            read_frames: read the sensor's frames too, at the fixed pitch.
         """
         margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
@@ -501,7 +530,7 @@ class Trainer:
         vergence = blur.window_vergence(
             depth_um(batch.frames, margin=margin, device=self.light.device)
         )
-        frames = self._read_pixels(step, light, pitch, False) if seen else None
+        frames = self._read_pixels(step, light, pitch, False) if read_frames else None
         return StepInputs(
             step, batch.to(self.light.device), light, optics_loss, vergence, frames
         )
@@ -509,8 +538,10 @@ class Trainer:
     def _read_pixels(
         self, step: int, light: Tensor, pitch: Tensor, resized: bool
     ) -> Tensor:
-        """Frames of the sensor. All readings of a step begin the same noise: networks
-        differ by what they see.
+        """(batch, 1, rows, columns) standardised frames of the sensor.
+
+        All readings of a step draw the same noise, so that members differ by their
+        weights alone. ``resized``: as in :func:`codesign.train.imaging.read_out`.
         """
         noise = seeded_generator(self.inner.seed, step, 1)
         return read_out(
@@ -523,47 +554,67 @@ class Trainer:
             resized=resized,
         )
 
-    def _losses(self, given: StepInputs, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
-        """Mean task loss of the step's members, and the multiply-accumulates of each."""
+    def _losses(
+        self, inputs: StepInputs, *, pitch_moves: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Mean task loss of the step's members, and (members,) multiply-accumulates of
+        each.
+
+        The loss of a member is L_seg + w_slip L_calib, plus the losses of depth and
+        pose.
+
+        Args:
+            pitch_moves: read the frames again, differentiable in the pitch.
+        """
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
         scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
-        size = given.light.shape[-1] * self.optics.sample_um
-        self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
+        size_um = inputs.light.shape[-1] * self.optics.sample_um
         space = self.model.net.space
+        self._coarsest_um = cost.coarsest_um(size_um, space.resolution[0])
 
-        def count(a: Architecture, pitch_um: Tensor) -> Tensor:
-            return cost.macs_of_size(space, a, size / pitch_um * a.resolution)
+        def macs_at(member: Architecture, pitch_um: Tensor) -> Tensor:
+            pixels = size_um / pitch_um * member.resolution
+            return cost.macs_of_size(space, member, pixels)
 
-        members = self._members(lambda a: float(count(a, pitch.detach())))
-        finer = {a: pitch_moves and a.resolution < 1 for a in members}
-        frames = {False: given.seen} if given.seen is not None else {
-            resized: self._read_pixels(given.step, given.light, pitch, resized) for resized in set(finer.values())
-        }  # fmt: skip
-        batch, pose, parts = given.batch, given.batch.pose, []
-        wide = frame_wide(
-            given.light.shape[-1], self.optics.sample_um, float(pitch.detach())
+        members = self._members(lambda a: float(macs_at(a, pitch.detach())))
+        resized = {a: pitch_moves and a.resolution < 1 for a in members}
+        if inputs.seen is not None:
+            frames = {False: inputs.seen}
+        else:
+            frames = {
+                coarser: self._read_pixels(inputs.step, inputs.light, pitch, coarser)
+                for coarser in set(resized.values())
+            }
+        batch = inputs.batch
+        pose = batch.pose
+        member_losses = []
+        frame_width = frame_wide(
+            inputs.light.shape[-1], self.optics.sample_um, float(pitch.detach())
         )
-        mask = losses.mask_in_frame(batch.mask, wide)
-        shift = batch.slip_mm if pose is None else pose.shift_mm
+        mask = losses.mask_in_frame(batch.mask, frame_width)
+        shift_mm = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
-            answer = self.model.net(frames[finer[a]], a)
+            prediction = self.model.net(frames[resized[a]], a)
             loss = losses.task_loss(
-                answer, mask, shift, scale, slip_weight=self.inner.slip_weight
+                prediction, mask, shift_mm, scale, slip_weight=self.inner.slip_weight
             )
             loss = loss + losses.depth_reading_loss(
-                answer,
-                given.vergence,
-                shift,
+                prediction,
+                inputs.vergence,
+                shift_mm,
                 scale,
                 depth_weight=self.inner.depth_weight,
             )
-            parts.append(
-                loss if pose is None else loss + self._pose_loss(answer, pose, wide)
-            )
-        macs = torch.stack([count(a, pitch) for a in members])
-        return torch.stack(parts).mean(), macs
+            if pose is not None:
+                loss = loss + self._pose_loss(prediction, pose, frame_width)
+            member_losses.append(loss)
+        macs = torch.stack([macs_at(a, pitch) for a in members])
+        return torch.stack(member_losses).mean(), macs
 
     def _pose_loss(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
+        """Weighted loss of landmarks and optic axis; landmarks as fractions of the
+        frame.
+        """
         weights = {
             "axis_weight": self.inner.axis_weight,
             "point_weight": self.inner.point_weight,
@@ -573,29 +624,34 @@ class Trainer:
     def _form_images(
         self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
     ) -> tuple[Imager, Tensor]:
-        """What images this step's frames, and the optics loss."""
+        """Imager of this step's frames, and the optics loss.
+
+        The loss is 0 where the lens is fixed or its weight 0. With
+        ``separability.every`` = n > 0 it is n times Eq. 6 at every n-th step. With n = 0
+        it is the depth loss of blurred texture at every step.
+        """
         coefficients = self.model.coefficients_rad
-        optics = self.light.at(
+        imager = self.light.at(
             step, coefficients, frame_samples(frames), self.scenes.margin, live=live
         )
         if self.light.stacks or not (live and self.inner.optics_weight):
-            return optics, torch.zeros(())
+            return imager, torch.zeros(())
         config = self.inner.separability
         every = self.inner.separability.every
         if every and (self.triplets is None or step % every):
-            return optics, torch.zeros(())
-        made = lens.lens_psf_stack(
+            return imager, torch.zeros(())
+        stack = lens.lens_psf_stack(
             self.optics, coefficients, error=self._lens_error(step)
         )
         if not every or self.triplets is None:
-            return optics, texture_depth_loss(
-                made, self.optics, energy=self.inner.energy
+            return imager, texture_depth_loss(
+                stack, self.optics, energy=self.inner.energy
             )
-        found = fisher_separability(
+        separability = fisher_separability(
             triplet_frames(self.triplets, config, step),
-            lambda one: sensor_irradiance(one, optics),
+            lambda scenes: sensor_irradiance(scenes, imager),
             encircled_energy(
-                made.intensity,
+                stack.intensity,
                 self.optics.sample_um,
                 radius_um=2 * self.optics.sample_um,
             ),
@@ -603,12 +659,21 @@ class Trainer:
             sensor=replace(self.sensor, pitch_um=float(self.model.pitch_um.detach())),
             sample_um=self.optics.sample_um,
         )
-        return optics, every * found.loss.value  # of weight optics_weight on average
+        # weight optics_weight on average over the steps
+        return imager, every * separability.loss.value
 
     def _lens_error(self, step: int) -> DrawnLensErrors | None:
+        """Assembly and process error of one lens, drawn by step number; None for no
+        spread.
+        """
         return self.optics.spread.draw(seeded_generator(self.inner.seed, step, 2))
 
     def _members(self, count: Count) -> Sequence[Architecture]:
+        """Architectures trained in this step: the fixed one, or a sandwich within the
+        budget.
+
+        Each architecture once. ``count``: multiply-accumulates of an architecture.
+        """
         if self.architecture is not None:
             return [self.architecture]
         space = self.model.net.space
@@ -616,22 +681,27 @@ class Trainer:
         members = sample_sandwich(
             space, count, self._budget, generator, subnets=self.inner.subnets
         )
-        return (
-            members[:1] if self.largest_only else list(dict.fromkeys(members))
-        )  # equal ones count once
+        return members[:1] if self.largest_only else list(dict.fromkeys(members))
 
     @property
     def _budget(self) -> float:
         """Multiply-accumulates that this step's members may take; 0 for any."""
-        return (
-            self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6
-            if self.budgets_mmacs
-            else 0.0
-        )
+        if not self.budgets_mmacs:
+            return 0.0
+        return self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6
 
     def _apply(self, rates: dict[str, float], *, finite: bool) -> None:
+        """Clip the gradients and step every optimiser of a rate above 0; clamp the
+        pitch.
+
+        Without finite gradients the step is skipped and counted.
+
+        Raises:
+            TrainingError: ``patience`` steps without a finite gradient in a row.
+        """
         if not finite:
-            self.skipped, self.bad_run = self.skipped + 1, self.bad_run + 1
+            self.skipped += 1
+            self.bad_run += 1
             if self.bad_run >= self.inner.patience:
                 raise TrainingError(
                     f"no finite gradient in {self.bad_run} steps up to step {self.step}; {self._culprits()}; "
@@ -655,6 +725,7 @@ class Trainer:
             )
 
     def _culprits(self) -> str:
+        """Groups whose gradients are not finite, in words."""
         bad = [
             name
             for name, (_, parameters) in self.groups.items()
@@ -666,54 +737,58 @@ class Trainer:
 def prefetch(
     work: Callable[[int], Made], steps: range, *, workers: int
 ) -> Iterator[Made]:
-    """``work`` of every step in order, up to ``workers`` steps ahead on threads: the
-    same numbers as without.
+    """Results of ``work`` for every step in order, computed ahead by ``workers``
+    threads.
+
+    At most ``workers`` + 1 results are pending. The values are those of one thread.
 
     Args:
-        work: depends on the step alone. steps: their numbers. workers: threads; 0 works
-            when a step is asked for.
+        work: depends on the step alone. steps: their numbers.
+        workers: threads; 0 computes a result when it is requested.
     """
     if not workers:
         yield from map(work, steps)
         return
     with ThreadPoolExecutor(workers, "prefetch") as pool:
-        begun: collections.deque[Future[Made]] = collections.deque()
+        pending: collections.deque[Future[Made]] = collections.deque()
         for step in steps:
-            begun.append(pool.submit(work, step))
-            if len(begun) > workers:
-                yield begun.popleft().result()
-        while begun:
-            yield begun.popleft().result()
+            pending.append(pool.submit(work, step))
+            if len(pending) > workers:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def renderer_threads(device: torch.device) -> int:
-    """Threads that render for a process that trains on ``device``.
+    """Number of renderer threads of a process that trains on ``device``.
 
-    Beside a GPU half of the processor's cores, eight at most, shared by the processes of
-    ``torchrun`` on this machine; none beside a processor, which trains itself.
+    With a GPU half of the processor's cores, eight at most, shared by the processes of
+    ``torchrun`` on this machine. On a processor 0, since training itself uses its
+    cores.
     """
     if device.type == "cpu":
         return 0
-    shared = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return max(1, min(8, usable_cores() // (2 * shared)))
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return max(1, min(8, usable_cores() // (2 * processes)))
 
 
 def device_of(wanted: Place) -> torch.device:
-    """The device of a choice: under ``torchrun`` each process takes the GPU of its
-    local number.
+    """Torch device of a ``--device`` choice; "auto" is the GPU where there is one.
+
+    Under ``torchrun`` each process takes the GPU of its local number.
 
     Args:
         wanted: "auto", "cpu" or "cuda".
 
     Raises:
-        ConfigError: a GPU is asked for where PyTorch finds none.
+        ConfigError: a GPU is requested where PyTorch finds none.
     """
-    found = torch.cuda.is_available()
-    if wanted == "cuda" and not found:
+    has_gpu = torch.cuda.is_available()
+    if wanted == "cuda" and not has_gpu:
         raise ConfigError(
             "device 'cuda': PyTorch finds no GPU here; install a build of torch with CUDA, or give --device cpu"
         )
-    if wanted == "cpu" or not found:
+    if wanted == "cpu" or not has_gpu:
         return torch.device("cpu")
     return torch.device(
         "cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
@@ -721,8 +796,10 @@ def device_of(wanted: Place) -> torch.device:
 
 
 def place_on_device(trainer: Trainer, device: torch.device) -> None:
-    """Let a trainer image and train on a device: its network and what its optimiser
-    remembers move there.
+    """Move a trainer's images, network and moments to a device; nothing for a
+    processor.
+
+    Loading an optimiser's own state casts it to the devices of its parameters.
     """
     if device.type == "cpu":
         return
@@ -731,31 +808,30 @@ def place_on_device(trainer: Trainer, device: torch.device) -> None:
     net = trainer.model.net
     net.to(device)
     for optimiser in trainer.optimisers.values():
-        optimiser.load_state_dict(
-            optimiser.state_dict()
-        )  # casts what it holds to its parameters' devices
+        optimiser.load_state_dict(optimiser.state_dict())
     follow_device(net, device)
 
 
 def follow_device(net: nn.Module, device: torch.device) -> None:
-    """From now on frames on the processor are taken to ``device``, and what is
-    predicted of those is brought back.
+    """Register hooks that run a network on ``device`` for inputs on the processor.
+
+    Its inputs move to the device; predictions of processor inputs move back.
 
     Args:
         net: network.
     """
-    brought = False
+    from_cpu = False
 
-    def enter(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
-        nonlocal brought
-        brought = any(isinstance(v, Tensor) and v.device.type == "cpu" for v in given)
-        return tuple(v.to(device) if isinstance(v, Tensor) else v for v in given)
+    def to_device(_: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
+        nonlocal from_cpu
+        from_cpu = any(isinstance(v, Tensor) and v.device.type == "cpu" for v in inputs)
+        return tuple(v.to(device) if isinstance(v, Tensor) else v for v in inputs)
 
-    def leave(_: nn.Module, __: tuple[Any, ...], answer: Prediction) -> Prediction:
-        parts = (getattr(answer, name) for name in Prediction.__slots__)
+    def to_cpu(_: nn.Module, __: tuple[Any, ...], output: Prediction) -> Prediction:
+        parts = (getattr(output, name) for name in Prediction.__slots__)
         return Prediction(
-            *(part.cpu() if brought and part is not None else part for part in parts)
+            *(part.cpu() if from_cpu and part is not None else part for part in parts)
         )
 
-    net.register_forward_pre_hook(enter)
-    net.register_forward_hook(leave)
+    net.register_forward_pre_hook(to_device)
+    net.register_forward_hook(to_cpu)
