@@ -310,7 +310,7 @@ def mesh_section(
         )
         start += len(low)
     for end, order in ((0, -1), (1, 1)):
-        cap = region.triangulate([pair[end] / nm for pair in contours])
+        cap = region.triangulate_region([pair[end] / nm for pair in contours])
         faces.append(cap[:, ::order] + end * corner_count)
     rings = [
         np.column_stack([ring, np.full(corner_count, z)])

@@ -390,7 +390,8 @@ def hold_windows(task: SearchTask, value: Array) -> SearchTask:
 def place_windows(
     task: SearchTask, ends: list[FitSolution]
 ) -> tuple[SearchTask, list[FitSolution]]:
-    """The task with windows fixed at the best mode, and the modes fitted again there."""
+    """The task with windows fixed at the best mode, and the modes (``ends``) fitted again
+    there."""
     moved = hold_windows(task, ends[0].value)
     if moved is task:
         return task, ends

@@ -306,7 +306,7 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
     """Refuse depths in another unit: a thousandth or a thousand times the design's.
 
     Args:
-        depth_um: (n,) stated source depths, um.
+        depth_um: (n,) stated source depths, um. lens: the design.
 
     Raises:
         CaptureError: with the column that would be right.

@@ -231,6 +231,9 @@ def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
 
     C AᵀW S W A C, with C the covariance of the fit, A its Jacobian, W weights and S the
     covariance of the pixels by these errors, less what the noise already contains.
+
+    Args:
+        problem: of the fit. mode: its solution.
     """
     noise, _, weight = pixel_weights(problem.data, mode.image)
     root = np.sqrt(weight) / noise

@@ -266,8 +266,8 @@ def real_of(kind: Any) -> Any:
 def least_tolerance(table: Array) -> float:
     """Least relative tolerance of :func:`low_rank_factors` above rounding.
 
-    Projections of a block are sums over a column, rounded to eps sqrt(rows) of the
-    norm. Below that the search would mistake rounding for more range.
+    Projections of a block of the ``table`` are sums over a column, rounded to
+    eps sqrt(rows) of the norm. Below that the search would mistake rounding for range.
     """
     return float(np.finfo(table.dtype).eps) * math.sqrt(max(table.shape)) / _STOP
 

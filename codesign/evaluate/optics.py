@@ -1,7 +1,4 @@
-"""Comparison of lenses as in the paper: axial information on and off axis (Table 3,
-Fig. 7), and sensitivity of whole scenes to gaze and slip (Table 1, Fig. 5), with
-confidence intervals over scenes.
-"""
+"""Lenses compared as in the paper: Tables 1 and 3, Figs. 5 and 7, with intervals."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,4 @@
-"""Tables and figures of the paper as claims, each with our measurement: paper, ours,
-ratio, conditions.
-
-A claim without a measurement names the command that measures it.
-"""
+"""Claims of the paper beside what was measured here, with the conditions of both."""
 
 import functools
 import json

@@ -223,7 +223,7 @@ def draw_augmentations(
     """Augmentations of ``count`` frames, drawn independently by cause.
 
     A cause is on with probability share * (variety - 1), limited to [0, 1]; none is on
-    up to variety 1. Generators of one seed draw the same sizes at any variety.
+    up to variety 1. A ``generator`` of one seed draws the same sizes at any variety.
     """
     size, draws = {}, {}
     for name, cause in CAUSES.items():
@@ -280,7 +280,7 @@ def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
     on.
 
     Args:
-        worn: augmentations of every frame.
+        states: of the frames. worn: augmentations of every frame.
     """
     traits = states.traits.clone()
     factor = torch.from_numpy(worn.size["iris"])

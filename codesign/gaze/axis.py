@@ -1,8 +1,6 @@
-"""From pupil centre and slippage to the optical axis of the eye: the spherical-eye
-solver.
+"""Spherical-eye solver: pupil centre and slippage to the optical axis of the eye.
 
-Camera frame: origin at the lens, z towards the eye, x right and y down as on the
-(upright) sensor image.
+Camera frame: z towards the eye, x right and y down on the image.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,5 @@
-"""What people have in common, as a file: with an exported network, all by which a
-device calibrates its wearer.
-
-people = load("people_1.h5")
-wearer = people.person(Readings(pupil_mm, slip_mm, axis_deg), gaze_deg)   # some points that were looked at
-wearer(Readings(...))                                                     # (n, 2) gaze across and down, deg
+"""The mixed-effects gaze model of a population as a file, by which a device calibrates
+its wearer.
 """
 
 from pathlib import Path

@@ -1,10 +1,4 @@
-"""The search space: elastic MobileNetV3 backbones as plain records (paper Sec. 3.3,
-after Howard et al. 2019).
-
-An :class:`Architecture` names depth, kernel, expansion, width and resolution;
-:func:`active_blocks` turns it into the
-inverted residuals that the network builds and the cost model counts.
-"""
+"""The search space: elastic MobileNetV3 backbones as plain records (paper Sec. 3.3)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

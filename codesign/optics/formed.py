@@ -291,8 +291,8 @@ def uniform_image_error(
 def relative_image_difference(one: Imager, true: Imager) -> float:
     """Relative L2 difference of two images of a texture in depth, over its contrast.
 
-    |image - reference| / |reference - mean|; the reference without stray light. Both of
-    frames of one size, with the same margin.
+    |image - reference| / |reference - mean|; the reference is the ``true`` image
+    without stray light. Both are of frames of one size, with the same margin.
     """
     frames = textured_frames(true.grid)
     reference = replace(true, stray=None)(frames)

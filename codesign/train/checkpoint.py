@@ -1,6 +1,4 @@
-"""Training state on disk: every tensor bit for bit (safetensors), the rest as JSON,
-written whole or not at all; and the log beside it, a JSON entry a line.
-"""
+"""Training state on disk, bit for bit, and the JSON log beside it."""
 
 import contextlib
 import json

@@ -55,7 +55,7 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
     return list(_cut(_section(contours, filled=False), grid))
 
 
-def triangulate(contours: Sequence[Array]) -> Array:
+def triangulate_region(contours: Sequence[Array]) -> Array:
     """(n, 3) corners of triangles that fill outlines but for their holes.
 
     Corners are numbered through all contours; triangles run counter-clockwise.

@@ -373,7 +373,7 @@ def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Computed:
+class ComputedPsfs:
     """stack: PSFs. figures: of the sharpest depth of every angle. meets_um: (x, y, z)
     behind the lens where rays of the design source meet, None where they do not.
     scan: along z, of a lens for collimated light.
@@ -594,7 +594,7 @@ def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
 
 def _compute(
     path: Path, settings: PsfSettings, device: lens.Lens, built: AsBuiltSource | None
-) -> Computed:
+) -> ComputedPsfs:
     """PSFs, figures of the sharpest depth of every angle, and a scan along z.
 
     The scan is of a lens for collimated light. With ``own_cell`` solved neighbours are
@@ -609,7 +609,7 @@ def _compute(
     if built is not None:
         stack = _of_built(path, settings, built)
         figures = psf.focus_metrics(stack, device)
-        return Computed(stack, figures, design.lens_meeting_um(device))
+        return ComputedPsfs(stack, figures, design.lens_meeting_um(device))
     device = _in_light(path, device, settings)
     left_out = _own_cell(device, settings) if settings.own_cell else None
     if left_out is not None and isinstance(left_out.neighbours, lens.NeighbourRows):
@@ -618,7 +618,7 @@ def _compute(
     figures = psf.focus_metrics(stack, device, power_error=design.power_error(device))
     bright = figures[0].window_share >= DARK
     scan = _scan(device, settings, stack) if bright else None
-    return Computed(stack, figures, design.lens_meeting_um(device), scan)
+    return ComputedPsfs(stack, figures, design.lens_meeting_um(device), scan)
 
 
 def _scan(
@@ -633,7 +633,7 @@ def _scan(
     return psf.focus_scan(device, offset_um=settings.offset_um, nodes=nodes)
 
 
-def _write(path: Path, computed: Computed, *, page: bool) -> None:
+def _write(path: Path, computed: ComputedPsfs, *, page: bool) -> None:
     """Write the PSFs, their pictures, and with ``page`` the report.
 
     Args:
@@ -862,7 +862,7 @@ def tolerance_excess(stack: psf.PsfStack) -> str:
     return f"the relative error {error:.2g} is above the tolerance {stack.tolerance:g}: {stack.budget.cure}"
 
 
-def dark_window(computed: Computed) -> str:
+def dark_window(computed: ComputedPsfs) -> str:
     """Message that windows hold hardly any light, and where the rays meet; else empty.
 
     Args:
@@ -882,7 +882,7 @@ def dark_window(computed: Computed) -> str:
     return f"the window of {angles} holds {share:.2g} of the light: {where}"
 
 
-def psf_text(target: Path, computed: Computed) -> str:
+def psf_text(target: Path, computed: ComputedPsfs) -> str:
     """Result of the command in words: error budget, figures of each angle, scan.
 
     Args:
@@ -947,7 +947,7 @@ def _depth(depth_um: float) -> str:
     return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
 
 
-def psf_numbers(computed: Computed) -> dict[str, Any]:
+def psf_numbers(computed: ComputedPsfs) -> dict[str, Any]:
     """Result of the command as a dictionary for JSON; None for numbers that are not
     finite.
 
@@ -987,7 +987,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def key_figures(computed: Computed) -> list[KeyFigure]:
+def key_figures(computed: ComputedPsfs) -> list[KeyFigure]:
     """Key figures of the report: counts, errors, efficiency and Strehl ratio on axis.
 
     Args:
@@ -1014,7 +1014,7 @@ def key_figures(computed: Computed) -> list[KeyFigure]:
     return [*figures, outside]
 
 
-def psf_sections(computed: Computed, pictures: dict[str, bytes]) -> list[Section]:
+def psf_sections(computed: ComputedPsfs, pictures: dict[str, bytes]) -> list[Section]:
     """Sections of the report: pictures, focus, error by cause, energy.
 
     Args:

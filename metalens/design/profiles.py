@@ -1,9 +1,6 @@
 """Phase profiles of lenses: hyperbolic, double helix, cubic, and a map from file.
 
-All focus a point source on the axis at ``source_distance_um`` before the lens onto the
-sensor at
-``sensor_distance_um`` behind it; the last three add their own term to that hyperbolic
-phase.
+The last three add their term to the hyperbolic phase of the focus.
 """
 
 import math

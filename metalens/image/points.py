@@ -14,7 +14,7 @@ from torch import Tensor
 from metalens.core.errors import PropagationError
 from metalens.image import compiled, polarised
 from metalens.image.rays import (
-    Paths,
+    RayPaths,
     Rays,
     landing_offset,
     rays,
@@ -94,7 +94,7 @@ class Pupil:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Samples:
+class WindowSamples:
     """Along one axis: (2 samples, points) light of the points of a transform on each
     sample, and below it the
     derivative of that by the sample's place in um; place_um: (samples,) from where the
@@ -105,7 +105,7 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class Sampling:
+class PupilSampling:
     """period_um of the nodes, their number along an axis and their step of p, size of
     the padded transform, harmonics
     that are kept.
@@ -131,7 +131,7 @@ class Sampling:
 
 def sampling(
     optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf
-) -> Sampling:
+) -> PupilSampling:
     """Nodes of the pupil and size of its padded transform for one window.
 
     Nodes are at equal steps of p = n sin θ. They fill the aperture as a window on the
@@ -169,7 +169,9 @@ def sampling(
     # multiples of 16 are a third quicker than sizes that just factorise
     padded_size = 16 * scipy.fft.next_fast_len(-(-size // 16))
     dimmed = beyond * math.pi**2 / (12 * SPARE * window.period)
-    return Sampling(period, nodes, step, padded_size, harmonics, beyond, dimmed, window)
+    return PupilSampling(
+        period, nodes, step, padded_size, harmonics, beyond, dimmed, window
+    )
 
 
 def psfs(
@@ -217,7 +219,7 @@ def psfs(
 def _point_psfs(
     optics: Optics,
     place: Tensor,
-    grid: Sampling,
+    grid: PupilSampling,
     depths_um: Tensor,
     wavelength_um: float,
     finest_um: float,
@@ -322,7 +324,7 @@ def stop_amplitudes(
 
 
 def _shown(
-    fluxes: list[Tensor], to_samples: tuple[Samples, ...], moves: list[Tensor]
+    fluxes: list[Tensor], to_samples: tuple[WindowSamples, ...], moves: list[Tensor]
 ) -> Tensor:
     """(depths, h, w) light of the transforms, moved to second order, on the samples.
 
@@ -377,7 +379,7 @@ def _fluxes(
 
 
 def _on_samples(
-    power: Tensor, to_samples: tuple[Samples, ...]
+    power: Tensor, to_samples: tuple[WindowSamples, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(…, h, w) light on the samples, and its derivatives by x and by y, per um.
 
@@ -393,13 +395,13 @@ def _on_samples(
     return light[..., :width], light[..., width:], by_y @ along_x.both[:width].mT
 
 
-def _around(to_samples: tuple[Samples, ...]) -> Tensor:
+def _around(to_samples: tuple[WindowSamples, ...]) -> Tensor:
     """([x, y], h, w) places of the samples from where the rays are traced to, um."""
     y, x = torch.meshgrid(to_samples[1].place_um, to_samples[0].place_um, indexing="ij")
     return torch.stack([x, y])
 
 
-def _move(slope: Tensor, to_samples: tuple[Samples, ...]) -> Tensor:
+def _move(slope: Tensor, to_samples: tuple[WindowSamples, ...]) -> Tensor:
     """([x, y, divergence], h, w) of the shift s(δ)_j = δᵀ slope_j δ / 2, in um.
 
     Args:
@@ -413,7 +415,7 @@ def _move(slope: Tensor, to_samples: tuple[Samples, ...]) -> Tensor:
 
 
 def _moved(
-    power: Tensor, to_samples: tuple[Samples, ...], move: Tensor
+    power: Tensor, to_samples: tuple[WindowSamples, ...], move: Tensor
 ) -> tuple[Tensor, Tensor]:
     """(depths, h, w) power P on the samples, and ∇·(s P), its change by the shift s.
 
@@ -429,7 +431,7 @@ def _moved(
 def node_rays(
     optics: Optics,
     place: Tensor,
-    grid: Sampling,
+    grid: PupilSampling,
     wavelength_um: float,
     beside_um: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Rays, Pupil]:
@@ -461,7 +463,7 @@ def node_rays(
     )
 
 
-def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
+def node_fields(pupil: Pupil, paths: RayPaths, wavelength_um: float) -> Tensor:
     """(depths, *shape) complex64 field weight · exp(iφ) on the pupil's nodes.
 
     φ is the phase of the pupil plus 2π/λ times the source's path. The wave's factor is
@@ -483,8 +485,8 @@ def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 
 @functools.lru_cache(maxsize=64)
 def _to_samples(
-    grid: Sampling, view_um: float, shift_um: float, device: torch.device
-) -> Samples:
+    grid: PupilSampling, view_um: float, shift_um: float, device: torch.device
+) -> WindowSamples:
     """Matrix from the points of the padded transform to the samples along one axis.
 
     Its element of sample and point m is Σ_h sinc²(h step / period)
@@ -514,7 +516,7 @@ def _to_samples(
         spectrum * (2j * np.pi / grid.period_um * harmonic), grid.size
     )
     matrix = np.concatenate([light, slope]).astype(np.float32)
-    return Samples(
+    return WindowSamples(
         torch.from_numpy(matrix).to(device),
         torch.from_numpy(place.astype(np.float32)).to(device),
     )

@@ -44,7 +44,7 @@ class Rays:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Paths:
+class RayPaths:
     """Optical paths of many depths as mixtures of a few: mix (depths, few) times few_um
     (few, *shape), float64.
     """
@@ -239,7 +239,7 @@ def source_paths(
     bundle: Rays,
     depths_um: Tensor,
     wavelength_um: float,
-) -> Paths:
+) -> RayPaths:
     """Optical path from each source to the lens at (x, y), less that to its middle, um.
 
     More depths than ``VERGENCES`` are interpolated between that many Chebyshev points
@@ -267,12 +267,14 @@ def _source_paths(
     bundle: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
-) -> Paths:
+) -> RayPaths:
     """As :func:`source_paths`; without films in front no wavelength is needed."""
     shared = layers, tangents, bundle
     if len(depths_um) <= VERGENCES:
         few = _paths_by_depth(*shared, depths_um, wavelength_um)
-        return Paths(few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device))
+        return RayPaths(
+            few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device)
+        )
     inverse = 1 / np.array(depths_um)
     least, largest = float(inverse.min()), float(inverse.max())
     unit_nodes = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
@@ -283,7 +285,7 @@ def _source_paths(
         unit_depths, VERGENCES - 1
     ) @ np.linalg.inv(basis)
     few = _paths_by_depth(*shared, tuple((1 / nodes).tolist()), wavelength_um)
-    return Paths(few, torch.from_numpy(mix).to(few))
+    return RayPaths(few, torch.from_numpy(mix).to(few))
 
 
 def _paths_by_depth(

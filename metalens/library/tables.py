@@ -215,9 +215,10 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
 def _numbers(row: list[str]) -> bool:
     """Whether every field of a row is a number."""
     try:
-        return all(map(float, row)) or True
+        list(map(float, row))
     except ValueError:
         return False
+    return True
 
 
 def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, _Column]:

@@ -1,9 +1,6 @@
-"""Dense symmetric linear algebra without the cost of general-purpose checks: matrices
-here have a hundred rows.
+"""Dense symmetric linear algebra for matrices of a hundred rows.
 
-Matrices are real, rows contiguous, and of symmetric ones the lower triangle counts.
-LAPACK sees the transposes, so
-nothing is copied but what is overwritten.
+Rows are contiguous; of symmetric matrices the lower triangle counts.
 """
 
 import numpy as np

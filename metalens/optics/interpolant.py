@@ -1,8 +1,6 @@
-"""Functions of rays over many places: polynomials where those reach rounding, so that
-Newton's method runs a few times.
+"""Chebyshev interpolants of ray functions of the squared reach u.
 
-What media make of a ray is analytic in its squared reach u, away from -(Σ t / n)²:
-Chebyshev coefficients fall as a power.
+They are analytic away from u = -(Σ t / n)², so coefficients fall as a power.
 """
 
 from collections.abc import Callable

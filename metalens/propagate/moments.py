@@ -1,8 +1,6 @@
-"""From millions of pillars to a few thousand moments, by blocks of neighbouring
-pillars.
+"""Moments of blocks of neighbouring pillars on a few interpolation nodes.
 
-The geometric phase (the carrier) is a polynomial over each block and is removed. A few
-interpolation nodes then stand for the pillars of the block.
+The carrier is a polynomial over each block and is removed.
 """
 
 import functools

@@ -1,10 +1,4 @@
-"""Point spread functions of a lens over depth, field angle and wavelength (paper Sec.
-3.1, Eqs. 1-3).
-
-``psf_stack`` takes phase and transmission maps, ``from_lens`` a lens file's content;
-``on_pixels`` gives what a sensor
-sees; ``save`` and ``load`` keep a stack as a file.
-"""
+"""Point spread functions over depth, field angle and wavelength (paper Eqs. 1-3)."""
 
 import lazy_loader
 

@@ -1,9 +1,6 @@
-"""Rigorous coupled-wave analysis (RCWA) of one pillar cell.
+"""Rigorous coupled-wave analysis (RCWA) of one pillar cell, with error estimates.
 
-``solve`` gives the zero-order response with an error estimate, ``jones`` both
-polarisations, ``near_field`` the fields in the cell, ``solve_row`` the orders of a row
-of different pillars. ``solve_textbook_rcwa`` is the plain reference: a page of formulae
-without symmetries. Light comes from the substrate.
+``solve_textbook_rcwa`` is the plain reference. Light comes from the substrate.
 """
 
 import lazy_loader

@@ -47,7 +47,7 @@ class DesignScore:
     encircled: Tensor
 
 
-class Objective(Protocol):
+class SearchObjective(Protocol):
     """An objective of the gradient ascent."""
 
     def loss(
@@ -81,7 +81,7 @@ class AxialObjective:
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Loss and encircled energy at some depths, see :class:`Objective`.
+        """Loss and encircled energy at some depths, see :class:`SearchObjective`.
 
         With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
         log(mean I), I per mm² of the images, the means over depths.
@@ -147,7 +147,7 @@ class AxialObjective:
         return depths, fields, torch.rand(2, 2, generator=generator) - 0.5
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """See :class:`Objective`."""
+        """See :class:`SearchObjective`."""
         return score_phase(
             phase_rad, self.pupil, focus_um=focus_um, settings=self.settings
         )
@@ -266,7 +266,7 @@ def fisher_profile(
     *,
     radius_um: float,
     settings: FisherSettings | None = None,
-    objective: Objective | None = None,
+    objective: SearchObjective | None = None,
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase in rad, focus and free form, as a function of position.
 
@@ -350,7 +350,7 @@ def optimize_free_form(
     pupil: Pupil,
     settings: ResolvedFisherSettings,
     *,
-    objective: Objective | None = None,
+    objective: SearchObjective | None = None,
 ) -> FisherPhase:
     """Free-form phase of most information: the best of several starts of gradient
     ascent.
@@ -450,7 +450,10 @@ class _Best:
     """The best iterate: first whether it keeps the energy, then its information."""
 
     def __init__(
-        self, objective: Objective, settings: ResolvedFisherSettings, focus_um: float
+        self,
+        objective: SearchObjective,
+        settings: ResolvedFisherSettings,
+        focus_um: float,
     ) -> None:
         self.objective, self.settings, self.focus_um = objective, settings, focus_um
         self.rank: tuple[bool, float] = (False, -math.inf)
@@ -479,7 +482,7 @@ class _Best:
 def _climb(
     pupil: Pupil,
     settings: ResolvedFisherSettings,
-    objective: Objective,
+    objective: SearchObjective,
     focus_um: float,
     zones: int,
     generator: torch.Generator,

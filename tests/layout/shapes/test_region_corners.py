@@ -61,7 +61,7 @@ def test_triangles_fill_an_outline_but_for_its_hole():
     points = np.concatenate([outline, hole])
     areas = [
         polygon.twice_area(points[three])
-        for three in region.triangulate([outline, hole])
+        for three in region.triangulate_region([outline, hole])
     ]
     assert min(areas) > 0
     assert sum(areas) == 2 * (90 * 70 - 30 * 40 - 70 * 10)
