@@ -472,7 +472,7 @@ async function drawing(panel, section) {
   }, "Shapes and how many copies they have");
 }
 
-const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Points: points, Numbers: async (panel, section) => fill(element("div", section, { class: panel.rows.length > 40 ? "scroll" : "scroll whole", tabindex: 0 }), panel.head, panel.rows) };
+const DRAW = { ImagePanel: images, CurvePanel: curves, ClassMapPanel: classes, DrawingPanel: drawing, PointPanel: points, TablePanel: async (panel, section) => fill(element("div", section, { class: panel.rows.length > 40 ? "scroll" : "scroll whole", tabindex: 0 }), panel.head, panel.rows) };
 (async () => {
   const data = JSON.parse(document.getElementById("data").textContent), main = document.getElementById("panels"), status = document.getElementById("status");
   for (const panel of data.panels) {
@@ -486,7 +486,7 @@ const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawin
   // on paper everything is as wide as the sheet: figures are drawn anew for it, and for the screen again afterwards
   for (const [when, on] of [["beforeprint", true], ["afterprint", false]]) addEventListener(when, () => { document.body.classList.toggle("paper", on); dispatchEvent(new Event("resize")); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => dispatchEvent(new Event("resize")));
-  const tables = data.panels.filter((panel) => panel.type === "Numbers").length, drawn = data.panels.length - tables, of = (n, what) => (n ? [`${n} ${what}${n > 1 ? "s" : ""}`] : []);
+  const tables = data.panels.filter((panel) => panel.type === "TablePanel").length, drawn = data.panels.length - tables, of = (n, what) => (n ? [`${n} ${what}${n > 1 ? "s" : ""}`] : []);
   status.textContent = [...of(drawn, "figure"), ...of(tables, "table")].join(", ");
   document.body.dataset.ready = "true";
 })();

@@ -16,7 +16,7 @@ from layout.study.spread_model import reduce_spread, reduction_error
 from metalens import modal
 from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
-from metalens.cell.shapes import Circle, Cross, Rectangle, Square
+from metalens.cell.shapes import Circle, Rectangle, Square
 from metalens.core.errors import ProcessError
 from metalens.core.report import Figure, Table
 from metalens.fabrication import (
@@ -229,7 +229,6 @@ def test_beyond_the_domain_the_phase_goes_on_straight():
     [
         (Circle(), Lattice(), np.pi / 4),
         (Rectangle(0.6), Lattice("hexagonal"), 0.6 / (math.sqrt(3) / 2)),
-        (Cross(0.4), Lattice("rectangular", 1.2), (0.8 - 0.16) / 1.2),
     ],
 )
 def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, share):

@@ -6,7 +6,9 @@ import base64
 import dataclasses
 import json
 import re
+import typing
 import zlib
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from metalens.view import (
     ClassMapPanel,
     CurvePanel,
     ImagePanel,
+    Panel,
     PointPanel,
     SliderAxis,
     TablePanel,
@@ -355,3 +358,10 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
         assert number == pytest.approx(
             float(stack[angle, depth, 14, 14] / stack.max()), rel=1e-3
         )  # four digits
+
+
+def test_the_page_draws_every_kind_of_panel():
+    script = resources.files("metalens") / "data" / "view" / "view.js"
+    drawn = re.search(r"const DRAW = {(.*)};", script.read_text(encoding="utf-8"))[1]
+    kinds = {c.__name__ for c in typing.get_args(Panel)}
+    assert kinds == set(re.findall(r"(\w+Panel):", drawn))
