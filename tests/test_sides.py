@@ -246,7 +246,7 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     )
     assert inapplicable_names(CELL) == ("pedestal_nm", "cap_nm")
     with pytest.raises(FitError, match="length_nm"):
-        pillar_slopes.log_response_slopes(plain, wanted={"length_nm"})
+        pillar_slopes.log_response_slopes(plain, names={"length_nm"})
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
         tolerance.analyse_tolerance(plain, Process(spread=Spread.only(turn_deg=0.2)))
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):

@@ -121,7 +121,7 @@ def _shoot(options: Options, path: Path) -> int:
             design,
             truth,
             log_response_slopes(
-                design, wanted=[k.name for k in truth.parameter if k.value]
+                design, names=[k.name for k in truth.parameter if k.value]
             ),
         )
         write_captures(draft.path, simulated, truth, design)

@@ -27,16 +27,16 @@ CURVES = "Modulation transfer along x up to the pixel's Nyquist frequency, and l
 _NAMED = 8  # lines that a legend holds
 
 
-def frames_page(path: Path, found: frames.CaptureQuality) -> None:
+def frames_page(path: Path, quality: frames.CaptureQuality) -> None:
     """Write the page of captures: numbers of every frame, curves of MTF and encircled
     energy, field curvature, distortion.
 
     Args:
         path: the page to write.
-        found: quality of the frames.
+        quality: quality of the frames.
     """
     columns = {
-        words: [attrgetter(name)(row) for row in found.frames]
+        words: [attrgetter(name)(row) for row in quality.frames]
         for name, words in COLUMNS.items()
     }
     stated = {
@@ -51,10 +51,10 @@ def frames_page(path: Path, found: frames.CaptureQuality) -> None:
             [report.Table(tuple(stated), list(zip(*stated.values(), strict=True)))],
         ),
         report.Section(
-            "Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]
+            "Curves", "", [report.Figure(_curves(quality), CURVES, wide=True)]
         ),
     ]
-    fields = [(x, y, depth) for (x, y), depth in found.best_depth_um.items()]
+    fields = [(x, y, depth) for (x, y), depth in quality.best_depth_um.items()]
     if fields:
         head = (
             "angle along x / deg",
@@ -64,14 +64,14 @@ def frames_page(path: Path, found: frames.CaptureQuality) -> None:
         sections.append(
             report.Section("Field curvature", "", [report.Table(head, fields)])
         )
-    if found.distortion:
+    if quality.distortion:
         head = ("angle along x / deg", "angle along y / deg", "distortion")
         table = report.Table(
-            head, [(x, y, f"{d:+.3%}") for (x, y), d in found.distortion.items()]
+            head, [(x, y, f"{d:+.3%}") for (x, y), d in quality.distortion.items()]
         )
         sections.append(report.Section("Distortion", "", [table]))
     sections.append(
-        report.Section("Put right or assumed on the way", "\n\n".join(found.notes))
+        report.Section("Put right or assumed on the way", "\n\n".join(quality.notes))
     )
     report.write_report(path, "Image quality of the captures", sections)
 
@@ -101,24 +101,24 @@ def _curves(quality: frames.CaptureQuality) -> bytes:
 
 
 def edge_page(
-    path: Path, image: Array, found: metrics.EdgeMtf, *, pixel_um: float
+    path: Path, image: Array, edge_mtf: metrics.EdgeMtf, *, pixel_um: float
 ) -> None:
     """Write the page of a slanted edge: the picture and the MTF across it.
 
     Args:
         path: the page to write.
         image: (y, x) picture.
-        found: modulation across the edge.
+        edge_mtf: modulation across the edge.
         pixel_um: pitch of the pixels, um.
     """
     figure, (picture, curve) = report.make_figure(1, 2)
     picture.imshow(image, cmap="gray")
     picture.set_axis_off()
-    curve.plot(found.frequency_per_um, found.modulation)
+    curve.plot(edge_mtf.frequency_per_um, edge_mtf.modulation)
     curve.axvline(0.5 / pixel_um, color="0.6", linestyle=":")
     curve.set_xlabel("cycles / µm")
     curve.set_ylabel("modulation")
-    caption = f"Modulation one half at {found.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
+    caption = f"Modulation one half at {edge_mtf.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
     report.write_report(
         path,
         "Slanted edge",
@@ -133,8 +133,8 @@ def edge_page(
 def micrograph_page(
     path: Path,
     image: Array,
-    found: sem.MeasuredDiameters,
-    laid: overlay.MaskOverlay | None,
+    measured: sem.MeasuredDiameters,
+    overlay_fit: overlay.MaskOverlay | None,
     table: overlay.Table,
     *,
     pixel_nm: float,
@@ -145,8 +145,8 @@ def micrograph_page(
     Args:
         path: the page to write.
         image: (y, x) picture.
-        found: measured pillars.
-        laid: the micrograph's pillars on the mask.
+        measured: measured pillars.
+        overlay_fit: the micrograph's pillars on the mask.
         pixel_nm: size of a pixel, nm.
     """
     caption = "Circles: measured edges, coloured by the error against the design (diameter where there is none); "
@@ -157,7 +157,9 @@ def micrograph_page(
             "",
             [
                 report.Figure(
-                    _pillars_figure(image, found, laid, pixel_nm), caption, wide=True
+                    _pillars_figure(image, measured, overlay_fit, pixel_nm),
+                    caption,
+                    wide=True,
                 )
             ],
         )

@@ -468,27 +468,27 @@ def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
     return np.asarray(out[arrangement.order] if arrangement.reordered else out)
 
 
-def laid_words(found: FrameArrangement) -> list[str]:
+def laid_words(arrangement: FrameArrangement) -> list[str]:
     """Sentences on the orientation and order of the frames, and on what of it is
     ambiguous.
 
     Args:
-        found: how the frames lie.
+        arrangement: how the frames lie.
     """
     words = []
-    if found.clearly:
-        words.append(f"frames fit the design only {found.words}: used so")
-    if found.reordered:
+    if arrangement.clearly:
+        words.append(f"frames fit the design only {arrangement.words}: used so")
+    if arrangement.reordered:
         words.append(
-            f"frames fit the stated depths only in the order {found.order.tolist()}: used so"
+            f"frames fit the stated depths only in the order {arrangement.order.tolist()}: used so"
         )
-    if found.alike:
-        which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
+    if arrangement.alike:
+        which = ", ".join((TURNS + MIRRORED)[k] for k in arrangement.alike)
         words.append(
             f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
             "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
         )
-    if not found.order_seen:
+    if not arrangement.order_seen:
         words.append(
             "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
         )

@@ -125,7 +125,7 @@ def _fit(
     known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
     sizes = unfitted_sizes(known, lens)
     check_enough(data, multistart.names_of(known, options.free))
-    response = response or log_response_slopes(lens, wanted=_spoken_of(options))
+    response = response or log_response_slopes(lens, names=_spoken_of(options))
     model = ForwardModel(lens, setting, response)
     start = parameter_vector({name: k.value for name, k in known.items()})
     scan_um = options.scan_um
@@ -309,24 +309,24 @@ def _spoken_of(options: FitOptions) -> set[str]:
     return {*options.free, *(k.name for k in options.known)}
 
 
-def _check_likeness(found: FrameArrangement, lens: Lens) -> None:
-    if found.likeness < LIKENESS:
+def _check_likeness(arrangement: FrameArrangement, lens: Lens) -> None:
+    if arrangement.likeness < LIKENESS:
         raise FitRefused(
-            f"fit refused: the frames look like no image of this lens (best correlation {found.likeness:.2f}); "
+            f"fit refused: the frames look like no image of this lens (best correlation {arrangement.likeness:.2f}); "
             f"they are of another lens than this {lens.profile} one, far from the stated depths, or dark"
         )
 
 
-def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
+def _as_laid(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
     """The task with its frames in an arrangement, and its window fixed at the light."""
-    sideways = found.clearly and found.orientation % 2 == 1
+    sideways = arrangement.clearly and arrangement.orientation % 2 == 1
     model = task.model.exchanged() if sideways else task.model
-    model = model.about(multistart.window_um(found, model))
+    model = model.about(multistart.window_um(arrangement, model))
     return dataclasses.replace(
         task,
         model=model,
-        data=task.data.arranged(lambda part: rearrange_frames(part, found)),
-        found=found,
+        data=task.data.arranged(lambda part: rearrange_frames(part, arrangement)),
+        found=arrangement,
     )
 
 

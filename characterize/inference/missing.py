@@ -37,14 +37,14 @@ class ResidualFinding:
 
 
 def decisive_findings(
-    found: Sequence[ResidualFinding], sigma: float = 5.0
+    findings: Sequence[ResidualFinding], sigma: float = 5.0
 ) -> list[str]:
     """Findings beyond ``sigma``, in words: no fit with one passes its checks.
 
     Args:
-        found: what residuals hold.
+        findings: what residuals hold.
     """
-    return [finding.words for finding in found if finding.sigma > sigma]
+    return [finding.words for finding in findings if finding.sigma > sigma]
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +272,7 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
 
 
 def to_fit(
-    found: list[ScoreTest], *, stuck: bool = False, most: int = 5
+    score_tests: list[ScoreTest], *, stuck: bool = False, most: int = 5
 ) -> list[ScoreTest]:
     """Causes to fit next: those that have parameters and may explain the frames.
 
@@ -280,11 +280,11 @@ def to_fit(
     ``ODDS``, likeliest first. At most ``most``.
 
     Args:
-        found: score tests.
+        score_tests: score tests.
         stuck: a parameter ran to its bound: any unstated cause may be behind it.
         most: causes that are fitted in turn to see which explains most.
     """
-    free = [test for test in found if test.frees]
+    free = [test for test in score_tests if test.frees]
     clear = [test for test in free if test.chance < CHANCE]
     likely = sorted(
         (test for test in free if test.odds > ODDS), key=lambda test: -test.odds
@@ -294,16 +294,16 @@ def to_fit(
     return (clear or likely)[:most]
 
 
-def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
+def score_test_text(score_tests: list[ScoreTest]) -> list[ResidualFinding]:
     """Sentence on the cause that the residuals lean to most, with the next three.
 
     Empty where all is chance. Significance in sigma of a normal variable of equal
     probability.
 
     Args:
-        found: score tests, the most telling first.
+        score_tests: score tests, the most telling first.
     """
-    clear = [test for test in found if test.chance < CHANCE]
+    clear = [test for test in score_tests if test.chance < CHANCE]
     if not clear:
         return []
     first = clear[0]
@@ -325,35 +325,39 @@ def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
     return [ResidualFinding(said, sigma)]
 
 
-def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
+def misplaced_windows_text(score_tests: list[ScoreTest]) -> list[str]:
     """Sentence on misplaced windows at single field angles, if they explain most.
 
     They must explain half of what any cause does. The fit would otherwise bend the
     lens, or turn the frames, until the spots of all angles fit their windows.
 
     Args:
-        found: score tests.
+        score_tests: score tests.
     """
-    most = max((test.chi2 - test.degrees for test in found), default=0.0)
+    most = max((test.chi2 - test.degrees for test in score_tests), default=0.0)
     return [
         f"{test.cause} explains what is left (chi-square {test.chi2:.0f} with {test.degrees} degrees): one decentre is "
         "fitted for all angles; cut the frames of every angle about its chief ray, distance times tan(angle) off that "
         "on the axis, or fit the angles one by one"
-        for test in found
+        for test in score_tests
         if test.cause == causes.WINDOWS
         and test.chance < CHANCE
         and test.chi2 - test.degrees >= most / 2
     ]
 
 
-def undetectable_effects(found: list[ScoreTest]) -> list[str]:
+def undetectable_effects(score_tests: list[ScoreTest]) -> list[str]:
     """Unfitted effects that the frames cannot distinguish from fitted parameters, with
     those parameters.
 
     Args:
-        found: score tests.
+        score_tests: score tests.
     """
-    return [f"{test.cause} is not fitted: {test.taken}" for test in found if test.taken]
+    return [
+        f"{test.cause} is not fitted: {test.taken}"
+        for test in score_tests
+        if test.taken
+    ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

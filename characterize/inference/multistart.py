@@ -564,17 +564,19 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, float]:
+def window_um(
+    arrangement: FrameArrangement, model: ForwardModel
+) -> tuple[float, float]:
     """(x, y) of the window's middle from the chief ray, um, by the light in the frames.
 
     Args:
-        found: how the frames lie.
+        arrangement: how the frames lie.
         model: the forward model.
     """
     most = _ASIDE_UM * wavelength_scale(model.lens.wavelength_um)
     x, y = (
         float(np.clip(-shift * model.setting.pixel_um, -most, most))
-        for shift in found.shift_px[::-1]
+        for shift in arrangement.shift_px[::-1]
     )
     return x, y
 

@@ -389,46 +389,46 @@ def _joined(
     )
 
 
-def posterior_text(names: Sequence[str], found: FitPosterior) -> list[str]:
+def posterior_text(names: Sequence[str], posterior: FitPosterior) -> list[str]:
     """Sentences on what the posterior leaves open.
 
     Ends of intervals that were not reached, skewed intervals, second modes, few draws.
 
     Args:
         names: of the parameters.
-        found: their posterior.
+        posterior: their posterior.
     """
     out = [
         f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, "
         "perhaps beyond"
-        for name, profile in found.profiles.items()
+        for name, profile in posterior.profiles.items()
         for which, place, reached in zip(
             ("lower", "upper"), (profile.low, profile.high), profile.found, strict=True
         )
         if not reached
     ]
     for i, name in enumerate(names):
-        if not found.parabolic[i]:
+        if not posterior.parabolic[i]:
             out.append(
-                f"{name} is bent: 95 % within {found.low[i]:.3g} to "
-                f"{found.high[i]:.3g} about {found.best.value[i]:.3g}, not the same on "
-                "both sides; take draws, not value and sigma"
+                f"{name} is bent: 95 % within {posterior.low[i]:.3g} to "
+                f"{posterior.high[i]:.3g} about {posterior.best.value[i]:.3g}, not the same "
+                "on both sides; take draws, not value and sigma"
             )
-    sigma = np.sqrt(np.diag(found.best.covariance))
-    for mode, share in zip(found.modes[1:], found.share[1:], strict=True):
-        most = np.argsort(-np.abs(mode.value - found.best.value) / sigma)[:3]
+    sigma = np.sqrt(np.diag(posterior.best.covariance))
+    for mode, share in zip(posterior.modes[1:], posterior.share[1:], strict=True):
+        most = np.argsort(-np.abs(mode.value - posterior.best.value) / sigma)[:3]
         values = ", ".join(
-            f"{names[i]} {mode.value[i]:.3g} for {found.best.value[i]:.3g}"
+            f"{names[i]} {mode.value[i]:.3g} for {posterior.best.value[i]:.3g}"
             for i in most
         )
         out.append(
             "a second lens explains the frames nearly as well (misfit "
-            f"{mode.merit - found.best.merit:+.1f}, probability {share:.0%}): {values}; "
+            f"{mode.merit - posterior.best.merit:+.1f}, probability {share:.0%}): {values}; "
             "frames farther from focus on both sides tell them apart"
         )
-    if len(found.draws) and found.effective_draws < DRAWS / 4:
+    if len(posterior.draws) and posterior.effective_draws < DRAWS / 4:
         out.append(
-            f"draws of the posterior are worth {found.effective_draws:.0f} independent "
-            "ones: take intervals, not draws"
+            f"draws of the posterior are worth {posterior.effective_draws:.0f} "
+            "independent ones: take intervals, not draws"
         )
     return out

@@ -348,23 +348,23 @@ def process_verdict(
     return f"the process is known to {known}" + loosely + more
 
 
-def predicted_error(task: SearchTask, found: FitPosterior) -> tuple[float, float]:
+def predicted_error(task: SearchTask, posterior: FitPosterior) -> tuple[float, float]:
     """Expected NRMSE of the as-built images: at the captured depths, and half-way
     between them.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        found: the posterior.
+        posterior: the posterior.
     """
-    values = _shown(task, found)
-    best = found.best.value
+    values = _shown(task, posterior)
+    best = posterior.best.value
     model = task.model.quick()  # accurate to a few percent of the differences
     between = models_between_depths(model)
     return _spread(task, model, best, values), _spread(task, between, best, values)
 
 
 def predicted_aside(
-    task: SearchTask, found: FitPosterior
+    task: SearchTask, posterior: FitPosterior
 ) -> tuple[float, float] | None:
     """Expected NRMSE of as-built images off the captured field angles.
 
@@ -372,7 +372,7 @@ def predicted_aside(
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        found: the posterior.
+        posterior: the posterior.
 
     Returns:
         (half-way between neighbouring angles, half a step beyond the outermost); None
@@ -381,10 +381,10 @@ def predicted_aside(
     angles = largest_angle_gap(task.model.setting.angle_rad)
     if angles is None:
         return None
-    values = _shown(task, found)
+    values = _shown(task, posterior)
     models = [_at_angle(task.model, angle).quick() for angle in angles]
     between_them, beyond = (
-        _spread(task, model, found.best.value, values) for model in models
+        _spread(task, model, posterior.best.value, values) for model in models
     )
     return between_them, beyond
 
@@ -416,18 +416,18 @@ def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     return ForwardModel(model.lens, setting, model.response).about(model.grid.middle_um)
 
 
-def _shown(task: SearchTask, found: FitPosterior) -> Array:
+def _shown(task: SearchTask, posterior: FitPosterior) -> Array:
     """(draws, p) parameters of the posterior, within the bounds.
 
     Its own draws, or Gaussian ones where there are none.
     """
-    if len(found.draws):
-        values = found.draws[:_SHOWN]
+    if len(posterior.draws):
+        values = posterior.draws[:_SHOWN]
     else:
-        size, vectors = np.linalg.eigh(found.covariance)
+        size, vectors = np.linalg.eigh(posterior.covariance)
         normal = np.random.default_rng(0).standard_normal((_SHOWN, len(size)))
         normal = normal * np.sqrt(np.maximum(size, 0))
-        values = found.best.value + normal @ vectors.T
+        values = posterior.best.value + normal @ vectors.T
     return np.clip(values, task.prior.low, task.prior.high)
 
 

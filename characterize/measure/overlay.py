@@ -45,7 +45,7 @@ class MaskOverlay:
     outlier: Array
 
 
-def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay:
+def overlay_design(measured: MeasuredDiameters, design: DiameterMap) -> MaskOverlay:
     """Place of a micrograph on the mask: the shift by whole sites at which measured
     diameters scatter least about a line in the drawn ones.
 
@@ -53,7 +53,7 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
     +x is taken as the mask's, to half the angle between two rows of the lattice.
 
     Args:
-        found: pillars of the micrograph.
+        measured: pillars of the micrograph.
         design: drawn diameters.
 
     Raises:
@@ -61,17 +61,17 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
             or lies across it, or more
             pillars than it has.
     """
-    good = np.isfinite(found.diameter_nm)
+    good = np.isfinite(measured.diameter_nm)
     if good.sum() < _LEAST:
         raise CaptureError(
             f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design"
         )
-    on_mask = found.site @ _steps(found.lattice, design)
+    on_mask = measured.site @ _steps(measured.lattice, design)
     first = on_mask.min(0)
     site = on_mask - first
     patch = np.zeros(site.max(0) + 1)
     weight = np.zeros_like(patch)
-    patch[tuple(site[good].T)] = found.diameter_nm[good]
+    patch[tuple(site[good].T)] = measured.diameter_nm[good]
     weight[tuple(site[good].T)] = 1.0
     drawn = np.asarray(design.diameter_um, float) * 1e3
     if (np.array(patch.shape) > drawn.shape).any():
@@ -87,7 +87,7 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
         )
         designed = drawn[site[:, 0] + row, site[:, 1] + column]
         designed = np.where(designed > 0, designed, np.nan)
-        error = found.diameter_nm - designed
+        error = measured.diameter_nm - designed
         median = np.nanmedian(error)
         spread = 1.4826 * float(np.nanmedian(np.abs(error - median)))
         outlier = np.nan_to_num(np.abs(error - median), nan=0.0) > OUTLIER * max(
@@ -134,7 +134,7 @@ def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
 
 
 def lattice_scale(
-    found: MeasuredDiameters, pixel_nm: float, design: DiameterMap
+    measured: MeasuredDiameters, pixel_nm: float, design: DiameterMap
 ) -> float:
     """Lattice constant in the picture over that of the mask: the factor by which the
     stated pixel is too large.
@@ -144,39 +144,39 @@ def lattice_scale(
     microscopes to per cent. Accuracy: 4e-4 for five pillars a side.
 
     Args:
-        found: pillars of the micrograph.
+        measured: pillars of the micrograph.
         pixel_nm: stated pixel, nm.
         design: what was drawn.
     """
-    good = np.isfinite(found.diameter_nm)
-    sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
+    good = np.isfinite(measured.diameter_nm)
+    sites = np.column_stack([measured.site[good], np.ones(int(good.sum()))])
     jacobian = np.linalg.lstsq(
-        sites, np.column_stack([found.row[good], found.column[good]]), rcond=None
+        sites, np.column_stack([measured.row[good], measured.column[good]]), rcond=None
     )[0][:2]
     return float(
         np.sqrt(abs(np.linalg.det(jacobian)) / design.site_um2) * pixel_nm / 1e3
     )
 
 
-def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
+def bias_table(overlay_fit: MaskOverlay, *, knots: int = 7) -> Table:
     """Rows (drawn nm, made less drawn nm, its standard error, pillars) over groups of
     equally many pillars by drawn diameter, without outliers.
 
     Args:
-        laid: the micrograph's pillars on the mask.
+        overlay_fit: the micrograph's pillars on the mask.
         knots: rows of the table at most.
 
     Raises:
         CaptureError: fewer than twelve pillars to take it from.
     """
-    good = np.isfinite(laid.error_nm) & ~laid.outlier
+    good = np.isfinite(overlay_fit.error_nm) & ~overlay_fit.outlier
     if good.sum() < _LEAST:
         raise CaptureError(
             f"{int(good.sum())} pillars on the design; need {_LEAST} or more for a bias table"
         )
-    order = np.argsort(laid.designed_nm[good], kind="stable")
-    drawn = laid.designed_nm[good][order]
-    error = laid.error_nm[good][order]
+    order = np.argsort(overlay_fit.designed_nm[good], kind="stable")
+    drawn = overlay_fit.designed_nm[good][order]
+    error = overlay_fit.error_nm[good][order]
     rows = []
     for part in np.array_split(
         np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))
@@ -193,14 +193,16 @@ def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
     return rows
 
 
-def register_to_mask(found: MeasuredDiameters, laid: MaskOverlay) -> MeasuredDiameters:
+def register_to_mask(
+    measured: MeasuredDiameters, overlay_fit: MaskOverlay
+) -> MeasuredDiameters:
     """The same pillars with the mask's own row and column as their site.
 
     Args:
-        found: pillars of the micrograph.
-        laid: the micrograph's pillars on the mask.
+        measured: pillars of the micrograph.
+        overlay_fit: the micrograph's pillars on the mask.
     """
-    return dataclasses.replace(found, site=laid.site)
+    return dataclasses.replace(measured, site=overlay_fit.site)
 
 
 def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:

@@ -292,7 +292,7 @@ class ForwardModel:
         return self._kept[key]
 
     def images(
-        self, x: Array, wanted: Sequence[str] | None = None
+        self, x: Array, names: Sequence[str] | None = None
     ) -> tuple[Array, Array | None]:
         """Expected frames (n, rows, columns) in electrons, and their derivatives.
 
@@ -300,14 +300,14 @@ class ForwardModel:
 
         Args:
             x: all parameters, in the order of ``PARAMETERS``.
-            wanted: parameters to differentiate by.
+            names: parameters to differentiate by.
 
         Returns:
             Frames, and derivatives (len(wanted), n, rows, columns) or None.
         """
         if x[_PITCH]:
-            return self._off_pitch(x, wanted)
-        light, slopes = self._light(x, wanted)
+            return self._off_pitch(x, names)
+        light, slopes = self._light(x, names)
         s = self.setting
         films = self.films
         stage = {"centre_um": self.stage_centre_um}
@@ -316,12 +316,12 @@ class ForwardModel:
         )
         scale = brightness[:, None, None] / self.area_um2
         sampled = scale * light
-        if wanted is None:
+        if names is None:
             return sampled + background_planes(x, s), None
-        out = np.zeros((len(wanted), *light.shape))
+        out = np.zeros((len(names), *light.shape))
         # derivatives that need no field
         direct: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
-        if "pixel_percent" in wanted:
+        if "pixel_percent" in names:
             direct["pixel_percent"] = self._pitch_slope(x)
         direct |= {
             name: s.glow * edge
@@ -329,15 +329,15 @@ class ForwardModel:
                 ("background_y_e", "background_x_e"), s.edges, strict=True
             )
         }
-        for j, name in enumerate(wanted):
+        for j, name in enumerate(names):
             out[j] = direct[name] if name in direct else scale * slopes[name]
         for name, rate in brightness_slopes(x, s, films=films, **stage).items():
-            if name in wanted:
-                out[list(wanted).index(name)] += rate[:, None, None] * sampled
+            if name in names:
+                out[list(names).index(name)] += rate[:, None, None] * sampled
         return sampled + background_planes(x, s), out
 
     def _off_pitch(
-        self, x: Array, wanted: Sequence[str] | None
+        self, x: Array, names: Sequence[str] | None
     ) -> tuple[Array, Array | None]:
         """:meth:`images` where the pixel pitch is not the stated one.
 
@@ -347,9 +347,9 @@ class ForwardModel:
         ratio = 1 + float(x[_PITCH]) / 100
         stated = x.copy()
         stated[_PITCH] = 0.0
-        frames, slopes = self.with_pixel_pitch(ratio).images(stated, wanted)
-        if slopes is not None and wanted is not None and "pixel_percent" in wanted:
-            slopes[list(wanted).index("pixel_percent")] /= ratio
+        frames, slopes = self.with_pixel_pitch(ratio).images(stated, names)
+        if slopes is not None and names is not None and "pixel_percent" in names:
+            slopes[list(names).index("pixel_percent")] /= ratio
         return frames, slopes
 
     def _pitch_slope(self, x: Array, step_percent: float = 0.3) -> Array:

@@ -46,7 +46,7 @@ _KEPT = 64  # lenses whose slopes are kept on disk
 
 
 def log_response_slopes(
-    lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()
+    lens: Lens, *, tolerance: float = 0.02, names: Container[str] = ()
 ) -> Sensitivity:
     """d ln t by the answering causes over the diameters of a lens, or a table of t.
 
@@ -71,22 +71,22 @@ def log_response_slopes(
     Args:
         lens: its cell, its diameters and its light.
         tolerance: of the slopes, relative.
-        wanted: names of causes to include although a table lacks them (the sidewall);
+        names: names of causes to include although a table lacks them (the sidewall);
             their slopes are zero otherwise.
 
     Raises:
-        FitError: a cause in ``wanted`` does not exist for pillars of this shape.
+        FitError: a cause in ``names`` does not exist for pillars of this shape.
         CellError, MaterialError: pillars that are not round, and that no solver takes.
     """
     for name in inapplicable_names(lens.cell):
-        if name in wanted:
+        if name in names:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
     if lens.pairs is not None:
         return _of_pairs(lens)
-    extra = [row.name for row in _unknown() if row.name in wanted]
+    extra = [row.name for row in _unknown() if row.name in names]
     description = _about(lens, tolerance, extra)
     try:
-        return _cached(description, lambda: _solve(lens, tolerance, wanted))
+        return _cached(description, lambda: _solve(lens, tolerance, names))
     except (CellError, MaterialError):
         if not lens.cell.round:
             raise
@@ -167,7 +167,7 @@ def _about(lens: Lens, tolerance: float, extra: Sequence[str]) -> str:
     )
 
 
-def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
+def _solve(lens: Lens, tolerance: float, names: Container[str]) -> Sensitivity:
     """:func:`log_response_slopes` by the solvers, without the cache.
 
     Slopes are sampled at Chebyshev nodes of the diameters and fitted by polynomials.
@@ -185,7 +185,7 @@ def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
         rates = own_rates(lens, diameters)
         rows, truncation = rates.rates, rates.error
     else:
-        rows = _table_slopes(lens, table, diameters, wanted)
+        rows = _table_slopes(lens, table, diameters, names)
     degree, error = _degree(unit, rows, tolerance)
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
@@ -197,15 +197,15 @@ def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
 
 
 def _table_slopes(
-    lens: Lens, table: Solved, diameter_um: Array, wanted: Container[str]
+    lens: Lens, table: Solved, diameter_um: Array, names: Container[str]
 ) -> Array:
     """(answering causes, n) d ln t at the design, from the table.
 
-    By RCWA where the table lacks a cause in ``wanted``; zero for the others.
+    By RCWA where the table lacks a cause in ``names``; zero for the others.
     """
     series = table.series(diameter_um)
     rows = np.zeros((len(series), len(diameter_um)), complex)
-    unknown = [row.name for row in _unknown() if row.name in wanted]
+    unknown = [row.name for row in _unknown() if row.name in names]
     rates = own_rates(lens, diameter_um).rates if unknown else rows
     for n, (row, acts) in enumerate(response_errors()):
         if acts.exact:

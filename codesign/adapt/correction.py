@@ -178,7 +178,7 @@ def correction_table(
 
 
 def next_lenses(
-    made: MadeLens, plan: MaskCorrection, x_fit: Array, x_true: Array
+    lens_model: MadeLens, plan: MaskCorrection, x_fit: Array, x_true: Array
 ) -> list[LensProposal]:
     """Simulated lenses of each step of a correction: PSFs, Strehl ratio, relative
     light.
@@ -187,21 +187,22 @@ def next_lenses(
     at the corrected sensor distance.
 
     Args:
-        made: the design with its settings. plan: proposed correction of the next mask.
+        lens_model: the design with its settings.
+        plan: proposed correction of the next mask.
         x_fit: parameters that the correction was computed from.
         x_true: parameters of the real process. Both hold all parameters.
     """
-    with_table = made.redrawn(_drawn_with(made.design, plan, x_fit))
-    with_map = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
+    with_table = lens_model.redrawn(_drawn_with(lens_model.design, plan, x_fit))
+    with_map = lens_model.redrawn(_drawn_with(plan.lens, plan, x_fit))
     x_spacer = x_true.copy()
     x_spacer[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
     cases = (
-        ("as made", made, x_true),
+        ("as made", lens_model, x_true),
         ("new bias table", with_table, x_true),
         ("table and corrected map", with_map, x_true),
         ("and the spacer set right", with_map, x_spacer),
     )
-    goal = made.wave()
+    goal = lens_model.wave()
     proposals = []
     for name, lens, x in cases:
         wave = lens.wave(x)

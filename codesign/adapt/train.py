@@ -183,7 +183,7 @@ class RetrainingOutcome:
 
 
 def lens_psfs(
-    made: MadeLens,
+    lens_model: MadeLens,
     result: AsBuilt,
     config: RetrainConfig,
     truth: HiddenLens | None = None,
@@ -191,7 +191,7 @@ def lens_psfs(
     """PSFs of the nominal, fitted, drawn and (where known) true lens.
 
     Args:
-        made: lens ready for perturbations. result: of the fit.
+        lens_model: lens ready for perturbations. result: of the fit.
         config: of the retraining; numbers of posterior draws.
         truth: lens of a virtual bench; None of a real one.
     """
@@ -200,14 +200,14 @@ def lens_psfs(
             result, config.draws + config.judge, seed=config.seed
         )
     )
-    drawn = tuple(made.stack(x) for x in rows[: config.draws])
+    drawn = tuple(lens_model.stack(x) for x in rows[: config.draws])
     judge_rows = rows[config.draws :] if truth is None else [truth.vector()]
-    best = made.stack(result.parameters())
+    best = lens_model.stack(result.parameters())
     return LensPsfs(
-        made.stack(),
+        lens_model.stack(),
         best,
         drawn,
-        tuple(made.stack(x) for x in judge_rows),
+        tuple(lens_model.stack(x) for x in judge_rows),
         truth is not None,
     )
 
@@ -254,46 +254,46 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
 
 
 def make_job(
-    source: FinishedRun, config: RetrainConfig, found: LensPsfs, name: str
+    source: FinishedRun, config: RetrainConfig, training_psfs: LensPsfs, name: str
 ) -> Trainer:
     """Trainer of one of :data:`JOBS`, on the PSFs that belong to it.
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
-        found: PSFs of the lenses in question. name: of the job.
+        training_psfs: PSFs of the lenses in question. name: of the job.
     """
     stacks = {
-        "nominal": (found.nominal,),
-        "retrained": found.drawn,
-        "known": found.judges,
+        "nominal": (training_psfs.nominal,),
+        "retrained": training_psfs.drawn,
+        "known": training_psfs.judges,
     }
     return make_trainer(source, config, stacks[name])
 
 
-def available_jobs(found: LensPsfs) -> tuple[str, ...]:
+def available_jobs(training_psfs: LensPsfs) -> tuple[str, ...]:
     """Networks that can be trained: with the truth only where it is known.
 
     Args:
-        found: PSFs of the lenses in question.
+        training_psfs: PSFs of the lenses in question.
     """
-    return JOBS if found.known else JOBS[:2]
+    return JOBS if training_psfs.known else JOBS[:2]
 
 
 def run_job(
-    going: Trainer, path: Path, settings: object, *, every: int = 50
+    trainer: Trainer, path: Path, settings: object, *, every: int = 50
 ) -> Iterator[LogRecord]:
     """Train one job from its present step to its end, yielding a record a step.
 
     A checkpoint is written to ``path`` after every ``every`` steps and at the end.
 
     Args:
-        going: training with its network. path: of the checkpoint.
+        trainer: training with its network. path: of the checkpoint.
         settings: record that a resume compares. every: steps between checkpoints.
     """
-    for record in going.run():
+    for record in trainer.run():
         yield record
-        if record.step % every == 0 or record.step == going.inner.steps:
-            checkpoint.save(path, {"trainer": going.state()}, settings=settings)
+        if record.step % every == 0 or record.step == trainer.inner.steps:
+            checkpoint.save(path, {"trainer": trainer.state()}, settings=settings)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -325,7 +325,7 @@ def render_test_frames(source: FinishedRun, config: RetrainConfig) -> TestFrames
 
 
 def judge_network(
-    going: Trainer,
+    trainer: Trainer,
     source: FinishedRun,
     config: RetrainConfig,
     stacks: Sequence[PixelPsfStack],
@@ -338,23 +338,25 @@ def judge_network(
     Its batch statistics are measured first. All cases share the frames.
 
     Args:
-        going: training with its network.
+        trainer: training with its network.
         source: finished run: its network, lens and sensor. config: of the retraining.
         stacks: PSFs of made lenses; at most ``config.judge`` are used.
         frames: of :func:`render_test_frames`, where several cases are judged.
         finer: judge on images formed at a quarter of the tolerance too.
     """
-    assess.recalibrate_network(going, source.architecture)
+    assess.recalibrate_network(trainer, source.architecture)
     frames = frames or render_test_frames(source, config)
     own = []
     fine = []
     for made in stacks[: config.judge]:
-        seen = assess.sensor_frames(going, frames, config.test_batches, stack=made)
-        own.append(_frame_errors(going, source, seen))
+        seen = assess.sensor_frames(trainer, frames, config.test_batches, stack=made)
+        own.append(_frame_errors(trainer, source, seen))
         if finer:
-            exact = assess.finer_frames(going, frames, config.test_batches, stack=made)
+            exact = assess.finer_frames(
+                trainer, frames, config.test_batches, stack=made
+            )
             if exact is not None:
-                fine.append(_frame_errors(going, source, exact))
+                fine.append(_frame_errors(trainer, source, exact))
     accuracy = _mean(own)
     if len(fine) < len(own):
         return accuracy
@@ -362,14 +364,14 @@ def judge_network(
 
 
 def _frame_errors(
-    going: Trainer, source: FinishedRun, seen: SensorFrames
+    trainer: Trainer, source: FinishedRun, frames: SensorFrames
 ) -> NetworkAccuracy:
     """Errors of a trainer's network on each of the sensor frames."""
     predictions = assess.predict_frames(
-        going.model.net, source.architecture, seen, going.inner
+        trainer.model.net, source.architecture, frames, trainer.inner
     )
-    error = (predictions.slip_mm - seen.slip_mm).abs()
-    return NetworkAccuracy(error, predictions.iou, seen.above)
+    error = (predictions.slip_mm - frames.slip_mm).abs()
+    return NetworkAccuracy(error, predictions.iou, frames.above)
 
 
 def _mean(parts: Sequence[NetworkAccuracy]) -> NetworkAccuracy:
@@ -384,16 +386,17 @@ def _mean(parts: Sequence[NetworkAccuracy]) -> NetworkAccuracy:
 def retraining_outcome(
     source: FinishedRun,
     config: RetrainConfig,
-    found: LensPsfs,
+    training_psfs: LensPsfs,
     trained: dict[str, Trainer],
 ) -> RetrainingOutcome:
     """Accuracy of all cases, on the same test frames.
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
-        found: PSFs of the lenses in question. trained: trainers by name of the job.
+        training_psfs: PSFs of the lenses in question.
+        trained: trainers by name of the job.
     """
-    nominal = (found.nominal,)
+    nominal = (training_psfs.nominal,)
     frames = render_test_frames(source, config)
     untouched = make_trainer(source, config, nominal)
 
@@ -403,9 +406,11 @@ def retraining_outcome(
     return RetrainingOutcome(
         designed=judge(untouched, nominal),
         nominal=judge(trained["nominal"], nominal),
-        before=judge(trained["nominal"], found.judges),
-        after=judge(trained["retrained"], found.judges),
-        known=judge(trained["known"], found.judges) if found.known else None,
+        before=judge(trained["nominal"], training_psfs.judges),
+        after=judge(trained["retrained"], training_psfs.judges),
+        known=judge(trained["known"], training_psfs.judges)
+        if training_psfs.known
+        else None,
     )
 
 

@@ -315,34 +315,36 @@ def draw_depth_scales(
     return (target_um / depth_um).clamp(1 - spread, 1 + spread)
 
 
-def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
+def as_batch(rendered: RenderedFrames, margin: int) -> FrameBatch:
     """Rendered frames as a training batch: mask without margin, slippage in mm, pose.
 
     Args:
-        made: rendered frames. margin: samples around the frame.
+        rendered: rendered frames. margin: samples around the frame.
     """
-    inside = slice(margin, made.pupil.shape[-1] - margin)
-    frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
+    inside = slice(margin, rendered.pupil.shape[-1] - margin)
+    frames = Frames(
+        rendered.frames.radiance, rendered.frames.coverage, rendered.frames.depth_um
+    )
     return FrameBatch(
         frames,
-        made.pupil[:, inside, inside],
-        (made.labels.slip_um * 1e-3).float(),
-        pose_of(made, margin),
+        rendered.pupil[:, inside, inside],
+        (rendered.labels.slip_um * 1e-3).float(),
+        pose_of(rendered, margin),
     )
 
 
-def pose_of(made: RenderedFrames, margin: int) -> EyePose:
+def pose_of(rendered: RenderedFrames, margin: int) -> EyePose:
     """Pose labels of rendered frames: shift in mm, optic axis, landmarks and pupil
     centre.
 
     Points are fractions of the frame without margin, from its centre.
 
     Args:
-        made: rendered frames.
+        rendered: rendered frames.
         margin: samples around the frame that are imaged and then cut off.
     """
-    pixels = made.pupil.shape[-1]
-    labels = made.labels
+    pixels = rendered.pupil.shape[-1]
+    labels = rendered.labels
     points_px = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
     points = (points_px - (pixels - 1) / 2) / (pixels - 2 * margin)
     return EyePose(

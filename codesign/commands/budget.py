@@ -58,18 +58,18 @@ def run(options: Options) -> int:
     )
 
 
-def of_light(made: lens.Lens) -> str:
+def of_light(built: lens.Lens) -> str:
     """Polarisation that a budget is for, where pillars of one size treat x and y
     differently.
 
     Empty for other lenses.
 
     Args:
-        made: lens.
+        built: lens.
     """
-    if not made.one_light:
+    if not built.one_light:
         return ""
-    return f"of {made.one_light}: these pillars ({made.cell.described}) answer x and y apart"
+    return f"of {built.one_light}: these pillars ({built.cell.described}) answer x and y apart"
 
 
 def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:

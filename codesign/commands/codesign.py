@@ -142,10 +142,10 @@ def _fine_pitch_warning(settings: RunConfig) -> str:
     )
 
 
-def _of_pitch(going: CodesignRun, limit_um: float) -> str:
+def _of_pitch(codesign_run: CodesignRun, limit_um: float) -> str:
     """Why the pitch was clamped at a limit, and what to change."""
-    settings = going.settings
-    if limit_um <= going.trainer.model.finest_um:
+    settings = codesign_run.settings
+    if limit_um <= codesign_run.trainer.model.finest_um:
         return (
             f"the pitch is held at {limit_um:.3f} um and asks for less, where the smallest network would be beyond "
             f"the budget of {min(settings.run.budgets_mmacs):g} MMACs"
@@ -159,23 +159,23 @@ def _of_pitch(going: CodesignRun, limit_um: float) -> str:
     return f"the pitch is held at {limit_um:.3f} um: coarser pixels would leave a network less than it can take"
 
 
-def _image_record(going: CodesignRun) -> dict[str, Any]:
+def _image_record(codesign_run: CodesignRun) -> dict[str, Any]:
     """Image model of a run and its error:
     :func:`codesign.optics.formed.describe_image`.
     """
-    settings = going.settings
+    settings = codesign_run.settings
     side = settings.scenes.pixels + 2 * settings.scenes.margin
-    coefficients = going.trainer.model.coefficients_rad.detach()
+    coefficients = codesign_run.trainer.model.coefficients_rad.detach()
     return formed.describe_image(
         settings.optics, coefficients, side, margin=settings.scenes.margin
     )
 
 
-def _export(folder: Path, going: CodesignRun, ends: list[BudgetResult]) -> None:
+def _export(folder: Path, codesign_run: CodesignRun, ends: list[BudgetResult]) -> None:
     """Write the network of every budget as ONNX."""
-    for end, state in zip(ends, going.searches, strict=True):
+    for end, state in zip(ends, codesign_run.searches, strict=True):
         path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
-        own = replace(going, trainer=end.trainer)
+        own = replace(codesign_run, trainer=end.trainer)
         net = end.trainer.model.net
         onnx_file.write_network_file(
             path, own, net, best_candidate(state.history).architecture
@@ -220,13 +220,13 @@ def _event_writer(folder: Path, step: int) -> Any:
     return make(str(folder), purge_step=step + 1 if step else None)
 
 
-def _write_events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
+def _write_events(writer: Any, codesign_run: CodesignRun, record: LogRecord) -> None:
     """Write a step to TensorBoard, and pictures every ``checkpoint_every`` steps."""
     for name, value in asdict(record).items():
         if name != "step":
             writer.add_scalar(name, float(value), record.step)
-    if record.step % going.settings.checkpoint_every == 0:
-        for name, picture in results.run_pictures(going).items():
+    if record.step % codesign_run.settings.checkpoint_every == 0:
+        for name, picture in results.run_pictures(codesign_run).items():
             image = plt_image.imread(io.BytesIO(picture))
             writer.add_image(name, image, record.step, dataformats="HWC")
     writer.flush()
@@ -254,21 +254,24 @@ def _resume(folder: Path, settings: RunConfig) -> CodesignRun:
 
 
 def _write_results(
-    folder: Path, going: CodesignRun, ends: list[BudgetResult], said: dict[str, Any]
+    folder: Path,
+    codesign_run: CodesignRun,
+    ends: list[BudgetResult],
+    said: dict[str, Any],
 ) -> None:
     """Write lens.h5, networks, result.json, answers.h5 and the plot of the Pareto
     set.
     """
-    settings = going.settings
+    settings = codesign_run.settings
     provenance = store.Provenance(
         config=config.dumps(settings), seed=settings.inner.seed
     )
-    phase = going.trainer.model.coefficients_rad.detach()
+    phase = codesign_run.trainer.model.coefficients_rad.detach()
     lens.save(
         folder / "lens.h5", trained.trained_lens(settings.optics, phase, provenance)
     )
-    _write_networks(folder, going, ends, provenance)
-    pitch_um = float(going.trainer.model.pitch_um.detach())
+    _write_networks(folder, codesign_run, ends, provenance)
+    pitch_um = float(codesign_run.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
     record = {
         "pitch_um": pitch_um,
@@ -276,9 +279,9 @@ def _write_results(
         "steps": settings.inner.steps,
         "rows": rows,
     }
-    record |= {"bound": results.window_depth_bound(going)}
+    record |= {"bound": results.window_depth_bound(codesign_run)}
     record |= {"frozen": list(settings.run.frozen), "image": said}
-    record |= {"pitch_held_um": going.trainer.pitch_held_um}
+    record |= {"pitch_held_um": codesign_run.trainer.pitch_held_um}
     record |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(record, indent=1) + "\n")
     labels = {
@@ -291,18 +294,21 @@ def _write_results(
         results.predictions_of_frames(ends, SHOWN),
         attributes=labels,
     )
-    if going.searches:
-        store.write_bytes(folder / "pareto.png", _pareto_picture(going))
+    if codesign_run.searches:
+        store.write_bytes(folder / "pareto.png", _pareto_picture(codesign_run))
 
 
 def _write_networks(
-    folder: Path, going: CodesignRun, ends: list[BudgetResult], about: store.Provenance
+    folder: Path,
+    codesign_run: CodesignRun,
+    ends: list[BudgetResult],
+    about: store.Provenance,
 ) -> None:
     """Write every budget's network, cut to its architecture, with lens and pitch.
 
     And its own lens file, where the search optimised lenses.
     """
-    for end, state in zip(ends, going.searches, strict=True):
+    for end, state in zip(ends, codesign_run.searches, strict=True):
         model = end.trainer.model
         budget = end.row["budget_mmacs"]
         network = Subnet(model.net, best_candidate(state.history).architecture)
@@ -311,18 +317,18 @@ def _write_networks(
             "optics.log_pitch": model.log_pitch,
         }
         checkpoint.save_network(weights_file(folder, budget), network, beside=optics)
-        if going.settings.search.inner_steps:
+        if codesign_run.settings.search.inner_steps:
             own_lens = trained.trained_lens(
-                going.settings.optics, model.coefficients_rad.detach(), about
+                codesign_run.settings.optics, model.coefficients_rad.detach(), about
             )
-            lens.save(lens_file(folder, going.settings, budget), own_lens)
+            lens.save(lens_file(folder, codesign_run.settings, budget), own_lens)
 
 
-def _pareto_picture(going: CodesignRun) -> bytes:
+def _pareto_picture(codesign_run: CodesignRun) -> bytes:
     """PNG of gaze error over cost of all candidates, with their Pareto set."""
     figure, axes = report.make_figure(size=(6.0, 4.0))
     for budget, state in zip(
-        going.settings.run.budgets_mmacs, going.searches, strict=True
+        codesign_run.settings.run.budgets_mmacs, codesign_run.searches, strict=True
     ):
         macs = [c.macs / 1e6 for c in state.history]
         axes.plot(
@@ -331,7 +337,7 @@ def _pareto_picture(going: CodesignRun) -> bytes:
             "o",
             label=f"budget {budget:g} MMACs",
         )
-    front = pareto_front([c for s in going.searches for c in s.history])
+    front = pareto_front([c for s in codesign_run.searches for c in s.history])
     axes.step(
         [c.macs / 1e6 for c in front],
         [c.error for c in front],

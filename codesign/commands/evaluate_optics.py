@@ -82,7 +82,7 @@ def run(options: Options) -> int:
 def _measure(
     options: Options,
     settings: OpticsSettings,
-    made: list[Lens],
+    compared: list[Lens],
     names: list[str],
     folder: Path,
 ) -> tuple[dict[str, Any], str]:
@@ -92,28 +92,28 @@ def _measure(
     Writes tables, numbers, pictures and page into the folder.
     """
     if options.baselines:
-        for name, lens in tuned_like(made[0], settings.axial):
+        for name, lens in tuned_like(compared[0], settings.axial):
             names.append(name)
-            made.append(lens)
-    setting = settings.axial.about(made[0])
+            compared.append(lens)
+    setting = settings.axial.about(compared[0])
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     pairs = options.console.track(
-        zip(names, made, strict=True), total=len(made), label="PSFs"
+        zip(names, compared, strict=True), total=len(compared), label="PSFs"
     )
     axial = {
         name: evaluate_optics.measure_axial_information(lens, setting)
         for name, lens in pairs
     }
     pairs = options.console.track(
-        zip(names, made, strict=True), total=len(made), label="field"
+        zip(names, compared, strict=True), total=len(compared), label="field"
     )
     over_field = {
-        name: settings.over_field.of(lens, made[0], setting.angles_deg)
+        name: settings.over_field.of(lens, compared[0], setting.angles_deg)
         for name, lens in pairs
     }
     spread = [
         name
-        for name, lens in zip(names, made, strict=True)
+        for name, lens in zip(names, compared, strict=True)
         if not design.lens_has_focus(lens)
     ]
     remarks = [f"{name} {SPREAD}" for name in spread]
@@ -121,7 +121,7 @@ def _measure(
         scenes = dict(
             zip(
                 names,
-                evaluate_optics.scene_energies(made, states, settings.scenes),
+                evaluate_optics.scene_energies(compared, states, settings.scenes),
                 strict=True,
             )
         )
@@ -140,7 +140,7 @@ def _measure(
         }
     if options.reader:
         table, values["reader"] = _reader_table(
-            options, settings.reader, dict(zip(names, made, strict=True))
+            options, settings.reader, dict(zip(names, compared, strict=True))
         )
         tables.append(table)
     text = "\n\n".join(table.text for table in tables)
@@ -158,12 +158,12 @@ def _measure(
 
 
 def _reader_table(
-    options: Options, setting: ReaderConfig, made: dict[str, Lens]
+    options: Options, setting: ReaderConfig, compared: dict[str, Lens]
 ) -> tuple[Table, dict[str, Any]]:
     """Table and numbers of the reference reader for every lens."""
     results = dict(
         options.console.track(
-            judge_lenses(made, setting), total=len(made), label="reader"
+            judge_lenses(compared, setting), total=len(compared), label="reader"
         )
     )
     numbers = {name: result.values() for name, result in results.items()}

@@ -206,7 +206,9 @@ def _train(
     return trainer
 
 
-def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[float]]]:
+def _curves(
+    folder: Path, lens_psfs: LensPsfs
+) -> dict[str, tuple[list[int], list[float]]]:
     """{job: (steps, task losses)} of the log."""
     entries = checkpoint.read_entries(folder / LOG)
     return {
@@ -214,11 +216,11 @@ def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[fl
             [e["step"] for e in entries if e["job"] == name],
             [e["task"] for e in entries if e["job"] == name],
         )
-        for name in retraining.available_jobs(found)
+        for name in retraining.available_jobs(lens_psfs)
     }
 
 
-def _cautions(result: asbuilt.AsBuilt, found: LensPsfs) -> list[str]:
+def _cautions(result: asbuilt.AsBuilt, lens_psfs: LensPsfs) -> list[str]:
     """Warnings about the fit and its use, in words."""
     words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
@@ -226,7 +228,7 @@ def _cautions(result: asbuilt.AsBuilt, found: LensPsfs) -> list[str]:
         words.append(
             f"the as-built record was made by release {release}, this is {__version__}"
         )
-    if not found.known:
+    if not lens_psfs.known:
         words.append(
             "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
         )

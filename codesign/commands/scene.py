@@ -197,11 +197,13 @@ def _image_frames(
 
 
 def _write_layers(
-    path: Path, made: RenderedFrames, step_um: float, about: Provenance
+    path: Path, rendered: RenderedFrames, step_um: float, about: Provenance
 ) -> int:
     """Write the occupied depth layers of the first frame; their number."""
     frame = scene.Frames(
-        made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1]
+        rendered.frames.radiance[:1],
+        rendered.frames.coverage[:1],
+        rendered.frames.depth_um[:1],
     )
     depths_um = frame.depth_um[frame.coverage > 0]
     low, high = float(depths_um.min()), float(depths_um.max())
@@ -217,9 +219,9 @@ def _write_layers(
     return len(layers.depth_um)
 
 
-def _labels_csv(made: RenderedFrames) -> str:
+def _labels_csv(rendered: RenderedFrames) -> str:
     """Labels as comma-separated values, a frame a line."""
-    labels = made.labels
+    labels = rendered.labels
     landmark_columns = [
         f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"
     ]
@@ -261,26 +263,26 @@ def _labels_csv(made: RenderedFrames) -> str:
 
 
 def contact_sheet(
-    made: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
+    rendered: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
 ) -> None:
     """Write a PNG of frames in rows, then depth (near is bright) and pupil masks of the
     first.
 
     Args:
-        made: rendered frames. path: of the file. columns: frames across.
+        rendered: rendered frames. path: of the file. columns: frames across.
         most: frames shown at most.
     """
     import cv2
 
-    light = made.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)
+    light = rendered.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)
     frames = list((light * 255).numpy().astype(np.uint8))
-    depth = (made.frames.depth_um * made.frames.coverage).sum(1)[:columns]
+    depth = (rendered.frames.depth_um * rendered.frames.coverage).sum(1)[:columns]
     low, high = float(depth.min()), float(depth.max())
     shades = 255 * (high - depth) / max(high - low, 1e-9)
     if len(frames) % columns == 0:
         frames += list(shades.numpy().astype(np.uint8))
     if len(frames) % columns == 0:
-        frames += list((made.pupil[:columns] * 255).numpy().astype(np.uint8))
+        frames += list((rendered.pupil[:columns] * 255).numpy().astype(np.uint8))
     blank = np.zeros_like(frames[0])
     frames += [blank] * (-len(frames) % columns)
     rows = [

@@ -524,26 +524,28 @@ class ErrorBudget:
         return ImagingDevice(optics, whole)
 
     def _optics(self, state: State | None = None, *, factor: Array | None = None,
-                made: MadeLens | None = None, shift_um: float = 0.0) -> Optics:  # fmt: skip
+                lens_model: MadeLens | None = None, shift_um: float = 0.0) -> Optics:  # fmt: skip
         """Lens plane, films and sensor for a changed lens.
 
         Args:
             state: process state; the design's without it.
             factor: (y, x) factor on the pillars' transmission; the neighbour coupling
                 without it.
-            made: manufactured lens in place of the designed one.
+            lens_model: manufactured lens in place of the designed one.
             shift_um: shift of the sensor away from the lens.
         """
         pillar_factor = self.coupling if factor is None else factor
-        plane = (made or self.made).plane(state or State.of(), factor=pillar_factor)
+        plane = (lens_model or self.made).plane(
+            state or State.of(), factor=pillar_factor
+        )
         distance = self.lens.sensor_distance_um + shift_um
         return Optics(plane, self.lens.layers, distance)
 
     def _pillars(self, state: State | None = None, *, factor: Array | None = None,
-                 made: MadeLens | None = None) -> Array:  # fmt: skip
+                 lens_model: MadeLens | None = None) -> Array:  # fmt: skip
         pillar_factor = self.coupling if factor is None else factor
         t = (
-            (made or self.made)
+            (lens_model or self.made)
             .pillars(state or State.of(), factor=pillar_factor)
             .numpy()
         )
@@ -574,10 +576,10 @@ class ErrorBudget:
         return BudgetEntry(link, phase, psf, NONE, method)
 
     def _changed(self, link: str, method: str, state: State | None = None, *,
-                 factor: Array | None = None, made: MadeLens | None = None,
+                 factor: Array | None = None, lens_model: MadeLens | None = None,
                  shift_um: float = 0.0) -> BudgetEntry:  # fmt: skip
         """Entry of changed pillars or a shifted sensor; arguments as :meth:`_optics`."""
-        pillar_changes = {"factor": factor, "made": made}
+        pillar_changes = {"factor": factor, "made": lens_model}
         optics = self._optics(state, shift_um=shift_um, **pillar_changes)  # type: ignore[arg-type]
         pillars = self._pillars(state, **pillar_changes)  # type: ignore[arg-type]
         return self._entry(link, self.device.image(optics), method, pillars=pillars)
@@ -702,7 +704,7 @@ class ErrorBudget:
         on_mask = replace(designed, diameter_um=rounded.astype(np.float32))
         drawn = self.made.redrawn(replace(self.lens, diameters=on_mask))
         method = f"every diameter rounded to {step_um * 1e3:g} nm"
-        yield self._changed("mask grid", method, made=drawn)
+        yield self._changed("mask grid", method, lens_model=drawn)
 
     def _process(self) -> Iterator[BudgetEntry]:
         """Entry of the process spread, rms over draws; a fit of the built lens removes

@@ -72,18 +72,18 @@ class FieldSetting:
         )
 
 
-def field_values(found: OverField) -> dict[str, Any]:
+def field_values(aberrations: OverField) -> dict[str, Any]:
     """Every number of one lens, ready for JSON: None in place of nan and inf.
 
     Args:
-        found: aberrations over the field.
+        aberrations: aberrations over the field.
     """
     arrays = {
-        name: _json_value(np.asarray(getattr(found, name)))
-        for name in found.__slots__
+        name: _json_value(np.asarray(getattr(aberrations, name)))
+        for name in aberrations.__slots__
         if name != "left_out"
     }
-    return arrays | {"left_out": list(found.left_out)}
+    return arrays | {"left_out": list(aberrations.left_out)}
 
 
 def _json_value(array: Array) -> Any:
@@ -93,18 +93,18 @@ def _json_value(array: Array) -> Any:
     return float(array) if math.isfinite(array) else None
 
 
-def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
+def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
     """Table of distortion, foci and light over the field angle, and table of the MTF.
 
     Args:
-        seen: aberrations over the field by name of the lens.
+        field_aberrations: aberrations over the field by name of the lens.
     """
     head = (
         "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
         "sharpest line T / µm", "S / µm", "vignetting / %", "illumination",
     )  # fmt: skip
     rows, mtf_rows = [], []
-    for name, aberrations in seen.items():
+    for name, aberrations in field_aberrations.items():
         for k, angle in enumerate(aberrations.angles_deg):
             label = name if k == 0 else ""
             focus = [
@@ -126,25 +126,25 @@ def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
                 for value in pair
             ]
             mtf_rows.append((label, f"{angle:g}", *mtf))
-    frequencies = next(iter(seen.values())).frequencies_per_mm
+    frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
     columns = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
     return [
-        Table(head, rows, _caption(seen)),
+        Table(head, rows, _caption(field_aberrations)),
         Table(("lens", "angle / °", *columns), mtf_rows, "Modulation transfer over the field, of all light through the lens "
               "(T tangential: along x, S sagittal: along y)."),
     ]  # fmt: skip
 
 
-def _caption(seen: Mapping[str, OverField]) -> str:
+def _caption(field_aberrations: Mapping[str, OverField]) -> str:
     depths = {
         f"{1e-3 * aberrations.depth_um:.4g} mm"
         if math.isfinite(aberrations.depth_um)
         else "infinity"
-        for aberrations in seen.values()
+        for aberrations in field_aberrations.values()
     }
     notes = "".join(
         f"\n{name}: {line}."
-        for name, aberrations in seen.items()
+        for name, aberrations in field_aberrations.items()
         for line in aberrations.left_out
     )
     return (
@@ -160,15 +160,15 @@ def _format_value(value: float, digits: int) -> str:
     return text.removeprefix("-") if float(text) == 0 else text
 
 
-def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
+def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:
     """PNG of distortion, field curvature, illumination and vignetting over the field
     angle.
 
     Args:
-        seen: aberrations over the field by name of the lens.
+        field_aberrations: aberrations over the field by name of the lens.
     """
     figure, panels = make_figure(1, 3, size=(10.5, 3.4))
-    for name, aberrations in seen.items():
+    for name, aberrations in field_aberrations.items():
         order = np.argsort(aberrations.angles_deg)
         angle = aberrations.angles_deg[order]
         colour = (
@@ -201,13 +201,13 @@ def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
     return figure_png(figure)
 
 
-def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
+def mtf_picture(field_aberrations: Mapping[str, OverField]) -> bytes:
     """PNG of the MTF over the field angle, a panel for each frequency.
 
     Args:
-        seen: aberrations over the field by name of the lens.
+        field_aberrations: aberrations over the field by name of the lens.
     """
-    frequencies = next(iter(seen.values())).frequencies_per_mm
+    frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
     figure, panels = make_figure(
         1,
         len(frequencies),
@@ -215,7 +215,7 @@ def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
         squeeze=False,
         sharey=True,
     )
-    for name, aberrations in seen.items():
+    for name, aberrations in field_aberrations.items():
         order = np.argsort(aberrations.angles_deg)
         for k, panel in enumerate(panels[0]):
             line = panel.plot(

@@ -258,7 +258,7 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
 
 def image_frames(
     source: FinishedRun,
-    made: RenderedFrames,
+    rendered: RenderedFrames,
     prepared: Imager,
     *,
     seed: int,
@@ -269,7 +269,7 @@ def image_frames(
 
     Args:
         source: finished run: its network, lens and sensor.
-        made: rendered frames.
+        rendered: rendered frames.
         prepared: imager of the run's lens.
         seed: seed of the noise.
         sensor: sensor of :func:`experiment_sensors`; the run's own without it.
@@ -278,7 +278,7 @@ def image_frames(
     margin = source.settings.scenes.margin
     return assess.read_batch(
         source.run.trainer,
-        as_batch(made, margin),
+        as_batch(rendered, margin),
         prepared,
         seed=seed,
         sensor=sensor,
@@ -578,19 +578,25 @@ def run_calibrator(
     )
 
 
-def read_from(kept: Sequence[Predictions], source: FinishedRun) -> NetworkReadings:
+def read_from(
+    predictions: Sequence[Predictions], source: FinishedRun
+) -> NetworkReadings:
     """Readings of all frames in the units of the gaze calibration: pupil and slippage
     in mm, optic axis as angles in the frame of the face.
 
     Args:
-        kept: predictions of every subject, in their order.
+        predictions: predictions of every subject, in their order.
         source: finished run: its network, lens and sensor.
     """
     centre, slip_mm = (
-        torch.cat([getattr(prediction, name) for prediction in kept]).double().numpy()
+        torch.cat([getattr(prediction, name) for prediction in predictions])
+        .double()
+        .numpy()
         for name in ("centre", "slip_mm")
     )
-    axes = [prediction.axis for prediction in kept if prediction.axis is not None]
+    axes = [
+        prediction.axis for prediction in predictions if prediction.axis is not None
+    ]
     tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
     angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
     return NetworkReadings(centre * source.run.window_um * 1e-3, slip_mm, angles)

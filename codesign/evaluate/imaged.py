@@ -168,39 +168,39 @@ def image_first_frames(
     )
 
 
-def write_images(folder: Path, found: ImagedFrames, about: Provenance) -> None:
+def write_images(folder: Path, imaged: ImagedFrames, about: Provenance) -> None:
     """Write image.h5 (kind ``image``) and image.png.
 
     Args:
         folder: folder to write to.
-        found: frames with their images.
+        imaged: frames with their images.
         about: provenance of image.h5.
     """
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
-    arrays = {name: np.asarray(getattr(found, name)) for name in names}
-    attributes = {"pitch_um": found.pitch_um, "error": found.error} | {
-        f"error_{cause}": error for cause, error in found.parts.items()
+    arrays = {name: np.asarray(getattr(imaged, name)) for name in names}
+    attributes = {"pitch_um": imaged.pitch_um, "error": imaged.error} | {
+        f"error_{cause}": error for cause, error in imaged.parts.items()
     }
     store.save(
         folder / "image.h5", "image", arrays, attributes=attributes, provenance=about
     )
-    store.write_bytes(folder / "image.png", plot_image(found))
+    store.write_bytes(folder / "image.png", plot_image(imaged))
 
 
-def plot_image(found: ImagedFrames) -> bytes:
+def plot_image(imaged: ImagedFrames) -> bytes:
     """PNG of the first frame: scene, image, and image minus scene.
 
     Args:
-        found: frames with their images.
+        imaged: frames with their images.
     """
     figure, axes = report.make_figure(1, 3, size=(9.6, 3.3))
-    difference = found.image[0] - found.scene[0]
-    brightest = float(found.scene[0].max())
+    difference = imaged.image[0] - imaged.scene[0]
+    brightest = float(imaged.scene[0].max())
     largest = float(np.abs(difference).max())
-    half_mm = found.pitch_um * len(difference) / 2000
+    half_mm = imaged.pitch_um * len(difference) / 2000
     extent = {"extent": (-half_mm, half_mm, half_mm, -half_mm)}
-    axes[0].imshow(found.scene[0], cmap="gray", vmin=0, vmax=brightest, **extent)
-    axes[1].imshow(found.image[0], cmap="gray", vmin=0, vmax=brightest, **extent)
+    axes[0].imshow(imaged.scene[0], cmap="gray", vmin=0, vmax=brightest, **extent)
+    axes[1].imshow(imaged.image[0], cmap="gray", vmin=0, vmax=brightest, **extent)
     drawn = axes[2].imshow(
         difference, cmap="RdBu_r", vmin=-largest, vmax=largest, **extent
     )

@@ -394,14 +394,14 @@ def of_gaze(content: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumbe
     Args:
         content: content of gaze.json, {folder: {"rows": rows of :func:`gaze_rows`}}.
     """
-    for entry in content.values():
-        rows = entry["rows"]
-        accurate = min(rows, key=lambda r: float(r["personal_deg"]))
-        return {
-            "table2/proposed_efficient": _gaze_number(rows[0]),
-            "table2/proposed_accurate": _gaze_number(accurate),
-        }
-    return {}
+    if not content:
+        return {}
+    rows = next(iter(content.values()))["rows"]
+    accurate = min(rows, key=lambda row: float(row["personal_deg"]))
+    return {
+        "table2/proposed_efficient": _gaze_number(rows[0]),
+        "table2/proposed_accurate": _gaze_number(accurate),
+    }
 
 
 def _gaze_number(row: Mapping[str, Any]) -> MeasuredNumber:

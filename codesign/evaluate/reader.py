@@ -229,7 +229,7 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
 
 
 def train_reader(
-    optics: Imager, seen: JudgingScenes, config: ReaderConfig
+    optics: Imager, scenes: JudgingScenes, config: ReaderConfig
 ) -> ReaderResult:
     """Train the reference reader on images of a lens and test it.
 
@@ -237,7 +237,7 @@ def train_reader(
 
     Args:
         optics: imager of the lens.
-        seen: scenes to train, calibrate and test on.
+        scenes: scenes to train, calibrate and test on.
         config: frames, sensor and light of the reader.
     """
     threads.keep_memory()
@@ -245,12 +245,12 @@ def train_reader(
     torch.manual_seed(config.seed)
     try:
         reader = ReferenceReader()
-        training = lens_frames(optics, seen.learn, config, config.frames)
+        training = lens_frames(optics, scenes.learn, config, config.frames)
         _train_depth(reader, training)
         _train_slip(reader, training)
         reader.eval()
-        calibration = lens_frames(optics, seen.calibrate, config, config.test)
-        test = lens_frames(optics, seen.judge, config, config.test)
+        calibration = lens_frames(optics, scenes.calibrate, config, config.test)
+        test = lens_frames(optics, scenes.judge, config, config.test)
         return _evaluate(
             reader, calibration, test, float(getattr(optics, "error", math.nan))
         )
@@ -418,11 +418,11 @@ def _evaluate(
     )
 
 
-def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
+def reader_table(results: dict[str, ReaderResult], config: ReaderConfig) -> Table:
     """Table with a row of errors for each lens.
 
     Args:
-        found: result by name of the lens.
+        results: result by name of the lens.
         config: frames, sensor and light of the reader.
     """
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
@@ -440,7 +440,7 @@ def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
         "image error",
     )
     rows = []
-    for name, result in found.items():
+    for name, result in results.items():
         values = result.values()
         axial = f"{values['axial_mm']:.2f} [{values['axial_low_mm']:.2f}, {values['axial_high_mm']:.2f}]"
         interval = f"±{values['interval_mm']:.2f} mm"

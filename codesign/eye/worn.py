@@ -289,7 +289,7 @@ def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
 
 
 def apply_augmentations(
-    made: RenderedFrames, worn: DrawnAugmentations
+    rendered: RenderedFrames, worn: DrawnAugmentations
 ) -> RenderedFrames:
     """Rendered frames with all causes that are painted on them.
 
@@ -299,17 +299,17 @@ def apply_augmentations(
     the visible share of the pupil follow.
 
     Args:
-        made: rendered frames. worn: augmentations of every frame.
+        rendered: rendered frames. worn: augmentations of every frame.
     """
     if not any(worn.size[name].any() for name in CAUSES if name not in BEFORE):
-        return made
+        return rendered
     light, cover, depth = (
-        getattr(made.frames, name).clone() for name in Frames.__slots__
+        getattr(rendered.frames, name).clone() for name in Frames.__slots__
     )
-    canvas = _Canvas(light, cover, depth, made.pupil.clone(), worn)
+    canvas = _Canvas(light, cover, depth, rendered.pupil.clone(), worn)
     _apply_make_up(canvas)
     _darken(canvas)
-    _add_glints(canvas, made.labels)
+    _add_glints(canvas, rendered.labels)
     _apply_uneven_light(canvas)
     _add_spectacles(canvas)
     _apply_motion_blur(canvas)
@@ -317,7 +317,7 @@ def apply_augmentations(
     return RenderedFrames(
         Frames(light, cover, depth),
         canvas.pupil,
-        _updated_labels(made.labels, made.pupil, canvas.pupil),
+        _updated_labels(rendered.labels, rendered.pupil, canvas.pupil),
     )
 
 

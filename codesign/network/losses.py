@@ -72,25 +72,25 @@ def depth_loss(predicted: Tensor, vergence: Tensor) -> Tensor:
     return (0.5 * error**2 * torch.exp(-2 * predicted[:, 1]) + predicted[:, 1]).mean()
 
 
-def uncertainty_loss(found: Prediction, truth: Tensor) -> Tensor:
+def uncertainty_loss(prediction: Prediction, truth: Tensor) -> Tensor:
     """Gaussian negative log likelihood e² / (2 σ²) + log σ with detached slippage
     errors e.
 
     It trains the uncertainty alone; 0 for a network without one.
 
     Args:
-        found: of the network. truth: (batch, 3) slippage in units of its scale.
+        prediction: of the network. truth: (batch, 3) slippage in units of its scale.
     """
-    if found.slip_log_sd is None:
-        return found.slip.new_zeros(())
-    error = (found.slip - truth).detach()
+    if prediction.slip_log_sd is None:
+        return prediction.slip.new_zeros(())
+    error = (prediction.slip - truth).detach()
     return (
-        0.5 * error**2 * torch.exp(-2 * found.slip_log_sd) + found.slip_log_sd
+        0.5 * error**2 * torch.exp(-2 * prediction.slip_log_sd) + prediction.slip_log_sd
     ).mean()
 
 
 def task_loss(
-    found: Prediction,
+    prediction: Prediction,
     mask: Tensor,
     slip_mm: Tensor,
     scale_mm: Tensor,
@@ -102,19 +102,19 @@ def task_loss(
     For a network without a mask L_seg is the loss of the pupil's centre.
 
     Args:
-        found: of the network. mask: (batch, y, x) coverage of the pupil.
+        prediction: of the network. mask: (batch, y, x) coverage of the pupil.
         slip_mm: (batch, 3) true slippage.
         scale_mm: (3,) unit of the network's slippage. slip_weight: of the slippage.
     """
-    if found.mask_logits.numel():
-        perception = segmentation_loss(found.mask_logits, mask)
+    if prediction.mask_logits.numel():
+        perception = segmentation_loss(prediction.mask_logits, mask)
     else:
-        perception = position_loss(found.centre, mask)
-    return perception + slip_weight * slip_loss(found.slip, slip_mm, scale_mm)
+        perception = position_loss(prediction.centre, mask)
+    return perception + slip_weight * slip_loss(prediction.slip, slip_mm, scale_mm)
 
 
 def depth_reading_loss(
-    found: Prediction,
+    prediction: Prediction,
     vergence: Tensor,
     slip_mm: Tensor,
     scale_mm: Tensor,
@@ -124,21 +124,21 @@ def depth_reading_loss(
     """lambda_depth L_depth plus the loss of the uncertainty, added to the task loss.
 
     Args:
-        found: of the network.
+        prediction: of the network.
         vergence: (batch, y, x) of the windows
             (:func:`codesign.network.blur.window_vergence`).
         slip_mm: (batch, 3) true slippage. scale_mm: (3,) unit of the network's
             slippage.
         depth_weight: of the depths of windows.
     """
-    depth_term = found.slip.new_zeros(())
-    if found.depth is not None:
-        depth_term = depth_weight * depth_loss(found.depth, vergence)
-    return depth_term + SPREAD_WEIGHT * uncertainty_loss(found, slip_mm / scale_mm)
+    depth_term = prediction.slip.new_zeros(())
+    if prediction.depth is not None:
+        depth_term = depth_weight * depth_loss(prediction.depth, vergence)
+    return depth_term + SPREAD_WEIGHT * uncertainty_loss(prediction, slip_mm / scale_mm)
 
 
 def pose_loss(
-    found: Prediction,
+    prediction: Prediction,
     axis: Tensor,
     points: Tensor,
     *,
@@ -150,22 +150,22 @@ def pose_loss(
     0 for a network without them.
 
     Args:
-        found: of the network. axis: (batch, 3) unit vectors.
+        prediction: of the network. axis: (batch, 3) unit vectors.
         points: (batch, points, 2) as a fraction of the image from its centre.
         axis_weight: of the optic axis. point_weight: of the landmarks.
     """
-    if found.points is None or found.axis is None:
-        return found.slip.new_zeros(())
+    if prediction.points is None or prediction.axis is None:
+        return prediction.slip.new_zeros(())
     inside = (points.abs() < 0.5).all(-1)
     point_error = F.smooth_l1_loss(
-        found.points / POINT_UNIT,
+        prediction.points / POINT_UNIT,
         points / POINT_UNIT,
         beta=POINT_KNEE,
         reduction="none",
     ).mean(-1)
     point_loss = (point_error * inside).sum() / inside.sum().clamp_min(1)
     axis_loss = F.smooth_l1_loss(
-        found.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=AXIS_KNEE
+        prediction.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=AXIS_KNEE
     )
     return axis_weight * axis_loss + point_weight * point_loss
 

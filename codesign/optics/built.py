@@ -275,23 +275,23 @@ class MadeLens:
         """The same settings and response for a lens of other diameters."""
         return MadeLens(lens, self.settings, response=self.response)
 
-    def plane(self, made: State, *, factor: Array | None = None) -> PillarCells:
+    def plane(self, state: State, *, factor: Array | None = None) -> PillarCells:
         """Lens plane of a process state, for rays of any direction.
 
         Args:
-            made: perturbations by the process.
+            state: perturbations by the process.
             factor: (y, x) complex, multiplies every pillar.
         """
-        return self._plane(made, self._gathered(made, factor=factor), factor)
+        return self._plane(state, self._gathered(state, factor=factor), factor)
 
-    def pillars(self, made: State, *, factor: Array | None = None) -> Tensor:
+    def pillars(self, state: State, *, factor: Array | None = None) -> Tensor:
         """(y, x) complex t of every pillar in a process state, 0 where there is none.
 
         Args:
-            made: perturbations by the process.
+            state: perturbations by the process.
             factor: (y, x) complex, multiplies every pillar.
         """
-        single = self._gathered(made, 1, factor=factor)
+        single = self._gathered(state, 1, factor=factor)
         return torch.from_numpy(single * self._carrier.conj())
 
     def _plane(

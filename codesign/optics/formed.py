@@ -97,16 +97,16 @@ def make_imager(
 
 @functools.lru_cache(maxsize=32)
 def _imager_of_made_lens(
-    settings: OpticsConfig, made: PixelPsfStack, grid: FrameGrid
+    settings: OpticsConfig, stack: PixelPsfStack, grid: FrameGrid
 ) -> Imager:
     """True image of a fabricated lens, cached for all who use the same lens."""
-    if made.plane is None:
+    if stack.plane is None:
         raise TrainingError(
             "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
             "use a run of optics.image = 'uniform' for it"
         )
     frame, margin, device = grid
-    return imager_through(settings, made.plane, frame, margin=margin, device=device)
+    return imager_through(settings, stack.plane, frame, margin=margin, device=device)
 
 
 @functools.lru_cache(maxsize=3)
@@ -301,16 +301,18 @@ def relative_image_difference(one: Imager, true: Imager) -> float:
     )
 
 
-def image_tolerance_problem(settings: OpticsConfig, found: Imager) -> str:
+def image_tolerance_problem(settings: OpticsConfig, imager_used: Imager) -> str:
     """Why the error of the true image is above ``optics.image_tolerance``.
 
     Empty where it is not, or the image is uniform, whose difference from the true one
     is reported instead.
 
     Args:
-        settings: of the lens and its image. found: what forms the images.
+        settings: of the lens and its image. imager_used: what forms the images.
     """
-    return "" if found.light.uniform else found.above(settings.image_tolerance)
+    return (
+        "" if imager_used.light.uniform else imager_used.above(settings.image_tolerance)
+    )
 
 
 def describe_image(

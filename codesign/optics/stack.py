@@ -488,16 +488,16 @@ def pillar_wave(settings: OpticsConfig, coefficients_rad: Tensor) -> PillarWave:
 
 
 def stack_imager(
-    settings: OpticsConfig, made: PixelPsfStack, frame: int, *, margin: int
+    settings: OpticsConfig, stack: PixelPsfStack, frame: int, *, margin: int
 ) -> Imager:
     """Shift-invariant imager of square frames of ``frame`` samples, margin included.
 
     Args:
-        settings: of the lens and its image. made: PSFs over depth.
+        settings: of the lens and its image. stack: PSFs over depth.
     """
     return uniform_imager(
-        made.intensity,
-        made.depths_um,
+        stack.intensity,
+        stack.depths_um,
         grid_of(settings, frame, margin),
         tolerance=settings.tolerance,
     )

@@ -265,14 +265,15 @@ def predict_frames(
     )
 
 
-def batched_frames(seen: SensorFrames) -> list[Tensor]:
+def batched_frames(frames: SensorFrames) -> list[Tensor]:
     """Frames a batch at a time.
 
     Args:
-        seen: frames of the sensor with their truth.
+        frames: frames of the sensor with their truth.
     """
     return [
-        seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)
+        frames.frames[i : i + frames.batch]
+        for i in range(0, len(frames.frames), frames.batch)
     ]
 
 
@@ -399,7 +400,7 @@ def gaze_error_deg(
     trainer: Trainer,
     architecture: Architecture,
     people: bench.PeopleFrames,
-    seen: SensorFrames,
+    frames: SensorFrames,
 ) -> float:
     """Mean gaze error, deg, after a personal calibration from the network's readings.
 
@@ -408,9 +409,9 @@ def gaze_error_deg(
     Args:
         trainer: with lens, sensor and network as they are.
         architecture: member of the search space.
-        people: people, their frames and gaze. seen: their frames on the sensor.
+        people: people, their frames and gaze. frames: their frames on the sensor.
     """
-    answers = predict_frames(trainer.model.net, architecture, seen, trainer.inner)
+    answers = predict_frames(trainer.model.net, architecture, frames, trainer.inner)
     read = bench.read_of(people, answers.centre, answers.slip_mm)
     return bench.calibrated_error_deg(people, read)
 

@@ -203,12 +203,12 @@ def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
 
 
 def _errors(
-    prefix: str, predictions: Predictions, seen: SensorFrames
+    prefix: str, predictions: Predictions, frames: SensorFrames
 ) -> dict[str, float | None]:
     """Mean axial and lateral slippage error in mm, and mask IoU; keys begin with
     ``prefix``.
     """
-    error = (predictions.slip_mm - seen.slip_mm).abs().mean(0)
+    error = (predictions.slip_mm - frames.slip_mm).abs().mean(0)
     iou = float(predictions.iou.mean())
     return {
         f"{prefix}axial_slip_mm": float(error[2]),
@@ -219,7 +219,7 @@ def _errors(
 
 
 def conformal_quantiles(
-    answers: Predictions, seen: SensorFrames, *, share: float = 0.9
+    answers: Predictions, frames: SensorFrames, *, share: float = 0.9
 ) -> float | None:
     """Split-conformal quantile of |axial error| / predicted standard deviation.
 
@@ -228,12 +228,12 @@ def conformal_quantiles(
     uncertainty.
 
     Args:
-        answers: predictions for ``seen``. seen: frames of the sensor with their labels,
-            that training, search and test never use. share: coverage of the interval.
+        answers: predictions for ``frames``. share: coverage of the interval.
+        frames: of the sensor with labels, that training, search and test never use.
     """
     if answers.slip_sd_mm is None:
         return None
-    ratio = (answers.slip_mm - seen.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
+    ratio = (answers.slip_mm - frames.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
     rank = min(math.ceil(share * (len(ratio) + 1)), len(ratio))
     return float(ratio.sort().values[rank - 1])
 
@@ -246,7 +246,7 @@ def _half_widths_mm(answers: Predictions, reach: float | None) -> Tensor | None:
 
 
 def uncertainty_summary(
-    name: str, answers: Predictions, seen: SensorFrames, reach: float | None
+    name: str, answers: Predictions, frames: SensorFrames, reach: float | None
 ) -> dict[str, float]:
     """Coverage and mean half width in mm of the 90 % intervals, and window depth error
     in mm.
@@ -255,18 +255,18 @@ def uncertainty_summary(
 
     Args:
         name: prefix of the keys. answers: of the network.
-        seen: frames of the sensor with their labels.
+        frames: frames of the sensor with their labels.
         reach: conformal quantile, in standard deviations.
     """
     row: dict[str, float] = {}
     if (half_width := _half_widths_mm(answers, reach)) is not None:
-        axial_error = (answers.slip_mm - seen.slip_mm)[:, 2].abs()
+        axial_error = (answers.slip_mm - frames.slip_mm)[:, 2].abs()
         row[f"{name}axial_coverage_90"] = float(
             (axial_error <= half_width).float().mean()
         )
         row[f"{name}axial_interval_mm"] = float(half_width.mean())
-    if answers.depth is not None and seen.vergence is not None:
-        error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(seen.vergence)
+    if answers.depth is not None and frames.vergence is not None:
+        error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(frames.vergence)
         row[f"{name}window_depth_mm"] = float(error.abs().mean())
     return row
 

@@ -155,7 +155,7 @@ def fisher_separability(
     return FisherSeparability(fisher, loss)
 
 
-def depth_information(made: PixelPsfStack) -> Tensor:
+def depth_information(stack: PixelPsfStack) -> Tensor:
     """(depths - 1,) Fisher information on depth between neighbouring depths, per mm².
 
     From the blur of a window of 1/f texture as wide as the PSFs, with noise of a
@@ -164,11 +164,11 @@ def depth_information(made: PixelPsfStack) -> Tensor:
     (:func:`metalens.fisher.texture_information`).
 
     Args:
-        made: PSFs over depth.
+        stack: PSFs over depth.
     """
-    psfs = made.intensity
+    psfs = stack.intensity
     spectrum = _texture(psfs.shape[-1]).to(psfs)
-    gaps = (made.depths_um[1:] - made.depths_um[:-1]).tolist()
+    gaps = (stack.depths_um[1:] - stack.depths_um[:-1]).tolist()
     pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
     information = [
         texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
@@ -178,7 +178,7 @@ def depth_information(made: PixelPsfStack) -> Tensor:
 
 
 def texture_depth_loss(
-    made: PixelPsfStack, settings: OpticsConfig, *, energy: float
+    stack: PixelPsfStack, settings: OpticsConfig, *, energy: float
 ) -> Tensor:
     """Mean of -log(information on depth + 0.05), plus a hinge on the encircled energy.
 
@@ -186,12 +186,12 @@ def texture_depth_loss(
     information of the PSF alone ranks lenses wrongly.
 
     Args:
-        made: PSFs over depth. settings: of the lens and its image.
+        stack: PSFs over depth. settings: of the lens and its image.
         energy: least encircled energy within two samples.
     """
-    information = depth_information(made)
+    information = depth_information(stack)
     share = encircled_energy(
-        made.intensity, settings.sample_um, radius_um=2 * settings.sample_um
+        stack.intensity, settings.sample_um, radius_um=2 * settings.sample_um
     )
     depth_loss = -torch.log(information + 0.05).mean()
     return depth_loss + 50 * torch.relu(energy - share).mean()

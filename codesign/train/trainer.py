@@ -349,7 +349,7 @@ class Trainer:
         optics: OpticsConfig,
         sensor: Sensor,
         scenes: SceneSource,
-        made: TrainedModel,
+        model: TrainedModel,
         *,
         architecture: Architecture | None = None,
         stacks: Sequence[PixelPsfStack] = (),
@@ -362,7 +362,7 @@ class Trainer:
         Args:
             inner: settings of the loop. optics: of the lens and its image.
             sensor: its pixels and noise. scenes: frames by step number.
-            made: network, lens and pitch to train.
+            model: network, lens and pitch to train.
             architecture: the only member that is trained; None trains sampled members.
             stacks: PSFs of a fabricated lens; every step draws one of them, and no
                 optics move.
@@ -379,7 +379,7 @@ class Trainer:
         self.optics = optics
         self.sensor = sensor
         self.scenes = scenes
-        self.model = made
+        self.model = model
         self.architecture = architecture
         self.light = StepImaging(
             optics,
@@ -389,16 +389,16 @@ class Trainer:
             seed=inner.seed,
             draw=self._lens_error,
         )
-        reading = _reading_layers(made.net)
-        others = [p for p in made.net.parameters() if all(p is not q for q in reading)]
+        reading = _reading_layers(model.net)
+        others = [p for p in model.net.parameters() if all(p is not q for q in reading)]
         self.groups: dict[str, tuple[LearningRateSchedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, others),
             "reading": (inner.weights, reading),
             "optics": (
                 inner.optics,
-                [made.coefficients_rad] if made.coefficients_rad.numel() else [],
+                [model.coefficients_rad] if model.coefficients_rad.numel() else [],
             ),
-            "pitch": (inner.pitch, [made.log_pitch]),
+            "pitch": (inner.pitch, [model.log_pitch]),
         }
         self.optimisers: dict[str, torch.optim.Optimizer] = {
             name: _soap(parameters)
@@ -414,7 +414,7 @@ class Trainer:
         self.bad_run = 0  # consecutive steps without a finite gradient
         # limit that the last step clamped the pitch to; None inside the range
         self.pitch_held_um: float | None = None
-        self._begins_um = float(made.pitch_um.detach())
+        self._begins_um = float(model.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
     def run(self, *, until: int | None = None) -> Iterator[LogRecord]:
@@ -772,23 +772,23 @@ def renderer_threads(device: torch.device) -> int:
     return max(1, min(8, usable_cores() // (2 * processes)))
 
 
-def device_of(wanted: Place) -> torch.device:
+def device_of(place: Place) -> torch.device:
     """Torch device of a ``--device`` choice; "auto" is the GPU where there is one.
 
     Under ``torchrun`` each process takes the GPU of its local number.
 
     Args:
-        wanted: "auto", "cpu" or "cuda".
+        place: "auto", "cpu" or "cuda".
 
     Raises:
         ConfigError: a GPU is requested where PyTorch finds none.
     """
     has_gpu = torch.cuda.is_available()
-    if wanted == "cuda" and not has_gpu:
+    if place == "cuda" and not has_gpu:
         raise ConfigError(
             "device 'cuda': PyTorch finds no GPU here; install a build of torch with CUDA, or give --device cpu"
         )
-    if wanted == "cpu" or not has_gpu:
+    if place == "cpu" or not has_gpu:
         return torch.device("cpu")
     return torch.device(
         "cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()

@@ -152,18 +152,18 @@ def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
 
 
 def step_and_repeat(
-    child: str, found: WaferDies, *, units_per_um: float
+    child: str, dies: WaferDies, *, units_per_um: float
 ) -> tuple[CellReference, ...]:
     """The dies as few arrays: runs of neighbours in a row, equal runs of rows together.
 
     Args:
         child: cell of the die.
-        found: dies that the wafer holds.
+        dies: dies that the wafer holds.
         units_per_um: database units in a micrometre.
     """
     spans: dict[int, list[tuple[int, int]]] = {}
-    order = np.lexsort((found.index[:, 0], found.index[:, 1]))
-    columns, rows = found.index[order].T.tolist()
+    order = np.lexsort((dies.index[:, 0], dies.index[:, 1]))
+    columns, rows = dies.index[order].T.tolist()
     for row, members in itertools.groupby(
         zip(rows, columns, strict=True), key=lambda pair: pair[0]
     ):
@@ -181,7 +181,7 @@ def step_and_repeat(
             (row_columns[start], row_columns[stop - 1] + 1)
             for start, stop in itertools.pairwise(breaks)
         ]
-    die_number = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
+    die_number = {(int(i), int(j)): n for n, (i, j) in enumerate(dies.index.tolist())}
     open_runs: dict[tuple[int, int], int] = {}
     blocks: list[tuple[tuple[int, int], int, int]] = []
     for row in range(min(spans), max(spans) + 2):
@@ -190,12 +190,12 @@ def step_and_repeat(
             (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - runs)
         ]
         open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
-    step = _steps(found, units_per_um)
+    step = _steps(dies, units_per_um)
     copies = []
     for (first, end), low, high in blocks:
         x, y = (
             round(v * units_per_um)
-            for v in found.place_um[die_number[first, low]].tolist()
+            for v in dies.place_um[die_number[first, low]].tolist()
         )
         copies.append(
             CellReference(
@@ -211,12 +211,12 @@ def step_and_repeat(
     return tuple(copies)
 
 
-def _steps(found: WaferDies, units_per_um: float) -> tuple[int, int]:
+def _steps(dies: WaferDies, units_per_um: float) -> tuple[int, int]:
     """From die to die in units, along x and y; 0 where there is one column or row."""
     steps = []
     for axis in (0, 1):
-        index = found.index[:, axis]
-        place = found.place_um[:, axis]
+        index = dies.index[:, axis]
+        place = dies.place_um[:, axis]
         low, high = int(index.argmin()), int(index.argmax())
         count = int(index[high] - index[low])
         steps.append(

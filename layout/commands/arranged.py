@@ -302,7 +302,7 @@ def _stepped(
     return joined.wafer_cell(work.record.name, die, steps, marks)
 
 
-def _write(work: FloorplanWork, made: MaskLibrary) -> None:
+def _write(work: FloorplanWork, library: MaskLibrary) -> None:
     """Write the mask files of the options, and read each back."""
     writers: dict[str, Callable[[MaskLibrary, Path], None]] = {}
     if work.options.writes_oasis:
@@ -312,10 +312,10 @@ def _write(work: FloorplanWork, made: MaskLibrary) -> None:
     for name, write in writers.items():
         path = work.folder / name
         with work.stages(f"write {name}"):
-            write(made, path)
+            write(library, path)
         with work.stages(f"read back {name}"):
             content = read_mask(path, make.MOST_READ, keep=make.KEPT)
-            differences = compare.mask_differences(made, content)
+            differences = compare.mask_differences(library, content)
         work.failures += [
             f"{name} does not read back as planned: {text}" for text in differences
         ]
@@ -323,20 +323,22 @@ def _write(work: FloorplanWork, made: MaskLibrary) -> None:
         work.written[name] = path.stat().st_size
 
 
-def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
+def _accompany(work: FloorplanWork, library: MaskLibrary) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
-    work.areas_um2 = made.areas_um2()
+    work.areas_um2 = library.areas_um2()
     fields = list(joined.place_fields(work.placed, work.splits))
     handover.write_fields(fields, work.folder / "fields.csv")
     work.notes += [
         f"{name}: copies that are turned by no quarter have no write fields"
         for name in joined.without_fields(work.placed, work.splits)
     ]
-    write_lyp(made, work.folder / "mask.lyp")
-    handover.write_dose_table(made, work.process, work.folder / "doses.csv")
+    write_lyp(library, work.folder / "mask.lyp")
+    handover.write_dose_table(library, work.process, work.folder / "doses.csv")
     limit = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
-    dose_count = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
+    dose_count = len(
+        {round(d, 6) for (n, _), d in library.doses.items() if n != aperture}
+    )
     if dose_count > limit:
         work.failures.append(
             f"{dose_count} doses on the mask, exposure.maximum_classes = {limit}"
@@ -344,8 +346,8 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
     texts = {
         "process.toml": config.dumps(work.process),
         "arrangement.toml": config.dumps(work.record),
-        "job.txt": "\n".join(_sheet(work, made, len(fields))) + "\n",
-        "layout.json": json.dumps(_values(work, made), indent=1) + "\n",
+        "job.txt": "\n".join(_sheet(work, library, len(fields))) + "\n",
+        "layout.json": json.dumps(_values(work, library), indent=1) + "\n",
     }
     if work.dies is not None:
         table = io.StringIO()
@@ -357,27 +359,27 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
         texts["dies.csv"] = table.getvalue()
     for name, text in texts.items():
         store.write_text(work.folder / name, text)
-    page.write_floorplan_page(work, made)
+    page.write_floorplan_page(work, library)
 
 
-def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
+def _values(work: FloorplanWork, library: MaskLibrary) -> dict[str, Any]:
     """Values of layout.json of an arrangement."""
     return {
         "ok": not work.failures,
         "failures": work.failures,
         "notes": work.notes,
         "unchecked": work.unchecked,
-        "charge_uC": handover.charge_uC(work.areas_um2, made.doses, work.process),
+        "charge_uC": handover.charge_uC(work.areas_um2, library.doses, work.process),
         "dies": 1 if work.dies is None else len(work.dies.index),
-        "cells": len(made.cells),
-        "doses": len(made.doses),
+        "cells": len(library.cells),
+        "doses": len(library.doses),
         "files": work.written,
         "lenses": work.lenses,
         "seconds": work.stages.seconds,
     }
 
 
-def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
+def _sheet(work: FloorplanWork, library: MaskLibrary, fields: int) -> list[str]:
     """Lines of the job sheet: parts, files, fields and doses.
 
     The job sheet of each lens is in its own folder.
@@ -385,7 +387,8 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
     process = work.process
     size = work.record.wafer
     lines = [
-        f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
+        f"JOB SHEET  mask {library.name}  process {process.name!r}  "
+        f"tone {process.tone}",
         work.verdict,
         *work.notes,
         "",
@@ -423,15 +426,15 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
     return [
         *lines,
         "",
-        *handover.charge_lines(handover.charge_uC(areas, made.doses, process)),
+        *handover.charge_lines(handover.charge_uC(areas, library.doses, process)),
         f"Write fields: {fields}{many}, part by part, in the order of fields.csv",
         "  they cover the pillars of the lenses alone",
         "",
-        *handover.dose_lines(areas, made.doses, made.layer_names, process),
+        *handover.dose_lines(areas, library.doses, library.layer_names, process),
     ]
 
 
-def _text(work: FloorplanWork, made: MaskLibrary) -> str:
+def _text(work: FloorplanWork, library: MaskLibrary) -> str:
     """Summary for a person: verdict, notes, files and time."""
     target = work.options.output
     lines = [] if work.failures and not work.unchecked else [work.verdict]
@@ -442,7 +445,7 @@ def _text(work: FloorplanWork, made: MaskLibrary) -> str:
     ]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
     lines.append(
-        f"  {dies}{len(made.cells):,} cells; {target / 'report.html'}; "
+        f"  {dies}{len(library.cells):,} cells; {target / 'report.html'}; "
         f"{sum(work.stages.seconds.values()):.1f} s"
     )
     return "\n".join(lines)

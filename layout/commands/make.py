@@ -149,7 +149,7 @@ def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> Lay
     mask = drawing.made
     with stages("write fields"):
         write_fields = fields.split_write_fields(
-            source.diameters, process, drawn=mask.cells
+            source.diameters, process, pillar_classes=mask.cells
         )
         plan = stages.rows.watched(with_fields(plan, write_fields, process))
     with stages("check"):

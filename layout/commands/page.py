@@ -24,16 +24,16 @@ from metalens.core.units import nm
 _LISTED = 50  # rows of a table
 
 
-def draw_pictures(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
+def draw_pictures(plan: MaskPlan, drc_report: DrcReport) -> dict[str, bytes]:
     """{file name: picture} of what will be written.
 
     Args:
         plan: of the die.
-        found: its design-rule check.
+        drc_report: its design-rule check.
     """
     windows = DxfWindow(0, 0, 8), pictures.edge_window(plan, 8)
     return {
-        "die.png": pictures.plot_die(plan, found),
+        "die.png": pictures.plot_die(plan, drc_report),
         "pillars.png": pictures.plot_pillars(plan, windows),
         "diameters.png": pictures.plot_diameters(plan),
     }
@@ -132,28 +132,31 @@ def _key_figures(job: LayoutJob) -> list[KeyFigure]:
     ]
 
 
-def _rules(found: DrcReport) -> Section:
+def _rules(drc_report: DrcReport) -> Section:
     """Section on the design rules: limits, counts, and the first violations."""
     items: list[Figure | Table] = [
         Table(
             ("rule", "limit", "violations"),
-            [[rule, found.limits[rule], n] for rule, n in found.counts.items()],
+            [
+                [rule, drc_report.limits[rule], n]
+                for rule, n in drc_report.counts.items()
+            ],
             "Checked on the drawn polygons, all pillars; limits in nm, corners in "
             "degrees, density as a share.",
         )
     ]
-    if found.worst:
+    if drc_report.worst:
         keys = ("rule", "layer", "cell", "count", "worst", "limit")
-        rows = [[entry[key] for key in keys] for entry in found.worst[:_LISTED]]
+        rows = [[entry[key] for key in keys] for entry in drc_report.worst[:_LISTED]]
         items.append(Table(keys, rows, "Violations by rule, layer and cell."))
         places = [
             [v.rule, "({:.0f}, {:.0f})".format(*v.centre), v.value, v.limit, v.text]
-            for v in found.violations[:_LISTED]
+            for v in drc_report.violations[:_LISTED]
         ]
         head = ("rule", "(x, y) / nm", "measured", "needed", "where")
         text = "The first violations; mask.lyrdb marks up to 500 of each rule."
         items.append(Table(head, places, text))
-    return Section("Design rules", found.summary + ".", items)
+    return Section("Design rules", drc_report.summary + ".", items)
 
 
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
@@ -316,12 +319,12 @@ def _files(
 # arrangements
 
 
-def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
+def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
     """Write report.html of an arrangement, die.png (and wafer.png).
 
     Args:
         work: of the command.
-        made: mask that was written.
+        library: mask that was written.
     """
     shots = {"die.png": pictures.plot_floorplan(work.placed, work.near)}
     notes = " ".join(f"{note}." for note in work.notes)
@@ -347,14 +350,14 @@ def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
         name: "DIFFERENT" if name in work.different else "as planned"
         for name in work.written
     }
-    charges = handover.charge_uC(work.areas_um2, made.doses, work.process)
+    charges = handover.charge_uC(work.areas_um2, library.doses, work.process)
     sections += [
         _checks(work),
         Section(
             "Dose",
             "One dose for each layer and datatype: doses.csv; write fields of the "
             "lenses: fields.csv.",
-            [_charge(charges), _dose_table(made, work.process)],
+            [_charge(charges), _dose_table(library, work.process)],
         ),
         _files(work.written, read_back, work.stages.seconds),
     ]
@@ -371,24 +374,24 @@ def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
     )
     report.write_report(
         work.folder / "report.html",
-        f"Mask {made.name}",
+        f"Mask {library.name}",
         sections,
         lead=lead,
         key_figures=[
             KeyFigure("parts", str(len(work.placed))),
             KeyFigure("dies", f"{dies:,}"),
-            KeyFigure("doses", str(len(made.doses))),
+            KeyFigure("doses", str(len(library.doses))),
             KeyFigure("what fails", str(len(work.failures)), not work.failures),
         ],
     )
 
 
-def _dose_table(made: MaskLibrary, process: Process) -> Table:
+def _dose_table(library: MaskLibrary, process: Process) -> Table:
     """Table of the dose of each layer and datatype."""
     base = process.exposure.base_uC_cm2
     rows = [
-        [*layer, f"{dose:.6f}", dose * base, made.layer_names.get(layer, "")]
-        for layer, dose in sorted(made.doses.items())
+        [*layer, f"{dose:.6f}", dose * base, library.layer_names.get(layer, "")]
+        for layer, dose in sorted(library.doses.items())
     ]
     return Table(("layer", "datatype", "relative dose", "µC/cm²", "name"), rows)
 

@@ -21,13 +21,13 @@ _COLOURS = ("#d1495b", "#355070", "#1f6feb", "#888", "#2a9d8f")
 _POINTS = 700  # of a picture, each way
 
 
-def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
+def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
     """Everything on the die as PNG; lattices as the share of the area that pillars
     cover, violations as crosses.
 
     Args:
         plan: of the die.
-        found: its design-rule check.
+        drc_report: its design-rule check.
     """
     figure, axes = report.make_figure(size=(7.2, 6.6))
     axes.grid(False)
@@ -51,8 +51,11 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
             interpolation="nearest",
         )
     reach = max(reach, _draw_figures(axes, plan, scale))
-    if found.violations:
-        x, y = np.array([violation.centre for violation in found.violations]).T * scale
+    if drc_report.violations:
+        x, y = (
+            np.array([violation.centre for violation in drc_report.violations]).T
+            * scale
+        )
         axes.plot(x, y, "x", color="red", ms=4, mew=1, label="violations")
     if axes.get_legend_handles_labels()[0]:
         place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.09)}
@@ -125,22 +128,22 @@ def plot_diameters(plan: MaskPlan) -> bytes:
     return report.figure_png(figure)
 
 
-def plot_verification(found: ExposureReport) -> bytes:
+def plot_verification(verification: ExposureReport) -> bytes:
     """Difference of resist and drawn diameters over the die, and its histogram, as PNG.
 
     Args:
-        found: of a written mask.
+        verification: of a written mask.
     """
     figure, (at_left, at_right) = report.make_figure(1, 2, size=(8.2, 3.6))
-    left, bottom, right, top = found.box_um
+    left, bottom, right, top = verification.box_um
     extent = (left, right, bottom, top)
     picture = at_left.imshow(
-        found.map_nm, origin="lower", extent=extent, cmap="coolwarm"
+        verification.map_nm, origin="lower", extent=extent, cmap="coolwarm"
     )
     at_left.grid(False)
     at_left.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
     figure.colorbar(picture, ax=at_left, label="resist - drawn / nm", shrink=0.8)
-    edges, pillars = found.histogram
+    edges, pillars = verification.histogram
     at_right.stairs(pillars, edges, fill=True)
     at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
     return report.figure_png(figure)

@@ -67,12 +67,12 @@ def check_plan(
     report = DrcReport.empty(plan.unit_nm, rules)
     _check_grid(plan, report)
     if plan.standing is not None:
-        _check_negative_frame(plan, rules, report)
+        _check_negative_frame(plan, report)
         plan = plan.standing
     for lattice in plan.lattices:
         counts = _check_density(plan, lattice, rules, report)
         _LatticeCheck(plan, lattice, rules, counts, report).run(foot_nm)
-    _check_figures(plan, rules, report)
+    _check_figures(plan, report)
     for zone, lattice in itertools.product(rules.exclusion, plan.lattices):
         _check_zone(plan, lattice, zone, report)
     _check_clearance(plan, rules, report)
@@ -635,7 +635,7 @@ def add_coverage(
 # figures, grid, zones
 
 
-def _check_figures(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
+def _check_figures(plan: MaskPlan, report: DrcReport) -> None:
     """Width and notch of marks, labels and apertures, merged by layer number."""
     polygons: dict[int, list[Array]] = {}
     for figure in plan.figures:
@@ -645,14 +645,10 @@ def _check_figures(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> Non
                     np.asarray(points, np.int64) for points in drawn
                 )
     for number, drawn_on_layer in polygons.items():
-        _check_merged(
-            drawn_on_layer, rules, {}, number, f"figures of layer {number}", report
-        )
+        _check_merged(drawn_on_layer, {}, number, f"figures of layer {number}", report)
 
 
-def _check_negative_frame(
-    plan: MaskPlan, rules: DesignRules, report: DrcReport
-) -> None:
+def _check_negative_frame(plan: MaskPlan, report: DrcReport) -> None:
     """Check the frame written around the lattices of a negative tone.
 
     Clear areas remain as structures: a width of the frame counts as a space, a notch of
@@ -672,7 +668,6 @@ def _check_negative_frame(
     rule_names = {"width": "space", "notch": "width"}
     _check_merged(
         drawn,
-        rules,
         rule_names,
         plan.classes[0].layer[0],
         "frame of the negative tone",
@@ -682,7 +677,6 @@ def _check_negative_frame(
 
 def _check_merged(
     polygons: list[Array],
-    rules: DesignRules,
     names: dict[str, str],
     layer: int,
     cell: str,
@@ -692,7 +686,6 @@ def _check_merged(
 
     Args:
         polygons: (n, 2) corners each, database units.
-        rules: design rules; the limits of the report apply.
         names: rule that a measured "width" or "notch" is reported as, if another.
         layer: number of the layer, for the report.
         cell: what the polygons are, for the report.

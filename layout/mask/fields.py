@@ -81,14 +81,17 @@ class FieldPlan:
 
 
 def split_write_fields(
-    diameters: DiameterMap, process: Process, *, drawn: DrawnClasses | None = None
+    diameters: DiameterMap,
+    process: Process,
+    *,
+    pillar_classes: DrawnClasses | None = None,
 ) -> FieldPlan:
     """Write fields for the pillars as they are drawn (bias taken off).
 
     Args:
         diameters: of the lens.
         process: bias, steps and write field.
-        drawn: the pillars of this map, quantised; None: quantised here.
+        pillar_classes: the pillars of this map, quantised; None: quantised here.
 
     Raises:
         ProcessError: a field smaller than the pitch; as
@@ -102,7 +105,11 @@ def split_write_fields(
         raise ProcessError(
             f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it"
         )
-    classes = quantise_diameters(diameters, process) if drawn is None else drawn
+    classes = (
+        quantise_diameters(diameters, process)
+        if pillar_classes is None
+        else pillar_classes
+    )
     occupied = _Seen.of(diameters, classes, settings.size_um)
     rows = _edges(settings, occupied.rows, field_rows)
     columns = _edges(settings, occupied.columns, field_columns)

@@ -76,7 +76,7 @@ def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
 
 
 def split_ranges(
-    point: PointExposure, drawn: DrawnKinds, number: Array, body: PillarArray
+    point: PointExposure, kinds: DrawnKinds, number: Array, body: PillarArray
 ) -> ScatterRanges:
     """Split the Gaussians of a point exposure by how far they reach among the pillars.
 
@@ -85,16 +85,16 @@ def split_ranges(
 
     Args:
         point: exposure of a beam.
-        drawn: kinds of pillars.
+        kinds: kinds of pillars.
         number: (entries,) pillars of each.
         body: the densest lattice.
     """
-    mass = number * drawn.area_um2
+    mass = number * kinds.area_um2
     total = float(mass.sum())
-    wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
+    wider = float((mass * kinds.wider_um2).sum() / total) if total else 0.0
     from_neighbours = np.array(
         [
-            _neighbour_exposure(drawn, number > 0, body.steps_um, width)
+            _neighbour_exposure(kinds, number > 0, body.steps_um, width)
             for width in point.widths_um
         ]
     )
@@ -115,27 +115,27 @@ def split_ranges(
 
 
 def _neighbour_exposure(
-    drawn: DrawnKinds, used: Array, steps_um: Array, width_um: float
+    kinds: DrawnKinds, used: Array, steps_um: Array, width_um: float
 ) -> float:
     """Mean exposure of the edges of a pillar by equal neighbours, at the largest.
 
     Args:
-        drawn: kinds of pillars.
+        kinds: kinds of pillars.
         used: (entries,) which occur.
         steps_um: (n, 2) positions of the neighbours.
         width_um: 1/e radius of one Gaussian of weight 1.
     """
     exposures = [0.0]
-    for entry in drawn.widest(used, steps_um) if used.any() else []:
-        positions = drawn.edge_points_um(entry)[:, None] - steps_um
+    for entry in kinds.widest(used, steps_um) if used.any() else []:
+        positions = kinds.edge_points_um(entry)[:, None] - steps_um
         exposures.append(
-            float(drawn.exposure_at(entry, positions, width_um).sum(1).mean())
+            float(kinds.exposure_at(entry, positions, width_um).sum(1).mean())
         )
     return max(exposures)
 
 
 def exposure_table(
-    drawn: DrawnKinds,
+    kinds: DrawnKinds,
     goal: Array,
     number: Array,
     *,
@@ -146,7 +146,7 @@ def exposure_table(
     """What each entry of a mask exposes at its own edge, and what is sought there.
 
     Args:
-        drawn: kinds of pillars.
+        kinds: kinds of pillars.
         goal: (entries,) edge exposure sought, over the threshold.
         number: (entries,) pillars of each.
         point: exposure of a beam.
@@ -160,19 +160,19 @@ def exposure_table(
     used = number > 0
     if not used.any():
         raise ProcessError("no pillar is drawn: there is nothing to expose")
-    area = np.where(used, drawn.area_um2, 0.0)
-    own_and_far, slope = drawn.edge_exposure(used, point)
+    area = np.where(used, kinds.area_um2, 0.0)
+    own_and_far, slope = kinds.edge_exposure(used, point)
     own = np.where(
         used, own_and_far - area * float(ranges.far.density(np.array(0.0))), 0.0
     )
     neighbours = area * _neighbour_bound(ranges.middle, body)
     if own[used].min() < _FAINT or (neighbours >= 0.9 * own)[used].any():
-        thin = 1e3 * float(drawn.diameter_um[used][own[used].argmin()])
+        thin = 1e3 * float(kinds.diameter_um[used][own[used].argmin()])
         raise ProcessError(
             f"a pillar of {thin:.0f} nm gives its own edge an exposure of {own[used].min():.3f} only, less than its "
             "neighbours do: the core of the point exposure (alpha_um) is too wide for these pillars"
         )
-    return ExposureTable(drawn, area, goal, own, slope, number)
+    return ExposureTable(kinds, area, goal, own, slope, number)
 
 
 def _neighbour_bound(middle: PointExposure, body: PillarArray) -> float:

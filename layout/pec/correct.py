@@ -576,20 +576,20 @@ def _touching(boxes: Array) -> Array:
 # the dosed plan
 
 
-def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
+def apply_dose_classes(doses: WantedDoses, ladder: DoseLadder) -> MaskPlan:
     """The plan with corrected doses: classes of diameter and dose, marks and labels in
     pieces of one dose each.
 
     Args:
-        wanted: doses of the plan.
+        doses: doses of the plan.
         ladder: of all that is written in one job.
     """
-    plan = wanted.plan
-    classes, lookup, names = _classes(wanted, ladder)
+    plan = doses.plan
+    classes, lookup, names = _classes(doses, ladder)
     lattices = tuple(
-        _redrawn(wanted, ladder, number, lookup) for number in range(len(plan.lattices))
+        _redrawn(doses, ladder, number, lookup) for number in range(len(plan.lattices))
     )
-    figures, mark_doses = _figures(wanted, ladder)
+    figures, mark_doses = _figures(doses, ladder)
     replaced = {pillar.layer for pillar in plan.classes} | {
         layer
         for figure in plan.figures
@@ -631,23 +631,23 @@ def layer_title(kind: str, level: float) -> str:
 
 
 def _classes(
-    wanted: WantedDoses, ladder: DoseLadder
+    doses: WantedDoses, ladder: DoseLadder
 ) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
     """Split each pillar class by the dose classes that its pillars need.
 
     Args:
-        wanted: doses of the plan.
+        doses: doses of the plan.
         ladder: of all that is written in one job.
 
     Returns:
         New classes of one outline and dose each, (old class, dose class) -> number of
         the new class, and names of their layers.
     """
-    plan = wanted.plan
+    plan = doses.plan
     occurs = np.zeros((len(plan.classes) + 1, NONE + 1), bool)
-    for number, lattice in enumerate(wanted.lattices):
+    for number, lattice in enumerate(doses.lattices):
         for first, block in lattice.blocks():
-            occurs[block, wanted.classes(number, first, block, ladder)] = True
+            occurs[block, doses.classes(number, first, block, ladder)] = True
     used = np.argwhere(occurs[:, :NONE])
     bases: dict[str, LayerNumber] = {}
     datatypes: dict[str, set[int]] = {}
@@ -672,41 +672,41 @@ def _classes(
 
 
 def _redrawn(
-    wanted: WantedDoses, ladder: DoseLadder, number: int, lookup: Array
+    doses: WantedDoses, ladder: DoseLadder, number: int, lookup: Array
 ) -> PillarArray:
     """A lattice with the numbers of the new classes, held on disk.
 
     Args:
-        wanted: doses of the plan.
+        doses: doses of the plan.
         ladder: of all that is written in one job.
         number: of the lattice.
         lookup: (old class, dose class) -> number of the new class.
     """
-    lattice = wanted.plan.lattices[number]
+    lattice = doses.plan.lattices[number]
 
     def blocks() -> Iterator[tuple[int, Array]]:
         for first, block in lattice.blocks():
-            yield first, lookup[block, wanted.classes(number, first, block, ladder)]
+            yield first, lookup[block, doses.classes(number, first, block, ladder)]
 
     sites = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
     return sites.within(lattice)
 
 
 def _figures(
-    wanted: WantedDoses, ladder: DoseLadder
+    wanted_doses: WantedDoses, ladder: DoseLadder
 ) -> tuple[tuple[FigureCell, ...], dict[LayerNumber, float]]:
     """Exposed figures in pieces, each piece on the datatype of its dose.
 
     Args:
-        wanted: doses of the plan.
+        wanted_doses: doses of the plan.
         ladder: of all that is written in one job.
 
     Returns:
         All figures of the plan, and the relative dose of each new layer.
     """
-    plan = wanted.plan
-    marks = wanted.marks
-    level = ladder.nearest(marks.doses(wanted.far))
+    plan = wanted_doses.plan
+    marks = wanted_doses.marks
+    level = ladder.nearest(marks.doses(wanted_doses.far))
     layer_numbers = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
     layer_of_piece = np.array(
         [

@@ -219,10 +219,10 @@ def _close(
     return total
 
 
-def _reach(drawn: DrawnKinds, edge: Array, width: float) -> float:
+def _reach(kinds: DrawnKinds, edge: Array, width: float) -> float:
     """Distance of two sites beyond which one pillar does not expose the other's edge.
 
     Six widths between the shapes, where a Gaussian is below exp(-36); um.
     """
-    widest = float(np.sqrt(drawn.wider_um2.max()))
+    widest = float(np.sqrt(kinds.wider_um2.max()))
     return float(np.hypot(*edge.T).max()) + widest + 6 * width

@@ -129,14 +129,14 @@ def exposure_at_edges(
     return total
 
 
-def points_across(found: EdgeSamples) -> tuple[Array, Array]:
+def points_across(samples: EdgeSamples) -> tuple[Array, Array]:
     """Points just outside and just inside the edges, ``ACROSS_UM`` from each other.
 
     Args:
-        found: samples on edges.
+        samples: samples on edges.
     """
-    step = ACROSS_UM / 2 * found.normal
-    return found.at_um + step, found.at_um - step
+    step = ACROSS_UM / 2 * samples.normal
+    return samples.at_um + step, samples.at_um - step
 
 
 def _near(at_um: Array, polygons: ExposedPolygons, reach: float) -> tuple[Array, Array]:

@@ -53,12 +53,12 @@ class FarFieldRequest:
     samples: int
 
 
-def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
+def far_field_request(options: Any, built_lens: lens.Lens) -> FarFieldRequest:
     """The request of the options of ``metalens psf --far-field``.
 
     Args:
         options: of the command line.
-        made: the lens, whose wavelength is the default.
+        built_lens: the lens, whose wavelength is the default.
 
     Raises:
         ConfigError: an option that says nothing of a far field, or more than one depth
@@ -71,7 +71,7 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
                 f"{field.name}: not for a far field, which takes {', '.join(TAKES[:5])}"
             )
     sources = options.sources_mm or (math.inf,)
-    waves = options.wavelengths_nm or (1e3 * made.wavelength_um,)
+    waves = options.wavelengths_nm or (1e3 * built_lens.wavelength_um,)
     along_x = options.angles_deg or (0.0,)
     along_y = options.angles_y_deg or (0.0,) * len(along_x)
     if len(sources) > 1 or len(waves) > 1 or len(along_x) != len(along_y):
@@ -97,27 +97,27 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
 
 
 def compute_far_fields(
-    made: lens.Lens, wanted: FarFieldRequest, console: Console
+    built_lens: lens.Lens, request: FarFieldRequest, console: Console
 ) -> list["FarField"]:
     """One far field for each direction of incidence.
 
     Of pillars of two sizes for the polarisation along x.
 
     Args:
-        made: the lens.
-        wanted: directions, source distance, wavelength and samples.
+        built_lens: the lens.
+        request: directions, source distance, wavelength and samples.
         console: of the command.
     """
     directions = console.track(
-        wanted.angles_deg, total=len(wanted.angles_deg), label="directions"
+        request.angles_deg, total=len(request.angles_deg), label="directions"
     )
     return [
         psf.far_field(
-            made,
+            built_lens,
             angle_rad=(math.radians(x), math.radians(y)),
-            source_um=1e3 * wanted.source_mm,
-            wavelength_um=1e-3 * wanted.wavelength_nm,
-            samples=wanted.samples,
+            source_um=1e3 * request.source_mm,
+            wavelength_um=1e-3 * request.wavelength_nm,
+            samples=request.samples,
         )
         for x, y in directions
     ]
@@ -125,8 +125,8 @@ def compute_far_fields(
 
 def save_far_fields(
     path: Path,
-    wanted: FarFieldRequest,
-    found: list["FarField"],
+    request: FarFieldRequest,
+    fields: list["FarField"],
     *,
     inputs: dict[str, str],
     page: bool,
@@ -135,52 +135,52 @@ def save_far_fields(
 
     Args:
         path: file to write.
-        wanted: the request, stored in the file.
-        found: far field of each direction.
+        request: the request, stored in the file.
+        fields: far field of each direction.
         inputs: SHA-256 of each input file.
         page: whether to write NAME.html.
     """
     beams = [
         (i, b.sine_x, b.sine_y, b.share)
-        for i, field in enumerate(found)
+        for i, field in enumerate(fields)
         for b in field.beams
     ]
     arrays = {
-        "share": np.stack([field.share for field in found]).astype(np.float32),
-        "sine": found[0].sines,
-        "rings": np.stack([field.rings for field in found]),
-        "angles_deg": np.array(wanted.angles_deg),
+        "share": np.stack([field.share for field in fields]).astype(np.float32),
+        "sine": fields[0].sines,
+        "rings": np.stack([field.rings for field in fields]),
+        "angles_deg": np.array(request.angles_deg),
         "beams": np.array(beams, float).reshape(-1, 4),
-        "beyond": np.array([field.beyond for field in found]),
-        "transmitted": np.array([field.transmitted for field in found]),
-        "error": np.array([field.error for field in found]),
+        "beyond": np.array([field.beyond for field in fields]),
+        "transmitted": np.array([field.transmitted for field in fields]),
+        "error": np.array([field.error for field in fields]),
     }
     about = {
-        "wavelength_um": 1e-3 * wanted.wavelength_nm,
-        "source_um": 1e3 * wanted.source_mm,
+        "wavelength_um": 1e-3 * request.wavelength_nm,
+        "source_um": 1e3 * request.source_mm,
     }
-    provenance = store.Provenance(config.dumps(wanted), inputs)
+    provenance = store.Provenance(config.dumps(request), inputs)
     store.save(
         path,
         "far-field",
         arrays,
-        attributes=about | {"beam_sine": found[0].beam_sine},
+        attributes=about | {"beam_sine": fields[0].beam_sine},
         provenance=provenance,
     )
-    image = far_field_picture(wanted, found)
+    image = far_field_picture(request, fields)
     store.write_bytes(path.with_name(f"{path.stem}_far.png"), image)
     if page:
-        _report(path.with_suffix(".html"), wanted, found, image)
+        _report(path.with_suffix(".html"), request, fields, image)
 
 
 def far_field_values(
-    wanted: FarFieldRequest, found: list["FarField"]
+    request: FarFieldRequest, far_fields: list["FarField"]
 ) -> dict[str, Any]:
     """Result of the command as a dictionary for JSON.
 
     Args:
-        wanted: the request.
-        found: far field of each direction.
+        request: the request.
+        far_fields: far field of each direction.
     """
     fields = [
         {
@@ -196,33 +196,33 @@ def far_field_values(
             ],
             "error": field.error,
         }
-        for (x, y), field in zip(wanted.angles_deg, found, strict=True)
+        for (x, y), field in zip(request.angles_deg, far_fields, strict=True)
     ]
     common = ("beam_sine", "beam_holds", "steepest")
-    return {name: getattr(found[0], name) for name in common} | {"fields": fields}
+    return {name: getattr(far_fields[0], name) for name in common} | {"fields": fields}
 
 
 def far_field_text(
-    target: Path, wanted: FarFieldRequest, found: list["FarField"]
+    target: Path, request: FarFieldRequest, fields: list["FarField"]
 ) -> str:
     """Result of the command in words: light that passes, cones and beams of each
     direction.
 
     Args:
         target: output file.
-        wanted: the request.
-        found: far field of each direction.
+        request: the request.
+        fields: far field of each direction.
     """
     source = (
         "plane waves"
-        if math.isinf(wanted.source_mm)
-        else f"a source at {wanted.source_mm:g} mm"
+        if math.isinf(request.source_mm)
+        else f"a source at {request.source_mm:g} mm"
     )
-    worst = max(field.error for field in found)
+    worst = max(field.error for field in fields)
     lines = [
-        f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {worst:.1g}"
+        f"{target}: far field of {source}, {request.wavelength_nm:g} nm, error {worst:.1g}"
     ]
-    for (x, y), field in zip(wanted.angles_deg, found, strict=True):
+    for (x, y), field in zip(request.angles_deg, fields, strict=True):
         cones = ((part, _cone(field, part)) for part in PARTS)
         shares = ", ".join(f"{p:.0%} within {a:.3g}" for p, a in cones if a is not None)
         lost = f", {field.beyond:.2g} does not leave into air"
@@ -236,7 +236,7 @@ def far_field_text(
             f"{b.sine_y:+.5f})"
             for b in field.beams
         ] or ["    no direction holds 1 % of it"]
-    return "\n".join([*lines, f"  {_beam_note(found[0])}"])
+    return "\n".join([*lines, f"  {_beam_note(fields[0])}"])
 
 
 def _beam_note(field: "FarField") -> str:
@@ -262,22 +262,22 @@ def _cone(field: "FarField", part: float) -> float | None:
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
-def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes:
+def far_field_picture(request: FarFieldRequest, fields: list["FarField"]) -> bytes:
     """PNG of the light over direction cosines (log scale), and within cones about the
     axis.
 
     Args:
-        wanted: the request.
-        found: far field of each direction.
+        request: the request.
+        fields: far field of each direction.
     """
     from matplotlib.colors import LogNorm
 
-    width = max(4.6, 3.6 * len(found))
+    width = max(4.6, 3.6 * len(fields))
     figure, panels = make_figure(
-        2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
+        2, len(fields), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
     )
     for column, ((x, y), field) in enumerate(
-        zip(wanted.angles_deg, found, strict=True)
+        zip(request.angles_deg, fields, strict=True)
     ):
         step = float(field.sines[1] - field.sines[0])
         edge = float(field.sines[-1]) + step / 2

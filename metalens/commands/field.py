@@ -244,7 +244,10 @@ def field_magnitude(field: Array) -> Array:
 
 
 def save_near_field(
-    path: Path, wanted: NearFieldRequest, found: list[NearField], inputs: dict[str, str]
+    path: Path,
+    request: NearFieldRequest,
+    fields: list[NearField],
+    inputs: dict[str, str],
 ) -> None:
     """Write the file of kind ``near-field``: E, H and index of both cuts and the maps.
 
@@ -252,46 +255,46 @@ def save_near_field(
 
     Args:
         path: file to write.
-        wanted: the request, stored in the file.
-        found: fields on the cuts xz and yz, and on the maps.
+        request: the request, stored in the file.
+        fields: fields on the cuts xz and yz, and on the maps.
         inputs: SHA-256 of each input file.
     """
-    xz, yz, xy = found
+    xz, yz, xy = fields
     arrays: dict[str, Array] = {
         "x_um": np.asarray(xz.grid.x_um),
         "y_um": np.asarray(yz.grid.y_um),
         "z_um": np.asarray(xz.grid.z_um),
     }
-    arrays["heights_um"] = np.array(wanted.heights_um)
+    arrays["heights_um"] = np.array(request.heights_um)
     for name, near, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
         for part, field in (("e", near.e), ("h", near.h), ("index", near.index)):
             squeezed = field if flat is None else field.squeeze(axis=flat)
             arrays[f"{name}/{part}"] = squeezed
     about: dict[str, store.Attribute] = {
-        "wavelength_um": wanted.wavelength_um,
-        "step_um": wanted.step_um,
+        "wavelength_um": request.wavelength_um,
+        "step_um": request.step_um,
     }
     about |= {
         f"error_{name}": near.error
-        for name, near in zip((*CUTS, "xy"), found, strict=True)
+        for name, near in zip((*CUTS, "xy"), fields, strict=True)
     }
-    provenance = store.Provenance(config.dumps(wanted), inputs)
+    provenance = store.Provenance(config.dumps(request), inputs)
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
 
 
-def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> bytes:
+def near_field_picture(request: NearFieldRequest, fields: list[NearField]) -> bytes:
     """PNG of |E| on both cuts (light goes upwards) and on the maps, with material
     edges.
 
     Args:
-        wanted: the request.
-        found: fields on the cuts xz and yz, and on the maps.
+        request: the request.
+        fields: fields on the cuts xz and yz, and on the maps.
     """
-    cuts = found[:2]
-    maps = found[2]
-    columns = max(2, len(wanted.heights_um))
+    cuts = fields[:2]
+    maps = fields[2]
+    columns = max(2, len(request.heights_um))
     figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
-    top = max(_largest(near) for near in found)
+    top = max(_largest(near) for near in fields)
     image = None
     for panel, near, name in zip(panels[0], cuts, CUTS, strict=False):
         across = np.asarray(near.grid.x_um if name == "xz" else near.grid.y_um)
@@ -301,7 +304,7 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
         panel.set(
             title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
         )
-    for i, height in enumerate(wanted.heights_um):
+    for i, height in enumerate(request.heights_um):
         x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
         image = _map(
             panels[1, i], x, y, field_magnitude(maps.e)[i], maps.index[i].real, top
@@ -310,7 +313,7 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
         panels[1, i].set(
             title=f"|E| at z = {height:.4g} µm", xlabel="x / µm", ylabel="y / µm"
         )
-    for panel in (*panels[0, 2:], *panels[1, len(wanted.heights_um) :]):
+    for panel in (*panels[0, 2:], *panels[1, len(request.heights_um) :]):
         panel.set_axis_off()
     figure.colorbar(image, ax=panels, label="|E| of the light that comes", shrink=0.6)
     return figure_png(figure)

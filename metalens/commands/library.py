@@ -475,23 +475,23 @@ def _run_two_sizes(options: Options, settings: CellFile) -> int:
     )
 
 
-def two_size_failures(made: axes.AxesLibrary) -> list[str]:
+def two_size_failures(pillars: axes.AxesLibrary) -> list[str]:
     """Reasons for exit status 1 of a library over two sizes, in words; empty where it
     serves.
 
     Args:
-        made: the library.
+        pillars: the library.
     """
     failures = []
-    share = float(made.usable.mean())
+    share = float(pillars.usable.mean())
     if share < LEAST_USABLE:
         failures.append(
-            f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {made.sweep.bar:g} "
-            f"(median {np.median(made.t_error):.2g}): allow a larger tolerance or take narrower ranges"
+            f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {pillars.sweep.bar:g} "
+            f"(median {np.median(pillars.t_error):.2g}): allow a larger tolerance or take narrower ranges"
         )
-    if made.missed:
+    if pillars.missed:
         failures.append(
-            f"{made.missed} of {len(made.held_out)} pairs held out lie above their error bar"
+            f"{pillars.missed} of {len(pillars.held_out)} pairs held out lie above their error bar"
         )
     return failures
 

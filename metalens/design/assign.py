@@ -243,7 +243,7 @@ def make(
 
 
 def assign_multi_wavelength(
-    wanted: Sequence[WavelengthTarget],
+    wavelength_targets: Sequence[WavelengthTarget],
     *,
     aperture_um: float,
     cell: Cell,
@@ -255,7 +255,7 @@ def assign_multi_wavelength(
     """Assign pillars of least squared error over several wavelengths.
 
     Args:
-        wanted: target at every wavelength, the design's own first.
+        wavelength_targets: target at every wavelength, the design's own first.
         aperture_um, cell, limits, profile, provenance: see :func:`make`.
         proxy: phase and |t| over the diameter at all wavelengths.
 
@@ -271,8 +271,8 @@ def assign_multi_wavelength(
         diameters lie within 1e-4 rad of the least sum for these pistons; the pistons
         are the best of 16 starts, another minimum may be lower.
     """
-    waves = [target.focus.wavelength_um for target in wanted]
-    weights = [target.weight for target in wanted]
+    waves = [target.focus.wavelength_um for target in wavelength_targets]
+    weights = [target.weight for target in wavelength_targets]
     if not waves or len(set(waves)) < len(waves):
         raise LensError(
             f"wavelengths {', '.join(f'{w:g}' for w in waves)} um: "
@@ -296,13 +296,15 @@ def assign_multi_wavelength(
         return [chosen], [_response(proxy, chosen, wave, span) for wave in waves]
 
     sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
-    phases = [target.phase for target in wanted]
+    phases = [target.phase for target in wavelength_targets]
     maps, channel_sums = _fill_sites(sites, phases, choose_sizes, table=table)
-    first = wanted[0].focus
+    first = wavelength_targets[0].focus
     lens = _make_lens(sites.map(maps[0]), cell, proxy, first, profile, provenance)
     return lens, tuple(
         sums.quality(target.focus, sites, cell, _coverage(proxy, wave, span))
-        for sums, target, wave in zip(channel_sums, wanted, waves, strict=True)
+        for sums, target, wave in zip(
+            channel_sums, wavelength_targets, waves, strict=True
+        )
     )
 
 

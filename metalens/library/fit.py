@@ -151,7 +151,10 @@ class MonotonicBranch:
 
 
 def longest_monotonic_branch(
-    library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool = False
+    library: PillarLibrary,
+    tolerances: ProxyTolerances,
+    *,
+    across_resonances: bool = False,
 ) -> MonotonicBranch:
     """The run of diameters that covers most phase without a fault.
 
@@ -162,30 +165,30 @@ def longest_monotonic_branch(
 
     Args:
         library: the swept cell.
-        wanted: limits of the run.
+        tolerances: limits of the run.
         across_resonances: the run may cross narrow resonances. Entries closer to one
             than ``least_half_width_um`` or two half-widths are then left out.
 
     Raises:
         DomainError: no such run holds 12 entries; the message states the faults.
     """
-    low, high = wanted.within_um or (0.0, np.inf)
+    low, high = tolerances.within_um or (0.0, np.inf)
     d = library.diameter_um
     inside = (d >= low - 1e-9) & (d <= high + 1e-9)
     narrow = [
         (angle, wavelength, centre, width)
         for _, angle, wavelength, centre, width in library.resonances.tolist()
-        if width < wanted.least_half_width_um
+        if width < tolerances.least_half_width_um
         and inside.any()
         and d[inside][0] <= centre <= d[inside][-1]
     ]
-    gaps = _gaps(narrow, wanted.least_half_width_um) if across_resonances else ()
+    gaps = _gaps(narrow, tolerances.least_half_width_um) if across_resonances else ()
     for start, end in gaps:
         inside &= (d < start) | (d > end)
     d = d[inside]
     t = library.t[..., inside]
     bars = library.t_error[..., inside]
-    faults = _faults(library, d, t, bars, wanted.least_transmission)
+    faults = _faults(library, d, t, bars, tolerances.least_transmission)
     faults += [] if gaps else [_near_resonance(d, *resonance) for resonance in narrow]
     faulty = np.any([mask for mask, _ in faults], axis=0)
     runs = [run for run in find_runs(~faulty) if run.stop - run.start >= LEAST_ENTRIES]
@@ -316,7 +319,7 @@ def _unwrapped(phase: Array) -> Array:
     return phase
 
 
-def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
+def fit(library: PillarLibrary, tolerances: ProxyTolerances | None = None) -> ProxyFit:
     """Polynomial proxy of a library, by minimax fits of phase and |T| in
     diameter^power.
 
@@ -326,18 +329,18 @@ def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyF
     the tolerances, ``shortfall`` says so.
 
     Args:
-        wanted: tolerances and limits of the fit.
+        tolerances: tolerances and limits of the fit.
 
     Raises:
         DomainError: no run of diameters without resonance holds enough entries.
     """
-    wanted = wanted or ProxyTolerances()
+    tolerances = tolerances or ProxyTolerances()
     if library.sweep.light == "circular":
-        return _fit_converted(library, wanted)
-    one_side = _fit_branch(library, wanted, across_resonances=False)
-    if any(width < wanted.least_half_width_um for *_, width in library.resonances):
+        return _fit_converted(library, tolerances)
+    one_side = _fit_branch(library, tolerances, across_resonances=False)
+    if any(width < tolerances.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
-            crossing = _fit_branch(library, wanted, across_resonances=True)
+            crossing = _fit_branch(library, tolerances, across_resonances=True)
             crosses = bool(crossing.proxy.gaps_um) and not crossing.shortfall
             if crosses and crossing.turns > one_side.turns:
                 return crossing
@@ -455,14 +458,16 @@ def _cut_last_diameters(
     return None
 
 
-def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> Proxy:
+def fit_proxy(
+    library: PillarLibrary, tolerances: ProxyTolerances | None = None
+) -> Proxy:
     """The proxy of a library alone; :func:`fit` gives its table of error against
     coefficients too.
 
     Args:
-        wanted: tolerances and limits of the fit.
+        tolerances: tolerances and limits of the fit.
     """
-    return fit(library, wanted).proxy
+    return fit(library, tolerances).proxy
 
 
 def proxy_of(library: PillarLibrary) -> Proxy:
@@ -507,16 +512,16 @@ def _longest_domain(
     return branch.part(slice(fitted)), best
 
 
-def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
+def tolerance_shortfall(proxy: Proxy, tolerances: ProxyTolerances) -> str:
     """Message on how far a proxy misses its tolerances; empty where it meets them.
 
     Args:
         proxy: phase and |T| over the diameter.
-        wanted: tolerances and limits of the fit.
+        tolerances: tolerances and limits of the fit.
     """
-    if tolerance_ratio(proxy, wanted) <= 1:
+    if tolerance_ratio(proxy, tolerances) <= 1:
         return ""
-    phase, level = wanted.tolerances
+    phase, level = tolerances.tolerances
     return (
         f"the proxy follows the phase within {proxy.max_phase_error_rad:.3g} rad and |T| within "
         f"{proxy.max_transmission_error:.3g}, where {phase:.3g} and {level:.3g} are wanted: sweep with more samples, "
@@ -524,14 +529,14 @@ def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
     )
 
 
-def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
+def tolerance_ratio(proxy: Proxy, tolerances: ProxyTolerances) -> float:
     """The larger of phase error and |T| error, each over its tolerance.
 
     Args:
         proxy: phase and |T| over the diameter.
-        wanted: tolerances and limits of the fit.
+        tolerances: tolerances and limits of the fit.
     """
-    phase, level = wanted.tolerances
+    phase, level = tolerances.tolerances
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 

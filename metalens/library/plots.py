@@ -92,7 +92,7 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
 
 
 def library_figure(
-    path: Path, library: "PillarLibrary", made: "ProxyFit | None"
+    path: Path, library: "PillarLibrary", proxy_fit: "ProxyFit | None"
 ) -> None:
     """PNG of a library over the diameter: phase, |t|, error bars with the tolerance,
     and the residuals of the proxy.
@@ -100,7 +100,7 @@ def library_figure(
     Args:
         path: of the PNG.
         library: the swept cell.
-        made: the fit of its proxy; None where there is none.
+        proxy_fit: the fit of its proxy; None where there is none.
     """
     figure = Figure(figsize=(7.5, 8.5), layout="constrained", dpi=110)
     phase, level, bars, residual_panel = figure.subplots(
@@ -134,11 +134,11 @@ def library_figure(
     phase.set_title(
         f"pitch {NM * cell.pitch_um:g} nm, height {NM * cell.height_um:g} nm, engine {library.engine}"
     )
-    if made is not None:
-        _residuals(residual_panel, library, made)
+    if proxy_fit is not None:
+        _residuals(residual_panel, library, proxy_fit)
         for panel in (phase, level):
             panel.axvspan(
-                *(NM * v for v in made.proxy.domain_um), color="0.92", zorder=0
+                *(NM * v for v in proxy_fit.proxy.domain_um), color="0.92", zorder=0
             )
     residual_panel.set(xlabel="diameter (nm)", ylabel="proxy - library")
     _write(figure, path)

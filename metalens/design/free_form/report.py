@@ -50,7 +50,7 @@ class JudgedLens:
 
 
 def judge_designs(
-    made: FisherPhase, pupil: Pupil, settings: ResolvedFisherSettings
+    profile: FisherPhase, pupil: Pupil, settings: ResolvedFisherSettings
 ) -> tuple[JudgedLens, ...]:
     """Figures of the design and of the best hyperbolic lens and double helix.
 
@@ -58,13 +58,13 @@ def judge_designs(
     the pixels.
 
     Args:
-        made: the designed phase.
+        profile: the designed phase.
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
     """
-    phase = phase_on(pupil, made)
-    score = _score(phase, made.focus_um, pupil, settings)
-    own = JudgedLens("free form", phase, made.focus_um, score, made.zones)
+    phase = phase_on(pupil, profile)
+    score = _score(phase, profile.focus_um, pupil, settings)
+    own = JudgedLens("free form", phase, profile.focus_um, score, profile.zones)
     simple = tune_baselines(pupil, settings)
     return own, *(replace(lens, name=f"{lens.name}, tuned") for lens in simple)
 

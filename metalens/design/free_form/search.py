@@ -396,14 +396,14 @@ def optimize_free_form(
     return replace(best, starts=tuple(figures))
 
 
-def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
+def phase_on(pupil: Pupil, profile: FisherPhase) -> Tensor:
     """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus.
 
     Args:
-        made: what was designed or computed.
+        profile: what was designed or computed.
     """
-    return _Phase(pupil, 0 if made.cells else len(made.controls), made.zones)(
-        made.controls
+    return _Phase(pupil, 0 if profile.cells else len(profile.controls), profile.zones)(
+        profile.controls
     )
 
 
