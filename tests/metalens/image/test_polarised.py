@@ -2,6 +2,7 @@
 many components are imaged.
 """
 
+import itertools
 import math
 import sys
 from dataclasses import replace
@@ -213,14 +214,16 @@ def test_a_pixel_counts_flux_and_an_image_says_what_one_scalar_misses_of_it():
     )
     field = math.atan(MIDDLE[0] / DISTANCE), math.atan(MIDDLE[1] / DISTANCE)
     images = {}
-    for polarisation, want in (("auto", flux), ("flux", flux), ("vector", energy)):
+    wanted = {"auto": flux, "flux": flux, "vector": energy}.items()
+    for tolerance, (polarisation, want) in itertools.product((1e-2, 5e-3), wanted):
         made = imager(
-            LENS, GRID, tolerance=5e-3, field=field, polarisation=polarisation
+            LENS, GRID, tolerance=tolerance, field=field, polarisation=polarisation
         )
         images[polarisation] = got = made(Frames(seen, cover, far))[0].numpy()
         assert np.linalg.norm(got - want) / np.linalg.norm(want) < 2.5 * made.error
         assert (made.plan.window.components > 0) == (polarisation != "auto")
-        assert made.parts["polarisation"] < 2e-3  # of the scalar at NA 0.38 too
+        if tolerance < 1e-2:
+            assert made.parts["polarisation"] < 2e-3  # of the scalar at NA 0.38 too
     apart = (
         energy - flux
     )  # 1e-2 of the image: what a choice of one for the other would miss
