@@ -4,5 +4,3 @@ from metalens.cell.materials import NAMES as NAMES
 from metalens.cell.materials import Material as Material
 from metalens.cell.materials import find_material as find_material
 from metalens.cell.materials import index as index
-from metalens.cell.materials import index_dispersion as index_dispersion
-from metalens.cell.materials import read_csv as read_csv

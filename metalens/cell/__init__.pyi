@@ -6,7 +6,6 @@ from .light import Polarization as Polarization
 from .light import check_direction as check_direction
 from .light import check_tolerance as check_tolerance
 from .materials import index as index
-from .materials import index_dispersion as index_dispersion
 from .orders import DiffractionOrder as DiffractionOrder
 from .orders import check_subwavelength as check_subwavelength
 from .orders import describe_order_loss as describe_order_loss
