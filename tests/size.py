@@ -6,6 +6,7 @@ the limits that stand there; a limit never rises.
 
 import ast
 import collections
+import functools
 import io
 import json
 import re
@@ -47,6 +48,14 @@ def count_tokens(text: str, tree: ast.Module) -> int:
     return sum(t.type not in NOT_CODE and t.start[0] not in skipped for t in tokens)
 
 
+@functools.cache
+def parse_module(path: Path) -> tuple[str, ast.Module, int]:
+    """(text, syntax tree, number of tokens) of a file."""
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    return text, tree, count_tokens(text, tree)
+
+
 def holds_number(node: ast.stmt) -> bool:
     """Whether a statement assigns a value that contains a number."""
     if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
@@ -76,10 +85,9 @@ def measure(folders: tuple[str, ...]) -> dict[str, float]:
     words, public, parameters, missing = 0, 0, 0, 0
     paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     for path in paths:
-        text = path.read_text(encoding="utf-8")
-        tree = ast.parse(text)
+        text, tree, tokens = parse_module(path)
         words += len((ast.get_docstring(tree) or "").split())
-        figures["tokens"] += count_tokens(text, tree)
+        figures["tokens"] += tokens
         figures["lines"] += text.count("\n")
         figures["long_lines"] += sum(len(ln) > COLUMNS for ln in text.splitlines())
         figures["numbers"] += sum(holds_number(node) for node in tree.body)
@@ -113,7 +121,8 @@ def measured() -> dict[str, dict[str, float]]:
     sizes = ("tokens", "lines", "long_lines")
     found = {name: measure((name,)) for name in LIBRARY} | {"library": measure(LIBRARY)}
     for name in ("tests", "benchmarks"):
-        found[name] = {key: measure((name,))[key] for key in sizes}
+        figures = measure((name,))
+        found[name] = {key: figures[key] for key in sizes}
     return found
 
 

@@ -61,7 +61,7 @@ def test_a_byte_order_mark_before_settings_changes_nothing(place):
     assert (place / "new.h5").stat().st_size == (place / "lens.h5").stat().st_size
 
 
-@pytest.mark.parametrize("verb", ["psf", "layout", "capture"])
+@pytest.mark.parametrize("verb", ["psf", "capture"])
 def test_a_name_in_no_encoding_is_a_name(place, verb):
     (place / "lens.h5").rename(place / f"{ODD}.h5")
     words = [f"{ODD}.h5" if word == "lens.h5" else word for word in SETTINGS[verb]]

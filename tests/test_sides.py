@@ -96,12 +96,7 @@ def anew(lens, width=0.0, length=0.0, turn_deg=0.0, bias=0.0):
     return out
 
 
-CHANGES = [
-    {"width_nm": 6.0},
-    {"length_nm": -7.0},
-    {"bias_nm": 8.0},
-    {"width_nm": -5.0, "length_nm": 5.0, "bias_nm": 4.0},
-]
+CHANGES = [{"bias_nm": 8.0}, {"width_nm": -5.0, "length_nm": 5.0, "bias_nm": 4.0}]
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -137,6 +132,7 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
     assert np.abs(anew(lens, turn_deg=1.5) - anew(lens)).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
     found = tolerance.analyse_tolerance(
         lens, Process(spread=Spread.only(width_nm=4.0)), depths_um=(90.0,), draws=10
@@ -156,8 +152,8 @@ def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
     )  # the second order, and derivatives of 6 and 8 harmonics
 
 
-def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens):
-    ready = MadeLens(lens, OpticsConfig())
+def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens, response):
+    ready = MadeLens(lens, OpticsConfig(), response=response)
     base = ready.pillars(State.of())[lens.diameters.diameter_um > 0].numpy()
     phases = [
         scatter_rad(

@@ -85,7 +85,7 @@ def test_a_killed_command_leaves_all_or_nothing(place, rng, verb):
     assert end(begin(*words, "-o", output)) == 0
     takes = time.monotonic() - before
     assert whole(output, read)
-    for _ in range(3):
+    for _ in range(2):
         child = begin(*words, "-o", output, "--force")
         time.sleep(rng.uniform(0, takes))
         os.kill(child, signal.SIGKILL)

@@ -122,6 +122,7 @@ def test_few_functions_hold_every_change(response):
         )
 
 
+@pytest.mark.slow
 def test_a_proxy_of_something_else_is_believed():
     """Twice the phase of this cell: a measured library, say. The solver is not put in
     its place.

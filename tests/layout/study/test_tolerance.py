@@ -240,9 +240,9 @@ def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, sha
     film = Cell(0.3, pillar="air", substrate="air", shape=shape, lattice=lattice)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
     lens = dataclasses.replace(hyperbolic(), cell=film, proxy=narrow)
-    found = compute_sensitivities(lens, count=5)
-    assert found.rates[0] == pytest.approx(np.full(5, 2j * np.pi / 0.85), abs=1e-6)
-    assert found.rates[2] == pytest.approx(np.zeros(5), abs=1e-6)
+    found = compute_sensitivities(lens, count=2)
+    assert found.rates[0] == pytest.approx(np.full(2, 2j * np.pi / 0.85), abs=1e-6)
+    assert found.rates[2] == pytest.approx(np.zeros(2), abs=1e-6)
     # an index change counts by the area of the pillar, to first order in the contrast
     # (and no coupling)
     filled = share * found.diameter_um**2 / 0.3**2

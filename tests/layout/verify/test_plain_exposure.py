@@ -95,7 +95,7 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
         (0.008, 3.7, 0.9, 0.11),
         pytest.param(0.025, 4.3, 0.6, 0.11, marks=pytest.mark.slow),
         pytest.param(0.041, 3.1, 0.8, 0.11, marks=pytest.mark.slow),
-        (0.06, 2.9, 0.7, 0.25),
+        pytest.param(0.06, 2.9, 0.7, 0.25, marks=pytest.mark.slow),
     ],
 )
 def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
