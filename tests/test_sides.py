@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
+from characterize import next_mask
 from characterize.model import made, parameter_vector, pillar_slopes, process_state_of
-from codesign.adapt import correction
 from codesign.evaluate.error_budget import BudgetInputs, ErrorBudget, scatter_rad
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
@@ -213,7 +213,7 @@ def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(
     proposed, solved anew, they answer
     as designed up to a piston."""
     x = parameter_vector({"width_nm": -10.0, "length_nm": 12.0, "bias_nm": 5.0})
-    plan = correction.propose_correction(lens, x, response=response, old=Bias())
+    plan = next_mask.propose_correction(lens, x, response=response, old=Bias())
     off = []
     for designed in SIZES.tolist():
         drawn = float(np.interp(designed, plan.designed_um, plan.drawn_nm)) * 1e-3

@@ -10,6 +10,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from characterize import next_mask
 from characterize.bench import HiddenLens
 from characterize.captures import capture as captures
 from characterize.commands import report
@@ -21,6 +22,9 @@ from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
+
+# endings of the files of a correction
+NEXT_MASK = ("_bias.csv", "_bias.toml", "_lens_corrected.h5")
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,10 @@ def run(options: Options) -> int:
         raise ConfigError(
             "--truth is of a virtual bench of a metalens: it goes with --design, not with --pupil"
         )
+    if options.pupil is not None and options.next_mask:
+        raise ConfigError("--next-mask goes with --design, not with --pupil")
+    if options.process is not None and not options.next_mask:
+        raise ConfigError("--process is of the present mask: give --next-mask too")
     if options.pupil is not None:
         return _run_pupil(options, options.pupil, target)
     return _run_lens(options, options.design or Path(), target)
@@ -80,18 +88,36 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     )
     truth = config.load(options.truth, HiddenLens) if options.truth else None
     true_values = {k.name: k.value for k in truth.parameter} if truth else None
+    present_bias = next_mask.present_bias(options.process)
     provenance = _provenance(options, design)
     with options.claim(
-        target, companions=report.BESIDE, room=transaction.ROOM + capture.frames.nbytes
+        target,
+        companions=report.BESIDE + (NEXT_MASK if options.next_mask else ()),
+        room=transaction.ROOM + capture.frames.nbytes,
     ) as draft:
         result = dataclasses.replace(fit(capture, lens, choice), provenance=provenance)
         asbuilt.save(draft.path, result)
         report.asbuilt_report(
             draft.path.with_suffix(".html"), result, truth=true_values
         )
-    return options.console.judged(
-        _lens_values(result), _lens_text(result, target), result.problems
-    )
+        mask = None
+        if options.next_mask:
+            mask = next_mask.plan_next_mask(result, old=present_bias)
+            if not mask.refused:
+                next_mask.write_correction(
+                    draft.path.parent,
+                    mask.plan,
+                    evened=not mask.uneven,
+                    prefix=f"{draft.path.stem}_",
+                )
+    values, text = _lens_values(result), _lens_text(result, target)
+    if mask is None:
+        return options.console.judged(values, text, result.problems)
+    strehl = {step.name: step.strehl for step in mask.steps}
+    values["next_mask"] = {"summary": mask.summary, "strehl": strehl}
+    if not mask.refused:
+        text = f"{text}\n  next mask: {mask.summary}"
+    return options.console.judged(values, text, [*result.problems, mask.refused])
 
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:

@@ -29,6 +29,11 @@ class Options(CommonOptions):
             wavelength_um, pixel_um, step_um ...).
         truth: TOML of a virtual bench (that of ``capture --truth``): its hidden values
             are drawn in the report.
+        next_mask: write the correction of the next mask too: bias.toml, bias.csv and
+            lens_corrected.h5, each after the name of the output; exit 1 where the
+            posterior is too wide or the predicted gain is negative.
+        process: PROCESS.toml of the present mask, whose bias the correction starts
+            from.
         insist: write a result that fails its checks too (exit 1, problems listed).
         output: file to write; a report lies beside it as .html.
     """
@@ -39,4 +44,6 @@ class Options(CommonOptions):
     metrology: Path | None = None
     pupil: Path | None = None
     truth: Path | None = None
+    next_mask: bool = False
+    process: Path | None = None
     insist: bool = False

@@ -1,4 +1,3 @@
-from . import correction as correction
 from . import report as report
 from . import retrained as retrained
 from . import source as source

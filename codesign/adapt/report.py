@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt.correction import LensProposal, MaskCorrection, table_rows
+from characterize.next_mask import MaskCorrection, NextMask, PredictedLens, table_rows
 from codesign.adapt.train import LensPsfs, RetrainingOutcome
 from metalens.core import report
 from metalens.core.report import Figure, KeyFigure, Section, Table
@@ -30,19 +30,15 @@ class RetrainingResults:
     apart: PSF errors of the fitted lens and of the judging lens, relative to the
     nominal one. curves: {job: (step, loss)}. proposals: states of the next lens with
     their PSF and slippage errors, mm. cautions: in words.
-    refused: why the correction is not written; uneven: why the map is not; empty where
-    they are.
     """
 
     outcome: RetrainingOutcome
     lenses: LensPsfs
     apart: tuple[float, float]
     curves: dict[str, tuple[list[int], list[float]]]
-    plan: MaskCorrection
-    proposals: Sequence[tuple[LensProposal, float, float]]
+    mask: NextMask
+    proposals: Sequence[tuple[PredictedLens, float, float]]
     cautions: Sequence[str] = field(default_factory=tuple)
-    refused: str = ""
-    uneven: str = ""
 
 
 def write_retraining_page(path: Path, story: RetrainingResults) -> None:
@@ -256,8 +252,8 @@ def _mask_section(story: RetrainingResults) -> Section:
     note = "bias.toml holds the new table for PROCESS.toml."
     table = Table(
         columns,
-        table_rows(story.plan),
-        "Written to no file: see above." if story.refused else note,
+        table_rows(story.mask.plan),
+        "Written to no file: see above." if story.mask.refused else note,
     )
     text = (
         "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
@@ -265,16 +261,16 @@ def _mask_section(story: RetrainingResults) -> Section:
         "varies over the lens; draw it with the new table. The spacer is no matter of the mask: the last row sets it "
         "right as well."
     )
-    if story.uneven and not story.refused:
-        text += f"\n\nNo lens_corrected.h5 is written: {story.uneven}."
-    if story.refused:
-        text = f"{story.refused[0].upper()}{story.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
+    if story.mask.uneven and not story.mask.refused:
+        text += f"\n\nNo lens_corrected.h5 is written: {story.mask.uneven}."
+    if story.mask.refused:
+        text = f"{story.mask.refused[0].upper()}{story.mask.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
     return Section(
         "The next mask",
         text,
         [
             gain,
-            Figure(_bias_picture(story.plan), "Bias: made less drawn diameter."),
+            Figure(_bias_picture(story.mask.plan), "Bias: made less drawn diameter."),
             table,
         ],
     )

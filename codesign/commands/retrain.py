@@ -7,9 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from characterize import next_mask
 from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
-from codesign.adapt import FinishedRun, LensPsfs, correction, lens_file
+from codesign.adapt import FinishedRun, LensPsfs, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained import RECIPE, RESULT, RetrainingRecipe, relative_inputs
@@ -49,7 +50,7 @@ def run(options: Options) -> int:
     )
     check_lens(design, result, insist=options.insist)
     truth = config.load(options.truth, HiddenLens) if options.truth else None
-    old = correction.present_bias(options.process)
+    old = next_mask.present_bias(options.process)
     recipe = _recipe(options, source)
     with options.claim_work(
         options.output, keep=("*.safetensors",), resume=options.resume
@@ -84,9 +85,6 @@ def _retrain_and_correct(
         f"judging: {len(retraining.available_jobs(psfs)) + 2} cases on the same frames"
     )
     outcome = retraining.retraining_outcome(source, options.settings, psfs, trained)
-    plan = correction.propose_correction(
-        design, result.parameters(), response=made.response, old=old
-    )
     if truth:
         true_parameters = truth.vector()
     else:
@@ -94,33 +92,20 @@ def _retrain_and_correct(
             result, options.settings.draws + 1, seed=options.settings.seed
         )
         true_parameters = list(draws)[-1]
+    mask = next_mask.plan_next_mask(result, old=old, truths=[true_parameters])
     proposals = []
     frames = retraining.render_test_frames(source, options.settings)
-    states = correction.next_lenses(made, plan, result.parameters(), true_parameters)
-    for state in console.track(states, total=len(states), label="next lens"):
+    for step in console.track(mask.steps, total=len(mask.steps), label="next lens"):
+        stack = made.redrawn(step.lens).stack(step.parameters)
         error = retraining.judge_network(
             trained["nominal"],
             source,
             options.settings,
-            (state.stack,),
+            (stack,),
             frames=frames,
             finer=False,
         )
-        proposals.append((state, psf_error(state.stack, psfs.nominal), error.slip_mm))
-    printed = correction.printed_um(design)
-    table_spread = correction.judge_correction(
-        result,
-        lambda x: (
-            correction.correction_table(
-                design, x, response=made.response, old=old, range_um=printed
-            ).bias_nm
-        ),
-    )
-    map_spread = correction.judge_correction(
-        result, correction.uneven_nm, part=correction.MAP
-    )
-    refused = table_spread.words or correction.loss_reason(states[0], states[1])
-    uneven = map_spread.words or correction.loss_reason(states[1], states[2])
+        proposals.append((step, psf_error(stack, psfs.nominal), error.slip_mm))
     psf_errors = (
         psf_error(psfs.best, psfs.nominal),
         psf_error(psfs.judges[0], psfs.nominal),
@@ -130,14 +115,12 @@ def _retrain_and_correct(
         psfs,
         psf_errors,
         _curves(folder, psfs),
-        plan,
+        mask,
         proposals,
         _cautions(result, psfs),
-        refused,
-        uneven,
     )
-    if not refused:
-        correction.write_correction(folder, plan, evened=not uneven)
+    if not mask.refused:
+        next_mask.write_correction(folder, mask.plan, evened=not mask.uneven)
     _write_results(folder, options, (source, trained["retrained"]), results)
     if options.export:
         net = trained["retrained"].model.net
@@ -287,8 +270,8 @@ def _values(
         "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
         "truth_known": story.lenses.known,
         "next_lens": states,
-        "correction_refused": story.refused,
-        "map_refused": story.uneven,
+        "correction_refused": story.mask.refused,
+        "map_refused": story.mask.uneven,
     }
 
 
@@ -306,8 +289,5 @@ def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
         lines.append(
             f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"
         )
-    if story.refused:
-        lines.append(f"next mask: {story.refused}")
-    elif story.uneven:
-        lines.append(f"next mask, bias.toml alone: {story.uneven}")
+    lines.append(f"next mask: {story.mask.summary}")
     return "\n".join([*lines, f"open {folder / 'report.html'}"])

@@ -84,8 +84,11 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
         str(bench / "told.toml"),
     ]
     words += ["--truth", str(bench / "truth.toml")]
-    assert main([*words, "-o", str(bench / "as.h5"), "--json"]) == 0
+    words += ["-o", str(bench / "as.h5"), "--next-mask", "--json"]
+    assert main(words) == 1  # three depths leave the height and the side wall open
     found = json.loads(capsys.readouterr().out)
+    assert "posterior leaves the bias table open" in found["failures"][0]
+    assert not (bench / "as_bias.toml").exists()
     value, sigma = found["parameters"]["bias_nm"]
     assert abs(value - 3.0) < 4 * sigma
     assert asbuilt.load(bench / "as.h5").trusted

@@ -5,12 +5,13 @@ reading of the table, real gain.
 import numpy as np
 import pytest
 
+from characterize import next_mask
 from characterize.model.parameters import parameter_vector, process_state_of
-from codesign.adapt import correction
 from codesign.optics import built
 from layout.process import process as processes
+from metalens import lens
 from metalens.core.errors import ConfigError
-from metalens.fabrication import perturbed_transmission, proxy_sensitivity
+from metalens.fabrication import Bias, perturbed_transmission, proxy_sensitivity
 from tests.codesign import made_lens as m
 
 OLD = """
@@ -21,8 +22,8 @@ table_nm = [[80, -6.0], [120, -3.5], [180, -1.0], [260, 0.5], [340, 1.0]]
 
 def _plan(old=None, **values):
     lens = m.small()
-    none = correction.present_bias(None)
-    return correction.propose_correction(
+    none = next_mask.present_bias(None)
+    return next_mask.propose_correction(
         lens,
         parameter_vector(values),
         response=proxy_sensitivity(lens),
@@ -38,7 +39,7 @@ def test_a_constant_bias_becomes_a_constant_table():
 
 def test_a_constant_bias_adds_to_the_present_table(tmp_path):
     (tmp_path / "process.toml").write_text(OLD)
-    old = correction.present_bias(tmp_path / "process.toml")
+    old = next_mask.present_bias(tmp_path / "process.toml")
     plan = _plan(old, bias_nm=2.0)
     assert np.allclose(plan.bias_nm, old.at(plan.drawn_nm) + 2.0, atol=1e-8)
 
@@ -68,7 +69,7 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
 
 def test_the_layout_draws_what_the_table_means(tmp_path):
     plan = _plan(bias_nm=5.0, height_nm=-8.0)
-    correction.write_correction(tmp_path, plan)
+    next_mask.write_correction(tmp_path, plan)
     made = processes.load_process(tmp_path / "bias.toml")
     assert np.allclose(
         made.bias.drawn_nm(plan.designed_um * 1e3), plan.drawn_nm, atol=2e-3
@@ -88,17 +89,17 @@ def test_the_present_bias_is_read_as_the_layout_reads_it(tmp_path, text):
     (tmp_path / "p.toml").write_text(text)
     drawn = np.linspace(60, 400, 50)
     assert np.allclose(
-        correction.present_bias(tmp_path / "p.toml").at(drawn),
+        next_mask.present_bias(tmp_path / "p.toml").at(drawn),
         processes.load_process(tmp_path / "p.toml").bias.at(drawn),
     )
 
 
 def test_no_process_file_and_nonsense_in_it_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"absent\.toml: no such file"):
-        correction.present_bias(tmp_path / "absent.toml")
+        next_mask.present_bias(tmp_path / "absent.toml")
     (tmp_path / "p.toml").write_text("[bias]\ntable_nm = [[1, 2, 3]]\n")
     with pytest.raises(ConfigError, match=r"bias\.table_nm"):
-        correction.present_bias(tmp_path / "p.toml")
+        next_mask.present_bias(tmp_path / "p.toml")
 
 
 def test_a_true_correction_gives_the_designed_lens_back():
@@ -107,15 +108,40 @@ def test_a_true_correction_gives_the_designed_lens_back():
     """
     made = built.MadeLens(m.small(), m.OPTICS)
     x = parameter_vector({k: v for k, v in m.TRUE.items() if k != "coma_x_rad"})
-    plan = correction.propose_correction(
-        m.small(), x, response=made.response, old=correction.present_bias(None)
+    plan = next_mask.propose_correction(
+        m.small(), x, response=made.response, old=next_mask.present_bias(None)
     )
-    before, table, mapped, placed = correction.next_lenses(made, plan, x, x)
+    steps = next_mask.predict_lenses(plan, m.small(), made.response, x, x)
+    before, table, mapped, placed = steps
     goal = made.stack()
-    errors = [built.psf_error(p.stack, goal) for p in (before, table, mapped, placed)]
-    assert errors[0] > 0.05
-    assert errors[3] < 0.01
+    first, last = (
+        built.psf_error(made.redrawn(p.lens).stack(p.parameters), goal)
+        for p in (before, placed)
+    )
+    assert first > 0.05
+    assert last < 0.01
     assert placed.strehl > 0.9995
     assert placed.strehl > before.strehl
     assert abs(mapped.light - 1) < 0.01
     assert table.strehl > before.strehl - 1e-3
+
+
+def test_a_known_lens_has_a_next_mask_and_an_unknown_one_the_measurement_it_needs(
+    tmp_path,
+):
+    """Bias of 6 nm known to 0.1 nm: its table takes 6 nm off; known to 9 nm: refused."""
+    mask = next_mask.plan_next_mask(m.asbuilt(sigma=0.1), old=Bias())
+    assert not mask.refused
+    as_made, table, both = (step.strehl for step in mask.steps[:3])
+    assert as_made < table < both <= 1
+    assert f"{both:.3f}" in mask.summary
+    next_mask.write_correction(tmp_path, mask.plan, prefix="as_")
+    drawn = processes.load_process(tmp_path / "as_bias.toml").bias
+    assert drawn.table_nm
+    corrected = lens.load(tmp_path / "as_lens_corrected.h5").diameters.diameter_um
+    designed = m.small().diameters.diameter_um
+    rim = np.abs(corrected - designed)[60].max()
+    assert rim == pytest.approx(4e-3 / 2 + 3e-3, abs=3e-3)  # gradient and bow at x = R
+    open_ = next_mask.plan_next_mask(m.asbuilt(sigma=9.0), old=Bias())
+    assert "leaves the bias table open" in open_.refused
+    assert "bias_nm" in open_.summary

@@ -1,9 +1,9 @@
-"""What the next lithography run should draw: a bias table from the as-built lens, a
-corrected map, their gain, and whether the lens is known well enough for them.
+"""Mask correction from an as-built lens: bias table, corrected diameter map, predicted
+gain, and whether the posterior is narrow enough for them.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import AsBuilt
-from characterize.model import PLACE, process_state_of
-from codesign.optics import MadeLens, PixelPsfStack
+from characterize.model import PLACE, made, parameter_vector, process_state_of
 from metalens import lens as lenses
 from metalens.core import store
 from metalens.core.arrays import Array
@@ -25,7 +24,8 @@ from metalens.fabrication import (
     of_process,
     perturbed_transmission,
 )
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import Lens
+from metalens.optics.paths import path_difference
 
 _ANGLES = 8  # along a circle of points where the corrected map is judged
 DRAWS = 24
@@ -87,15 +87,47 @@ class MaskCorrection:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LensProposal:
-    """One state of the next lens: its PSFs, Strehl ratio against the designed wave
-    front, and light.
+class PredictedLens:
+    """Simulated lens after a step of the correction.
+
+    name: the step. lens, parameters: diameters, and all parameters of the fit's order.
+    strehl: Strehl ratio against the designed wave front. light: transmitted power over
+    that of the design.
     """
 
     name: str
-    stack: PixelPsfStack
+    lens: Lens
+    parameters: Array
     strehl: float
     light: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NextMask:
+    """Correction of the next mask, its predicted gain, and what speaks against it.
+
+    steps: simulated lens after each step; Strehl ratio and light are means over the
+    lenses that stood for the truth.
+    refused: why there is no correction; uneven: why the map alone is not corrected;
+    empty where they are usable.
+    """
+
+    plan: MaskCorrection
+    steps: list[PredictedLens]
+    refused: str
+    uneven: str
+
+    @property
+    def summary(self) -> str:
+        """Predicted gain, or why there is none, in words."""
+        if self.refused:
+            return self.refused
+        before, table, both = self.steps[:3]
+        words = f"predicted Strehl ratio {table.strehl:.3f} with the new bias table"
+        if not self.uneven:
+            words += f", {both.strehl:.3f} with the corrected map too"
+        words += f", for {before.strehl:.3f} as made"
+        return f"{words}; bias table alone: {self.uneven}" if self.uneven else words
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,6 +138,56 @@ class CorrectionTable:
     bias_nm: Array
     designed_um: Array
     wanted_um: Array
+
+
+def plan_next_mask(
+    result: AsBuilt, *, old: Bias, truths: Sequence[Array] | None = None
+) -> NextMask:
+    """Correction of the next mask from a fit, judged by posterior and simulated gain.
+
+    Refused where the table's standard deviation over the posterior is above 2 nm, or
+    where the simulated lens has a lower Strehl ratio with it.
+
+    Args:
+        result: of the fit.
+        old: bias that the present mask was drawn with.
+        truths: all parameters of lenses that stand for the real one; None: three draws
+            from the posterior.
+
+    Raises:
+        ConfigError: as :func:`propose_correction`.
+    """
+    design, response, best = result.design, result.response, result.parameters()
+    plan = propose_correction(design, best, response=response, old=old)
+    if truths is None:
+        truths = [result.parameters(row) for row in result.samples(3, seed=7)]
+    lenses_of_truths = [
+        predict_lenses(plan, design, response, best, truth) for truth in truths
+    ]
+    steps = [
+        dataclasses.replace(
+            each[0],
+            strehl=float(np.mean([lens.strehl for lens in each])),
+            light=float(np.mean([lens.light for lens in each])),
+        )
+        for each in zip(*lenses_of_truths, strict=True)
+    ]
+    printed = printed_um(design)
+
+    def bias_table_nm(x: Array) -> Array:
+        table = correction_table(
+            design, x, response=response, old=old, range_um=printed
+        )
+        return table.bias_nm
+
+    table_spread = judge_correction(result, bias_table_nm)
+    map_spread = judge_correction(result, uneven_nm, part=MAP)
+    return NextMask(
+        plan,
+        steps,
+        refused=table_spread.words or loss_reason(steps[0], steps[1]),
+        uneven=map_spread.words or loss_reason(steps[1], steps[2]),
+    )
 
 
 def propose_correction(
@@ -119,8 +201,11 @@ def propose_correction(
         old: bias that the present mask was drawn with.
 
     Raises:
-        ConfigError: the table would be steeper than the layout can invert.
+        ConfigError: pillars of two sizes, or the table would be steeper than the layout
+            can invert.
     """
+    if design.pairs is not None:
+        raise ConfigError("pillars of two sizes have no bias table of one size")
     table = correction_table(
         design, x, response=response, old=old, range_um=printed_um(design)
     )
@@ -177,42 +262,63 @@ def correction_table(
     return CorrectionTable(drawn_nm, bias_nm, designed_um, corrected_um)
 
 
-def next_lenses(
-    lens_model: MadeLens, plan: MaskCorrection, x_fit: Array, x_true: Array
-) -> list[LensProposal]:
-    """Simulated lenses of each step of a correction: PSFs, Strehl ratio, relative
-    light.
+def predict_lenses(
+    plan: MaskCorrection,
+    design: Lens,
+    response: Sensitivity,
+    x_fit: Array,
+    x_true: Array,
+) -> list[PredictedLens]:
+    """Simulated lenses of each step of a correction, with their Strehl ratios.
 
     The lens as made, then with the new table, then with the corrected map too, and last
-    at the corrected sensor distance.
+    at the corrected sensor distance. Summed over every pillar, on the axis.
 
     Args:
-        lens_model: the design with its settings.
         plan: proposed correction of the next mask.
+        design: as designed.
+        response: of the pillars to height, index and side wall.
         x_fit: parameters that the correction was computed from.
         x_true: parameters of the real process. Both hold all parameters.
     """
-    with_table = lens_model.redrawn(_drawn_with(lens_model.design, plan, x_fit))
-    with_map = lens_model.redrawn(_drawn_with(plan.lens, plan, x_fit))
+    with_table = _drawn_with(design, plan, x_fit)
+    with_map = _drawn_with(plan.lens, plan, x_fit)
     x_spacer = x_true.copy()
     x_spacer[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
-    cases = (
-        ("as made", lens_model, x_true),
+    steps = (
+        ("as made", design, x_true),
         ("new bias table", with_table, x_true),
         ("table and corrected map", with_map, x_true),
         ("and the spacer set right", with_map, x_spacer),
     )
-    goal = lens_model.wave()
-    proposals = []
-    for name, lens, x in cases:
-        wave = lens.wave(x)
-        light = float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum())
-        strehl = wavefront_overlap(wave, goal)
-        proposals.append(LensProposal(name, lens.stack(x), strehl, light))
-    return proposals
+    goal = _wave(design, response, parameter_vector())
+    power = float((abs(goal) ** 2).sum())
+    predicted = []
+    for name, lens, x in steps:
+        wave = _wave(lens, response, x)
+        light = float((abs(wave) ** 2).sum()) / power
+        overlap = wavefront_overlap(wave, goal)
+        predicted.append(PredictedLens(name, lens, x, overlap, light))
+    return predicted
 
 
-def loss_reason(before: LensProposal, after: LensProposal) -> str:
+def _wave(lens: Lens, response: Sensitivity, x: Array) -> Array:
+    """(y, x) wave behind every pillar, with the defocus of a wrong sensor distance.
+
+    The wavelength of the bench's source does not count.
+    """
+    x = x.copy()
+    x[PLACE["wavelength_nm"]] = 0.0
+    radius2 = lens.diameters.x_um**2 + lens.diameters.y_um[:, None] ** 2
+    distance = lens.sensor_distance_um
+    defocus_um = path_difference(
+        radius2, distance + float(x[PLACE["distance_um"]])
+    ) - path_difference(radius2, distance)
+    wave = made.as_built_transmission(lens, response, x)
+    return wave * np.exp(2j * np.pi / lens.wavelength_um * defocus_um)
+
+
+def loss_reason(before: PredictedLens, after: PredictedLens) -> str:
     """Why a step of the correction is not written: the simulated lens is worse with it;
     empty where it is not.
 
@@ -256,7 +362,7 @@ def uneven_nm(x: Array) -> Array:
 
 
 def write_correction(
-    folder: Path, plan: MaskCorrection, *, evened: bool = True
+    folder: Path, plan: MaskCorrection, *, evened: bool = True, prefix: str = ""
 ) -> None:
     """Write bias.csv, bias.toml (the [bias] table of PROCESS.toml) and
     lens_corrected.h5.
@@ -264,14 +370,16 @@ def write_correction(
     Args:
         folder: of the files. plan: proposed correction of the next mask.
         evened: write the lens file too.
+        prefix: of the names of the files.
     """
     knots = list(zip(plan.drawn_nm, plan.bias_nm, strict=True))
     rows = [f"{drawn:.3f},{bias:.3f}" for drawn, bias in knots]
-    store.write_text(folder / "bias.csv", "\n".join(["drawn_nm,bias_nm", *rows]) + "\n")
+    lines = ["drawn_nm,bias_nm", *rows]
+    store.write_text(folder / f"{prefix}bias.csv", "\n".join(lines) + "\n")
     pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias in knots)
-    store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
+    store.write_text(folder / f"{prefix}bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     if evened:
-        lenses.save(folder / "lens_corrected.h5", plan.lens)
+        lenses.save(folder / f"{prefix}lens_corrected.h5", plan.lens)
 
 
 def present_bias(path: Path | None) -> Bias:
@@ -377,8 +485,9 @@ def _with_diameters(
     clipped = np.where(printed, np.clip(diameter_um, low, top), 0).astype(np.float32)
     return dataclasses.replace(
         design,
-        diameters=DiameterMap(clipped, design.diameters.pitch_um),
+        diameters=dataclasses.replace(design.diameters, diameter_um=clipped),
         profile=f"{design.profile}, corrected",
+        neighbours=None,
     )
 
 
