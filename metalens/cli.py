@@ -105,7 +105,7 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "info": (
         "metalens.commands.info",
-        "kind, version, provenance and a small picture of any artefact",
+        "kind, version, provenance and arrays of any artefact",
     ),
 }
 

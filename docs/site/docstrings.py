@@ -4,13 +4,14 @@ extension, see mkdocs.yml).
 
 import importlib
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import griffe
 
-from metalens.core import config
-
+sys.path.insert(0, str(Path(__file__).parent))
+record_fields: Any = importlib.import_module("record_fields")
 _NAMED = re.compile(r"^::: ([\w.]+)$", re.M)
 _ROLE = re.compile(r":(?:func|class|mod|meth|attr):`~?([\w.]+)`")
 _REFERENCE = Path(__file__).parents[1] / "reference" / "api.md"
@@ -39,7 +40,7 @@ class Docstrings(griffe.Extension):
             "dataclass" in str(one.value) for one in cls.decorators
         ):
             return
-        told = config.describe_fields(
+        told = record_fields.describe_fields(
             getattr(importlib.import_module(cls.module.path), cls.name)
         )
         texts = cls.docstring.value.split("\n\n")

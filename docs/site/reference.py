@@ -9,6 +9,7 @@ import dataclasses
 import importlib
 import inspect
 import re
+import sys
 import types
 import typing
 from collections.abc import Iterator
@@ -20,7 +21,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from metalens.cli import VERBS
-from metalens.core import config
+
+sys.path.insert(0, str(Path(__file__).parent))
+record_fields: Any = importlib.import_module("record_fields")
 
 # settings file: (module, record, command that reads it)
 SETTINGS = {
@@ -138,7 +141,7 @@ def keys(record: type[Any], path: str = "") -> list[str]:
     """Markdown of a record's keys, then of the tables below it."""
     hints, texts = (
         typing.get_type_hints(record, include_extras=True),
-        config.describe_fields(record),
+        record_fields.describe_fields(record),
     )
     lead = (inspect.getdoc(record) or "").split("\n\n")[0].replace("\n", " ")
     lines = [f"### `[{path}]`" if path else "### Top level", "", lead, ""]
@@ -188,12 +191,12 @@ def _options(verb: str, module: str) -> list[str]:
         ]
     record = loaded.Options
     texts, hints = (
-        config.describe_fields(record),
+        record_fields.describe_fields(record),
         typing.get_type_hints(record, include_extras=True),
     )
     for base in reversed(record.__mro__[1:-1]):
         if dataclasses.is_dataclass(base):
-            texts = config.describe_fields(base) | texts
+            texts = record_fields.describe_fields(base) | texts
     lines = [
         f"## metalens {verb}",
         "",

@@ -301,7 +301,7 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
             ("psf_montage.png", "PSFs over depth and field angle."),
             (
                 "psf_information.png",
-                "Axial information of Eq. 11; the normalisation decides the ranking.",
+                "Axial information of Eq. 11 under three binnings.",
             ),
             ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
         ),

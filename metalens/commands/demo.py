@@ -158,12 +158,6 @@ def _done(
             yield tuple(words), (int(status), dict(values), float(seconds))
 
 
-def _share(design: dict[str, Any]) -> str:
-    """Focusing efficiency of a design, or that it has none."""
-    efficiency = design.get("efficiency")
-    return "not known" if efficiency is None else f"{efficiency:.1%}"
-
-
 def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
     """Write report.html: key figures, a table of the stages, and a section for each.
 
@@ -172,38 +166,29 @@ def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
         outcomes: of the stages that ran.
     """
     total = sum(o.seconds for o in outcomes)
-    values = {_name(o.stage): o.values for o in outcomes}
+    design = next(o.values for o in outcomes if o.stage.words[0] == "design")
+    passed = not any(o.status for o in outcomes)
     keys = [
-        report.KeyFigure("pillars", f"{values['design'].get('pillars', 0):,}"),
+        report.KeyFigure("pillars", f"{design.get('pillars', 0):,}"),
         report.KeyFigure(
-            "numerical aperture", f"{values['design'].get('numerical_aperture', 0):.3f}"
+            "focusing efficiency", report.in_figures(design.get("efficiency"), 3)
         ),
-        report.KeyFigure("focusing efficiency", _share(values["design"])),
         report.KeyFigure(
-            "every stage passed its check",
-            _verdict(outcomes),
-            good=not any(o.status for o in outcomes),
+            "every stage passed its check", report.in_figures(passed), good=passed
         ),
         report.KeyFigure("from first solve to this page", f"{total:.0f} s"),
     ]
-    if "budget" in values:
-        keys.insert(
-            3,
-            report.KeyFigure(
-                "gaze error of all links", f"{values['budget']['gaze_error_deg']:.2g}°"
-            ),
-        )
+    head = ("stage", "seconds", "how wrong it may be", "passed its check", "command")
     rows = [
         (
             o.stage.title,
             f"{o.seconds:.1f}",
             _error(o),
-            _verdict([o]),
-            "metalens " + " ".join(o.stage.words),
+            o.status == 0,
+            f"metalens {' '.join(o.stage.words)}",
         )
         for o in outcomes
     ]
-    head = ("stage", "seconds", "how wrong it may be", "passed its check", "command")
     timing = report.Table(
         head, rows, "Time beside error. Run any of these yourself in this folder."
     )
@@ -231,43 +216,9 @@ def _section(folder: Path, outcome: StageOutcome) -> report.Section:
         for name, caption in stage.pictures
         if (folder / name).is_file()
     ]
-    return report.Section(stage.title, stage.text, (*pictures, *_tables(outcome)))
-
-
-def _tables(outcome: StageOutcome) -> Iterator[report.Table]:
-    """Tables of a result: its rows, its fitted parameters, and its plain values.
-
-    Args:
-        outcome: of a stage, with the result of its command.
-    """
-    listed = outcome.values.get("rows")
-    if isinstance(listed, list) and listed and isinstance(listed[0], dict):
-        head = [k for k, v in listed[0].items() if not isinstance(v, dict | list)]
-        yield report.Table(
-            [report.in_words(h) for h in head],
-            [[row[k] for k in head] for row in listed],
-        )
-    fitted = outcome.values.get("parameters")
-    if isinstance(fitted, dict):
-        rows = [
-            (
-                report.in_words(name),
-                value,
-                sigma,
-                f"{value - 1.96 * sigma:.4g} to {value + 1.96 * sigma:.4g}",
-            )
-            for name, (value, sigma) in fitted.items()
-        ]
-        yield report.Table(("parameter", "value", "1 sigma", "95 % interval"), rows)
-    plain = [
-        (report.in_words(name), value)
-        for name, value in outcome.values.items()
-        if isinstance(value, bool | int | float | str)
-    ]
-    words = " ".join(outcome.stage.words)
-    yield report.Table(
-        ("result", "value"), plain, f"metalens {words}: {outcome.seconds:.1f} s"
-    )
+    words = f"metalens {' '.join(stage.words)}: {outcome.seconds:.1f} s"
+    table = report.summary_table(outcome.values, words)
+    return report.Section(stage.title, stage.text, (*pictures, table))
 
 
 def _error(outcome: StageOutcome) -> str:
@@ -279,7 +230,3 @@ def _error(outcome: StageOutcome) -> str:
     if not isinstance(value, int | float):
         return meaning
     return f"{report.in_figures(float(value), 2)} {meaning}"
-
-
-def _verdict(outcomes: list[StageOutcome]) -> str:
-    return "yes" if not any(o.status for o in outcomes) else "no"

@@ -3,8 +3,9 @@ of printable pillars.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,6 @@ from metalens.design import (
     Cubic,
     DoubleHelix,
     Focus,
-    FocusCheck,
     Limits,
     PhaseMap,
     PhaseOf,
@@ -33,10 +33,11 @@ from metalens.lens import Lens
 from metalens.lens import picture as lens_plot
 from metalens.library import PillarLibrary, axes
 from metalens.optics import Layers, check_gaps
+from metalens.psf import FocusMetrics
 
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
-# pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
-MOST_SUMMED = 60_000_000
+# pillars whose PSF is computed with the design: 2.6 mm at a pitch of 0.3 um
+MOST_PILLARS = 60_000_000
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
 
@@ -222,7 +223,7 @@ class Options(CommonOptions):
         output: the lens file to write.
         process: PROCESS.toml whose printable pillars and gaps bound the diameters, in
             place of [limits].
-        skip_focus_check: leave out the exact diffraction sum around the focus.
+        skip_focus_check: do not judge place and Strehl ratio of the focus.
         accept_partial_turn: where the pillars cover less than a turn, take the nearest;
             the loss is stated.
         own_cell: solve rows of its own unlike pillars (minutes), for efficiency, lens
@@ -270,7 +271,7 @@ def run(options: Options) -> int:
     ends = (".png",) if two_size else (".png", "_fisher.png")
     with options.claim(target, companions=ends, inputs=inputs) as draft:
         design_lens = _design_two_sizes if two_size else _design_one_size
-        designed, settings, values, notes, checks = design_lens(
+        designed, settings, values, notes, failures = design_lens(
             settings, options, draft.path
         )
         lens.save(draft.path, designed)
@@ -279,22 +280,14 @@ def run(options: Options) -> int:
         f"{target}: {settings.profile} lens of {values['pillars']:,} pillars, "
         f"{settings.aperture_mm} mm, {1e3 * designed.wavelength_um:g} nm"
     )
-    failures = [
-        f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a "
-        f"Strehl ratio of {check.strehl:.3f}, expected {check.expected:.3f}"
-        for check in checks
-        if check is not None and not check.passed
-    ]
     doubt = "" if two_size else designed.proxy.doubt
     return options.console.report(
         title, values, notes=notes, failures=[*failures, doubt]
     )
 
 
-# lens, settings as filled in, values for JSON, notes, and checks of the foci
-_Outcome = tuple[
-    Lens, DesignSettings, dict[str, Any], list[str], Sequence[FocusCheck | None]
-]
+# lens, settings as filled in, values for JSON, notes, and failures
+_Outcome = tuple[Lens, DesignSettings, dict[str, Any], list[str], list[str]]
 
 
 def _design_two_sizes(
@@ -308,7 +301,7 @@ def _design_two_sizes(
         draft: file that will be written, for pictures beside it.
 
     Returns:
-        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+        Lens, settings as filled in, values for JSON, notes, and failures.
     """
     path = options.config.parent / (settings.library or "")
     pillars = axes.load(path)
@@ -332,23 +325,21 @@ def _design_two_sizes(
         "multiplexed": metrics.multiplexed,
         "covered": metrics.covered,
     }
-    checks: list[FocusCheck | None] = []
+    failures = []
     lights: tuple[Literal["x", "y"], ...] = ("x", "y")
     profiles = settings.profile, (settings.along_y or settings).profile
     for i, light in enumerate(lights):
         quality = (metrics.x, metrics.y)[i]
-        polarised = designed.seen(light)
         hyperbolic = profiles[i] == "hyperbolic"
-        check = _check(polarised, quality, options, wanted=hyperbolic)
-        checks.append(check)
-        own = _summarize(polarised, quality, check)
+        own, failure = _judge(designed.seen(light), quality, options, wanted=hyperbolic)
+        failures.append(failure)
         del own["turns"]  # of a single diameter
         values[f"along_{light}"] = own | {
             "wavefront_efficiency_error": metrics.wavefront_efficiency_error[i],
             "leaked": metrics.leaked[i],
         }
     lost = describe_order_loss(pillars.cell, settings.focus.wavelength_um)
-    return designed, settings, values, [lost], checks
+    return designed, settings, values, [lost], failures
 
 
 def _design_one_size(
@@ -362,7 +353,7 @@ def _design_one_size(
         draft: file that will be written, for pictures beside it.
 
     Returns:
-        Lens, settings as filled in, values for JSON, notes, and checks of the foci.
+        Lens, settings as filled in, values for JSON, notes, and failures.
 
     Raises:
         ConfigError: several wavelengths of rotated pillars.
@@ -429,11 +420,13 @@ def _design_one_size(
     designed, coupling = _couple(designed, quality, radius_um, options, rotated=rotated)
     checkable = settings.profile == "hyperbolic"
     expected = quality.strehl if others else 1.0
-    check = _check(designed, quality, options, wanted=checkable, expected=expected)
-    values = _summarize(designed, quality, check) | values
+    own, failure = _judge(
+        designed, quality, options, wanted=checkable, expected=expected
+    )
+    values = own | values
     if coupling is not None:
         values["neighbours"] = asdict(coupling)
-    checks = [check]
+    failures = [failure]
     by_wavelength = []
     for light, target, other in zip(settings.wavelengths, targets, others, strict=True):
         at_wavelength = replace(
@@ -442,12 +435,12 @@ def _design_one_size(
             sensor_distance_um=target.focus.sensor_distance_um,
             source_distance_um=target.focus.source_distance_um,
         )
-        check = _check(
+        own, failure = _judge(
             at_wavelength, other, options, wanted=checkable, expected=other.strehl
         )
-        checks.append(check)
+        failures.append(failure)
         named = {"wavelength_nm": light.wavelength_nm, "weight": light.weight}
-        by_wavelength.append(named | _summarize(at_wavelength, other, check))
+        by_wavelength.append(named | own)
     if by_wavelength:
         values["wavelengths"] = by_wavelength
     elif quality.turns < 1:
@@ -464,7 +457,7 @@ def _design_one_size(
         "entry_error": proxy.entry_error,
         "loss": pillars.mean_loss(designed.diameters.diameter_um, focus.wavelength_um),
     }
-    return designed, settings, values, notes, checks
+    return designed, settings, values, notes, failures
 
 
 def _is_two_size_library(path: Path) -> bool:
@@ -568,7 +561,7 @@ def _find_phase(
         return phase, focus, {}
     console.say("tuning a hyperbolic lens and a double helix for the same task")
     lenses = reports.judge_designs(free_form, pupil, search)
-    picture = reports.report_picture(lenses, pupil, search)
+    picture = reports.report_picture(lenses, search)
     write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
     return phase, focus, {"fisher": reports.report_values(lenses, search)}
 
@@ -635,57 +628,27 @@ def _couple(
     return designed, design.neighbour_coupling_loss(designed, radius_um=radius_um)
 
 
-def _check(
+def _judge(
     designed: Lens,
     quality: Quality,
     options: Options,
     *,
     wanted: bool,
     expected: float = 1.0,
-) -> FocusCheck | None:
-    """Exact diffraction sum around the focus; None where it is left out.
+) -> tuple[dict[str, Any], str]:
+    """Quality of a lens and of the PSF of its design source for JSON, and its failure.
+
+    The PSF is left out of a phase without a focus, of a lens of more pillars than fit
+    in memory at once, and where torch is not installed. The failure is empty where the
+    focus passes or is not judged.
 
     Args:
         designed: the lens.
         quality: of its pillars.
         options: of the command line.
-        wanted: whether the profile has a focus that can be checked.
+        wanted: whether the profile has a focus that can be judged.
         expected: Strehl ratio that the phase errors leave.
     """
-    if options.skip_focus_check or not wanted:
-        return None
-    if quality.pillars > MOST_SUMMED:
-        options.console.say(f"more than {MOST_SUMMED:,} pillars: no exact focus check")
-        return None
-    return design.check_focus(designed, expected=expected)
-
-
-def _summarize(
-    designed: Lens, quality: Quality, check: FocusCheck | None
-) -> dict[str, Any]:
-    """Quality of a lens, of its PSF and of its focus, for JSON; None for nan.
-
-    The PSF is left out of a phase without a focus, of a lens of more pillars than fit
-    in memory at once, and where torch is not installed.
-
-    Args:
-        designed: the lens.
-        quality: of its pillars.
-        check: of its focus; None without.
-    """
-    values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
-    if quality.focuses:
-        values |= {
-            "numerical_aperture": quality.numerical_aperture,
-            "field_of_view_deg": math.degrees(quality.field_of_view_rad),
-            "efficiency": None,
-        }
-        if quality.pillars <= MOST_SUMMED:
-            try:
-                values |= _of_psf(design.focus_figures(designed))
-            except ModuleNotFoundError as error:
-                if error.name != "torch":
-                    raise
     names = (
         "wavefront_efficiency",
         "sampled_aperture",
@@ -696,25 +659,45 @@ def _summarize(
         "rms_phase_error_rad",
         "turns",
     )
-    values |= {name: getattr(quality, name) for name in names}
-    if check is not None:
-        values |= {
-            "focus_x_um": check.x_um,
-            "focus_y_um": check.y_um,
-            "focus_z_um": None if math.isnan(check.z_um) else check.z_um,
-            "exact_strehl": check.strehl,
-            "focus_passed": check.passed,
-        }
-    return values
-
-
-def _of_psf(figures: Any) -> dict[str, Any]:
-    """Figures of the PSF of the design source for JSON; None for nan."""
-    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
-    values = {name: getattr(figures, name) for name in names}
-    values |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
-    plain = {
-        name: None if isinstance(v, float) and math.isnan(v) else v
-        for name, v in values.items()
+    values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
+    own = {name: getattr(quality, name) for name in names}
+    if not quality.focuses:
+        return values | own, ""
+    values |= {
+        "numerical_aperture": quality.numerical_aperture,
+        "field_of_view_deg": math.degrees(quality.field_of_view_rad),
+        "efficiency": None,
     }
-    return plain | {"diffraction_limit": asdict(figures.limit)}
+    judged = wanted and not options.skip_focus_check
+    if quality.pillars > MOST_PILLARS or find_spec("torch") is None:
+        if judged:
+            options.console.say(
+                f"no focus check: it needs torch and at most {MOST_PILLARS:,} pillars"
+            )
+        return values | own, ""
+    check = design.check_focus(designed, axial=judged, expected=expected)
+    values |= _psf_values(check.figures) | own
+    if not judged:
+        return values, ""
+    values |= {
+        "focus_x_um": check.x_um,
+        "focus_y_um": check.y_um,
+        "focus_z_um": check.z_um,
+        "focus_passed": check.passed,
+    }
+    problem = "the focus is dim" if check.placed else "no focus where it should be"
+    failure = (
+        f"{problem}: a Strehl ratio of {check.figures.strehl:.3f}, expected "
+        f"{check.expected:.3f}"
+    )
+    return values, "" if check.passed else failure
+
+
+def _psf_values(figures: FocusMetrics) -> dict[str, Any]:
+    """Figures of the PSF of the design source for JSON."""
+    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
+    return {name: getattr(figures, name) for name in names} | {
+        "psf_strehl": figures.strehl,
+        "psf_strehl_error": figures.strehl_error,
+        "diffraction_limit": asdict(figures.limit),
+    }

@@ -13,13 +13,11 @@ from metalens import lens, psf
 from metalens.core import config, store
 from metalens.core.errors import ConfigError
 from metalens.core.report import (
-    Console,
     Figure,
-    KeyFigure,
     Section,
-    Table,
     figure_png,
     make_figure,
+    summary_table,
     write_report,
 )
 
@@ -36,7 +34,7 @@ TAKES = (
 )
 SAMPLES = 401
 PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are reported
-HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y")
+CAPTION = "Light far behind the lens over direction cosines, +x right and +y down."
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ def far_field_request(options: Any, built_lens: lens.Lens) -> FarFieldRequest:
 
 
 def compute_far_fields(
-    built_lens: lens.Lens, request: FarFieldRequest, console: Console
+    built_lens: lens.Lens, request: FarFieldRequest
 ) -> list["FarField"]:
     """One far field for each direction of incidence.
 
@@ -106,11 +104,7 @@ def compute_far_fields(
     Args:
         built_lens: the lens.
         request: directions, source distance, wavelength and samples.
-        console: of the command.
     """
-    directions = console.track(
-        request.angles_deg, total=len(request.angles_deg), label="directions"
-    )
     return [
         psf.far_field(
             built_lens,
@@ -119,7 +113,7 @@ def compute_far_fields(
             wavelength_um=1e-3 * request.wavelength_nm,
             samples=request.samples,
         )
-        for x, y in directions
+        for x, y in request.angles_deg
     ]
 
 
@@ -170,7 +164,11 @@ def save_far_fields(
     image = far_field_picture(request, fields)
     store.write_bytes(path.with_name(f"{path.stem}_far.png"), image)
     if page:
-        _report(path.with_suffix(".html"), request, fields, image)
+        sections = [
+            Section("Directions", items=[Figure(image, CAPTION, wide=True)]),
+            Section("Result", items=[summary_table(far_field_values(request, fields))]),
+        ]
+        write_report(path.with_suffix(".html"), "Far field", sections)
 
 
 def far_field_values(
@@ -188,7 +186,10 @@ def far_field_values(
             "angle_y_deg": y,
             "transmitted": field.transmitted,
             "beyond": field.beyond,
-            "within_deg": {f"{part:g}": _cone(field, part) for part in PARTS},
+            "within_deg": {
+                f"{part:g}": math.degrees(math.asin(min(field.within_sine(part), 1.0)))
+                for part in PARTS
+            },
             "beams": [
                 dataclasses.asdict(beam)
                 | {"angle_deg": beam.angle_deg, "azimuth_deg": beam.azimuth_deg}
@@ -202,69 +203,8 @@ def far_field_values(
     return {name: getattr(far_fields[0], name) for name in common} | {"fields": fields}
 
 
-def far_field_text(
-    target: Path, request: FarFieldRequest, fields: list["FarField"]
-) -> str:
-    """Result of the command in words: light that passes, cones and beams of each
-    direction.
-
-    Args:
-        target: output file.
-        request: the request.
-        fields: far field of each direction.
-    """
-    source = (
-        "plane waves"
-        if math.isinf(request.source_mm)
-        else f"a source at {request.source_mm:g} mm"
-    )
-    worst = max(field.error for field in fields)
-    lines = [
-        f"{target}: far field of {source}, {request.wavelength_nm:g} nm, error {worst:.1g}"
-    ]
-    for (x, y), field in zip(request.angles_deg, fields, strict=True):
-        cones = ((part, _cone(field, part)) for part in PARTS)
-        shares = ", ".join(f"{p:.0%} within {a:.3g}" for p, a in cones if a is not None)
-        lost = f", {field.beyond:.2g} does not leave into air"
-        lines.append(
-            f"  from ({x:g}, {y:g}) deg: {field.transmitted:.3f} of the light on the "
-            f"pillars passes, of that {shares} deg of the axis"
-            f"{lost if field.beyond > 1e-4 else ''}"
-        )
-        lines += [
-            f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, "
-            f"{b.sine_y:+.5f})"
-            for b in field.beams
-        ] or ["    no direction holds 1 % of it"]
-    return "\n".join([*lines, f"  {_beam_note(fields[0])}"])
-
-
-def _beam_note(field: "FarField") -> str:
-    """What a beam is in words, and the largest sine that the lattice samples."""
-    limit = (
-        ""
-        if field.steepest >= 1
-        else f"; the lattice tells directions up to a sine of {field.steepest:.3f}"
-    )
-    return (
-        f"a beam is the light within a sine of {field.beam_sine:.2g} of its middle ({field.beam_holds:.0%} of an ideal "
-        f"round one){limit}"
-    )
-
-
-def _cone(field: "FarField", part: float) -> float | None:
-    """Half angle in deg of the cone about the axis with a share of the transmitted
-    light.
-
-    None where no cone has it.
-    """
-    sine = field.within_sine(part)
-    return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
-
-
 def far_field_picture(request: FarFieldRequest, fields: list["FarField"]) -> bytes:
-    """PNG of the light over direction cosines (log scale), and within cones about the
-    axis.
+    """PNG of the light over direction cosines (log scale).
 
     Args:
         request: the request.
@@ -273,16 +213,10 @@ def far_field_picture(request: FarFieldRequest, fields: list["FarField"]) -> byt
     from matplotlib.colors import LogNorm
 
     width = max(4.6, 3.6 * len(fields))
-    figure, panels = make_figure(
-        2, len(fields), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
-    )
-    for column, ((x, y), field) in enumerate(
-        zip(request.angles_deg, fields, strict=True)
-    ):
-        step = float(field.sines[1] - field.sines[0])
-        edge = float(field.sines[-1]) + step / 2
+    figure, panels = make_figure(1, len(fields), size=(width, 4.4), squeeze=False)
+    for panel, (x, y), field in zip(panels[0], request.angles_deg, fields, strict=True):
+        edge = float(field.sines[-1] + (field.sines[1] - field.sines[0]) / 2)
         top = float(field.share.max())
-        panel = panels[0, column]
         low = max(1e-6 * top, 1e-300)
         shown = panel.imshow(
             np.maximum(field.share, low),
@@ -296,46 +230,4 @@ def far_field_picture(request: FarFieldRequest, fields: list["FarField"]) -> byt
         figure.colorbar(
             shown, ax=panel, label="share of the light in a square", shrink=0.85
         )
-        sines = step * np.arange(1, len(field.rings) + 1)
-        angles = np.degrees(np.arcsin(np.minimum(sines, 1.0)))
-        panels[1, column].plot(angles, np.cumsum(field.rings))
-        panels[1, column].set(
-            xlabel="angle from the axis / deg",
-            ylabel="share within",
-            ylim=(0, 1.02),
-            xlim=(0, None),
-        )
     return figure_png(figure)
-
-
-def _report(
-    path: Path, request: FarFieldRequest, fields: list["FarField"], image: bytes
-) -> None:
-    """Write the report: the picture of directions and the table of beams.
-
-    Args:
-        path: of the report.
-        request: directions, source distance, wavelength and samples.
-        fields: far field of each direction.
-        image: PNG of the picture.
-    """
-    rows = [
-        [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
-        for (x, y), field in zip(request.angles_deg, fields, strict=True)
-        for b in field.beams
-    ]
-    words = "Light far behind the lens over direction cosines, +x right and +y down; below, what cones hold."
-    caption = f"Shares are of the light that the pillars let through; {_beam_note(fields[0])}."
-    keys = [
-        KeyFigure("relative error", f"{max(field.error for field in fields):.1g}", True)
-    ]
-    keys += [KeyFigure("of the light passes", f"{fields[0].transmitted:.3f}")]
-    sections = [Section("Directions", items=[Figure(image, words, wide=True)])]
-    sections.append(
-        Section(
-            "Beams",
-            items=[Table(HEAD, rows, caption)] if rows else (),
-            text="" if rows else caption,
-        )
-    )
-    write_report(path, "Far field", sections, key_figures=keys)

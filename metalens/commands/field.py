@@ -197,36 +197,26 @@ def run(options: Options) -> int:
             draft.path.with_suffix(".png"), near_field_picture(request, fields)
         )
     by_cut = dict(zip((*CUTS, "xy"), fields, strict=True))
-    values: dict[str, Any] = {
-        name: {"error": cut.error, "largest_e": _largest(cut)}
-        for name, cut in by_cut.items()
-    }
-    failures: list[str] = []
-    missed = [name for name, cut in by_cut.items() if not cut.converged]
-    words = [
-        f"  {name}: |E| up to {_largest(cut):.2f} of the light that comes, within {cut.error:.1g} (rms)"
-        for name, cut in by_cut.items()
-    ]
+    missed = ", ".join(name for name, cut in by_cut.items() if not cut.converged)
+    text = (
+        f"{missed} above the tolerance {request.tolerance:g} at {fields[0].orders} "
+        "orders: allow a larger one; fields at edges converge slowly"
+    )
     failed = any(cut.error > (options.tolerance or UNKNOWN) for cut in fields)
-    if missed:
-        above = f"{', '.join(missed)} above the tolerance {request.tolerance:g} at {fields[0].orders} orders: "
-        cure = (
-            "allow a larger one; "
-            if failed and all(cut.error <= UNKNOWN for cut in fields)
-            else ""
-        )
-        text = f"{above}{cure}fields at edges converge slowly"
-        if failed:
-            failures.append(text)
-        else:
-            words.append(f"  {text}")
-    title = f"{options.output}: field of {request.cell.described}, {NM * request.wavelength_um:g} nm"
-    numbers = {
-        "orders": fields[0].orders,
-        "tolerance": request.tolerance,
-        "cuts": values,
-    }
-    return options.console.judged(numbers, "\n".join([title, *words]), failures)
+    return options.console.report(
+        f"{options.output}: field of {request.cell.described}, "
+        f"{NM * request.wavelength_um:g} nm",
+        {
+            "orders": fields[0].orders,
+            "tolerance": request.tolerance,
+            "cuts": {
+                name: {"error": cut.error, "largest_e": _largest(cut)}
+                for name, cut in by_cut.items()
+            },
+        },
+        notes=[text] if missed and not failed else [],
+        failures=[text] if failed else [],
+    )
 
 
 def _largest(field: NearField) -> float:

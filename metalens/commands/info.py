@@ -1,23 +1,19 @@
-"""What a file is: kind, version, provenance, arrays and a small picture of the largest;
-masks and networks as well.
-"""
+"""What a file is: kind, version, provenance and arrays; masks and networks as well."""
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 
 from metalens.cli import load_above
 from metalens.commands.common import MASKS, CommonOptions
-from metalens.core import store, transaction
-from metalens.core.errors import StoreError
+from metalens.core import reading, store, transaction
+from metalens.core.errors import DAMAGE, StoreError
 
 NETWORK = ".safetensors"
 _DRAWINGS = {*MASKS, ".dxf", ".cif"}  # the latter two are refused by name
-_SHADES = " .:-=+*#%@"
 _HDF5 = b"\x89HDF"  # first bytes
 
 
@@ -62,7 +58,7 @@ def run(options: Options) -> int:
     else:
         stored = store.load(path)
         values = _stored_values(path.name, stored)
-        text = "\n".join([_stored_text(values), *_sketch_largest(stored)])
+        text = _stored_text(values)
     options.console.result(values, text)
     return 0
 
@@ -116,29 +112,6 @@ def _short(value: object) -> str:
     if isinstance(value, float):
         text = repr(float(f"{value:.12g}"))
     return text if len(text) <= 100 else text[:97] + "..."
-
-
-def _sketch_largest(stored: store.StoredArtefact) -> list[str]:
-    """Character picture of the largest array, at most 48 columns by about 24 rows.
-
-    Its first (y, x) image, the densest character for the largest value; empty for files
-    without such an array.
-
-    Args:
-        stored: the artefact.
-    """
-    arrays = [a for a in stored.arrays.values() if a.ndim >= 2]
-    largest = max(arrays, key=lambda array: array.size, default=np.zeros((0, 0), bool))
-    if not largest.size or largest.dtype.kind not in "fiu":
-        return []
-    rows, columns = largest.shape[-2:]
-    y = np.linspace(0, rows - 1, min(rows, max(1, round(24 * rows / columns))))
-    x = np.linspace(0, columns - 1, min(columns, 48))
-    first = largest.reshape(-1, rows, columns)[0]
-    picked = first[np.ix_(y.astype(int), x.astype(int))].astype(float)
-    low, high = float(np.nanmin(picked)), float(np.nanmax(picked))
-    shade = np.nan_to_num((picked - low) / (high - low or 1.0)) * (len(_SHADES) - 1)
-    return ["".join(_SHADES[int(v)] for v in row) for row in shade]
 
 
 def manifest_entry(path: Path) -> dict[str, Any] | None:
@@ -204,49 +177,29 @@ def _folder_text(manifest: dict[str, Any]) -> str:
 def safetensors_head(path: Path) -> dict[str, Any]:
     """Kind, version, settings and tensors of a safetensors file, by its head.
 
-    The head is 8 bytes of its length, then JSON.
-
     Args:
         path: of the file.
 
     Raises:
         StoreError: missing, cut short, or no such file.
     """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise StoreError(f"{path}: {reading.missing_reason(path)}")
     try:
-        with open(path, "rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            size = path.stat().st_size
-            head = json.loads(file.read(length) if length <= size else b"")
-        tensors = {
-            name: entry for name, entry in head.items() if name != "__metadata__"
-        }
-        about = dict(head.get("__metadata__", {}))
-        if "about" in about:
-            about = {
-                k: v for k, v in json.loads(about["about"]).items() if k != "state"
+        with safe_open(path, "numpy") as file:
+            about = dict(file.metadata() or {})
+            tensors = {name: file.get_slice(name) for name in sorted(file.keys())}
+            arrays = {
+                name: f"{tensor.get_dtype()} {tuple(tensor.get_shape())}"
+                for name, tensor in tensors.items()
             }
-        ends = [int(entry["data_offsets"][1]) for entry in tensors.values()]
-        arrays = {
-            name: f"{entry['dtype']} {tuple(entry['shape'])}"
-            for name, entry in sorted(tensors.items())
-        }
-    except FileNotFoundError:
-        raise StoreError(f"{path}: no such file") from None
-    except (
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+        about = dict(json.loads(about["about"])) if "about" in about else about
+    except (SafetensorError, RecursionError, *DAMAGE) as error:
         raise StoreError(
             f"{path}: cut short or no safetensors file ({error}); make it again"
         ) from None
-    if 8 + length + max(ends, default=0) != size:
-        raise StoreError(
-            f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again"
-        )
     kind = str(about.get("kind", "network"))
     version = str(about.get("version", "1"))
     return {

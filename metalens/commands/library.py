@@ -13,13 +13,7 @@ import numpy as np
 import tyro
 
 from metalens import library
-from metalens.cell import (
-    Cell,
-    DiffractionOrder,
-    named_orders,
-    no_resonance_um,
-    substrate_orders,
-)
+from metalens.cell import Cell, named_orders, no_resonance_um, substrate_orders
 from metalens.commands.common import DistributedOptions, Output
 from metalens.core import config, store
 from metalens.core.errors import DomainError
@@ -167,9 +161,12 @@ def _finish(
         stated=settings.sweep.tolerance is not None,
         accept_partial_turn=options.accept_partial_turn,
     )
-    values = _values(pillars, fitted, seconds)
-    text = _text(options.output, pillars, fitted, seconds, failures)
-    return options.console.judged(values, text, failures)
+    return options.console.report(
+        f"{options.output}: library of {pillars.cell.described}",
+        _values(pillars, fitted, seconds),
+        notes=_notes(pillars, failures),
+        failures=failures,
+    )
 
 
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
@@ -280,9 +277,13 @@ def _values(
         "median_error": float(np.median(pillars.t_error)),
         "polarizations": list(pillars.polarization),
     }
-    if _orders(pillars):
-        lost = pillars.lost
-        values["lost"] = {"mean": float(lost.mean()), "most": float(lost.max())}
+    shortest, widest = float(pillars.wavelength_um[0]), float(pillars.angle_rad[-1])
+    if orders := substrate_orders(pillars.cell, shortest, angle_rad=widest):
+        values["lost"] = {
+            "orders": named_orders(orders),
+            "mean": float(pillars.lost.mean()),
+            "most": float(pillars.lost.max()),
+        }
     if pillars.turned is not None:
         values["circular"] = _circular(pillars.turned)
     if fitted is not None:
@@ -296,7 +297,6 @@ def _values(
             "max_transmission_error": proxy.max_transmission_error,
             "entry_error": proxy.entry_error,
             "polarization_spread": fitted.polarization_spread,
-            "notes": list(fitted.notes),
             "error_against_coefficients": [
                 dataclasses.asdict(trial) for trial in fitted.table
             ],
@@ -304,98 +304,36 @@ def _values(
     return values
 
 
-def _text(
-    target: Path,
-    pillars: PillarLibrary,
-    fitted: ProxyFit | None,
-    seconds: float,
-    failures: list[str],
-) -> str:
-    """Result of a sweep in words: effort, time and error of sweep and proxy.
+def _notes(pillars: PillarLibrary, failures: list[str]) -> list[str]:
+    """What a user of the library must know, in words.
 
     Args:
-        target: output file.
         pillars: the library.
-        fitted: its proxy; None where none fits.
-        seconds: time of the sweep.
         failures: reasons for exit status 1.
     """
-    each = 1e3 * seconds / max(1, pillars.solves)
-    effort = (
-        f"  sweep    {pillars.solves:4d} solves ({pillars.engine}, {each:.0f} ms each)   {seconds:6.1f} s    "
-        if pillars.engine != "table"
-        else "  table                                                 "
-    )
-    lines = [
-        f"{target}: {pillars.t.size} entries, {len(pillars.resonances)} poles near the real diameters",
-        *(f"  {note}" for note in pillars.notes if pillars.engine == "table"),
-        "",
-        "  what     effort                          time        error",
-        f"{effort}t within {pillars.t_error.max():.1e} (median {np.median(pillars.t_error):.1e})",
-    ]
-    if fitted is not None:
-        lines += [
-            *(
-                f"  proxy    {trial.coefficients:4d} coefficients                            "
-                f"phase {trial.phase_error_rad:.1e} rad, |T| {trial.transmission_error:.1e}"
-                for trial in fitted.table
-            ),
-            "",
-            *_proxy_lines(fitted),
-        ]
-    if not (
-        pillars.converged
-        or any(failure.startswith(_above(pillars)) for failure in failures)
+    notes = [note for note in pillars.notes if note not in failures]
+    stated = any(failure.startswith(_above(pillars)) for failure in failures)
+    if not (pillars.converged or stated):
+        notes.append(
+            f"{_above(pillars)}, which the file does not state: beside resonances as a "
+            "rule, of narrow walls and shapes without mirrors in more places"
+        )
+    if (
+        pillars.turned is None
+        and pillars.polarization == ("x",)
+        and not pillars.cell.alike
     ):
-        lines.append(
-            f"  {_above(pillars)}, which the file does not state: beside resonances as a rule, "
-            "of narrow walls and shapes without mirrors in more places"
+        notes.append(
+            "all of it for light along x: these pillars answer light along y otherwise"
         )
-    lines += _lost_lines(pillars)
-    if pillars.turned is not None:
-        lines += _turned_lines(pillars.turned)
-    elif pillars.polarization == ("x",) and not pillars.cell.alike:
-        lines.append(
-            "  all of it for light along x: these pillars answer light along y otherwise"
-        )
-        lines += _cross_polarised_lines(pillars)
-    return "\n".join(lines)
-
-
-def _orders(pillars: PillarLibrary) -> tuple[DiffractionOrder, ...]:
-    """Orders of the substrate, at the shortest wavelength and the widest angle."""
-    return substrate_orders(
-        pillars.cell,
-        float(pillars.wavelength_um[0]),
-        angle_rad=float(pillars.angle_rad[-1]),
-    )
-
-
-def _lost_lines(pillars: PillarLibrary) -> list[str]:
-    """Light lost to orders of the substrate, in words; empty where none propagates."""
-    orders, lost = _orders(pillars), pillars.lost
-    if not orders:
-        return []
-    return [
-        f"  diffraction orders {named_orders(orders)} propagate in the substrate: with "
-        f"absorption they take {lost.mean():.1%} of the light in the mean, "
-        f"{lost.max():.1%} at most"
-    ]
-
-
-def _cross_polarised_lines(pillars: PillarLibrary) -> list[str]:
-    """Share of light along x that leaves along y, in words.
-
-    It is not 0 only where no mirror of the shape lies along x or y.
-    """
-    outline = pillars.cell.outline(float(pillars.diameter_um[-1]))
-    if outline.keeps(-1, 1) or outline.keeps(1, -1):
-        return []
-    lost = float(1 - pillars.energy.min())
-    return [
-        f"  up to {lost:.0%} of it leaves along y, or is absorbed: no mirror of the shape lies along x or y; turn it "
-        "(angle_rad) until one does"
-    ]
+        outline = pillars.cell.outline(float(pillars.diameter_um[-1]))
+        if not (outline.keeps(-1, 1) or outline.keeps(1, -1)):
+            notes.append(
+                f"up to {1 - pillars.energy.min():.0%} of it leaves along y, or is "
+                "absorbed: no mirror of the shape lies along x or y; turn it "
+                "(angle_rad) until one does"
+            )
+    return notes
 
 
 def _circular(turned: GeometricPhase) -> dict[str, Any]:
@@ -414,35 +352,6 @@ def _circular(turned: GeometricPhase) -> dict[str, Any]:
         "isolated_error": turned.model_error,
         "solver_error": float(turned.t_error.max()),
     }
-
-
-def _turned_lines(turned: GeometricPhase) -> list[str]:
-    """Conversion of circular light by the rotated pillar, in words."""
-    shares = _circular(turned)
-    return [
-        f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {shares['converted']:.3f} +- "
-        f"{shares['converted_error']:.2g} of circular light is converted with the geometric phase, "
-        f"{shares['unconverted']:.2g} +- {shares['unconverted_error']:.1g} keeps its hand",
-        f"  a pillar turned alone is {shares['isolated_error']:.2g} of t off the solved ones at "
-        f"{len(turned.angle_rad)} turns (solver within {shares['solver_error']:.1g})",
-    ]
-
-
-def _proxy_lines(fitted: ProxyFit) -> list[str]:
-    """Domain, coverage and errors of the proxy, in words."""
-    proxy = fitted.proxy
-    low, high = (1e3 * d for d in proxy.domain_um)
-    turns = "" if math.isnan(fitted.turns) else f", {fitted.turns:.2f} turns"
-    lines = [
-        f"  proxy in diameter^{proxy.power} from {low:.1f} to {high:.1f} nm{turns}: phase within "
-        f"{proxy.max_phase_error_rad:.1e} rad, |T| within {proxy.max_transmission_error:.1e} (half of them unseen),",
-        f"  of entries whose own error bars are {proxy.entry_error:.1e} of |t| (root mean square)",
-    ]
-    if fitted.polarization_spread > 0:
-        lines.append(
-            f"  s and p differ by up to {2 * fitted.polarization_spread:.1e}; the proxy holds their mean"
-        )
-    return lines + [f"  {note}" for note in fitted.notes]
 
 
 def _run_two_sizes(options: Options, settings: CellFile) -> int:
@@ -468,10 +377,10 @@ def _run_two_sizes(options: Options, settings: CellFile) -> int:
         pillars = dataclasses.replace(pillars, provenance=about)
         axes.save(draft.path, pillars)
         plots.axes_library_figure(draft.path.with_suffix(".png"), pillars)
-    return options.console.judged(
+    return options.console.report(
+        f"{target}: library over two sizes of {settings.cell.described}",
         _two_size_values(pillars, seconds),
-        _two_size_text(target, pillars, seconds),
-        two_size_failures(pillars),
+        failures=two_size_failures(pillars),
     )
 
 
@@ -521,20 +430,3 @@ def _least(pillars: axes.AxesLibrary) -> list[float]:
         float(np.abs(pillars.t[..., k, k])[pillars.usable].min(initial=1.0))
         for k in (0, 1)
     ]
-
-
-def _two_size_text(target: Path, pillars: axes.AxesLibrary, seconds: float) -> str:
-    """Result of a sweep over two sizes in words: sizes, effort, errors, held-out
-    pairs.
-    """
-    x, y, held_out = NM * pillars.x_um, NM * pillars.y_um, pillars.held_out
-    lines = [
-        f"{target}: {len(x)} x {len(y)} sizes ({x[0]:.1f}-{x[-1]:.1f} nm along x, {y[0]:.1f}-{y[-1]:.1f} nm along y), "
-        f"Jones matrices at {len(pillars.wavelength_um)} wavelength(s)",
-        f"  {pillars.solves} solves (rcwa, orders within {pillars.harmonics}), {seconds:.1f} s",
-        f"  t within {np.median(pillars.t_error):.1e} in the median; {pillars.usable.mean():.1%} of the sizes are within "
-        f"{pillars.sweep.bar:g}, the others are excluded bands of resonances",
-        f"  {len(held_out)} pairs held out: interpolated within {np.median(held_out[:, 3]):.1e} in the median, "
-        f"{held_out[:, 3].max():.1e} at most, {pillars.missed} above their bar",
-    ]
-    return "\n".join(lines)

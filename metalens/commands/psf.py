@@ -25,9 +25,9 @@ from metalens.core.report import (
     Figure,
     KeyFigure,
     Section,
-    Table,
     figure_png,
     make_figure,
+    summary_table,
     write_report,
 )
 from metalens.core.store import Provenance, write_bytes
@@ -395,7 +395,7 @@ CAPTIONS = {
     "and the share of the window's light inside a circle.",
     "zscan": "Irradiance along x on planes behind the lens for light along the axis, and its peak and width over the "
     "plane's shift from the sensor.",
-    "information": "I(z) of Eq. 11 under two normalisations and three binnings; the normalisation decides the ranking.",
+    "information": "Axial information I(z) of Eq. 11 under three binnings, mean over 9 sub-pixel positions.",
 }
 
 
@@ -523,10 +523,13 @@ def run(options: Options) -> int:
         device.proxy.doubt,
         dark_window(computed),
     ]
-    values = psf_numbers(computed) | {"doubt": device.proxy.doubt}
-    text = psf_text(target, computed)
-    text += describe_order_loss(device.cell, float(computed.stack.wavelengths_um.min()))
-    return options.console.judged(values, text, failures)
+    shortest = float(computed.stack.wavelengths_um.min())
+    return options.console.report(
+        f"{target}: PSFs within a relative error of {computed.stack.error:.2g}",
+        psf_values(computed),
+        notes=[_place_note(computed), describe_order_loss(device.cell, shortest)],
+        failures=failures,
+    )
 
 
 def _run_far_field(options: Options) -> int:
@@ -551,15 +554,14 @@ def _run_far_field(options: Options) -> int:
         companions=("_far.png", ".html"),
         room=transaction.ROOM + 4 * request.samples**2,
     ) as draft:
-        fields = far_field.compute_far_fields(device, request, options.console)
+        fields = far_field.compute_far_fields(device, request)
         far_field.save_far_fields(
             draft.path, request, fields, inputs=inputs, page=options.report
         )
-    options.console.result(
+    return options.console.report(
+        f"{target}: shares of the light that passes the pillars, by beams and cones",
         far_field.far_field_values(request, fields),
-        far_field.far_field_text(target, request, fields),
     )
-    return 0
 
 
 class AsBuiltSource(Protocol):
@@ -655,17 +657,27 @@ def _write(path: Path, computed: ComputedPsfs, *, page: bool) -> None:
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
     if page:
-        sections = psf_sections(computed, {CAPTIONS[n]: i for n, i in pictures.items()})
+        focus = computed.figures[0]
+        figures = [
+            Figure(image, CAPTIONS[name], wide=True) for name, image in pictures.items()
+        ]
         write_report(
             path.with_suffix(".html"),
             "Point spread functions",
-            sections,
-            key_figures=key_figures(computed),
+            [
+                Section("Pictures", items=figures),
+                Section("Result", items=[summary_table(psf_values(computed))]),
+            ],
+            key_figures=[
+                KeyFigure("relative error", f"{computed.stack.error:.2g}"),
+                KeyFigure("focusing efficiency", f"{focus.efficiency:.3f}"),
+                KeyFigure("Strehl ratio", f"{focus.strehl:.3f}"),
+            ],
         )
 
 
 def plot_information(stack: psf.PsfStack) -> bytes:
-    """PNG of the axial information I(z) of Eq. 11 over depth, for two normalisations.
+    """PNG of the axial information I(z) of Eq. 11 over depth, in the L2 normalisation.
 
     Pixels of 3 µm (three samples, if that is more), binned 1, 2 and 3 times; the first
     and last field angle. Information between neighbouring depths is divided by the
@@ -681,32 +693,25 @@ def plot_information(stack: psf.PsfStack) -> bytes:
     light = torch.as_tensor(stack.intensity).double()
     light = light.reshape(len(stack.angles_rad), *light.shape[-3:])
     pitch = max(PIXEL_UM, 3 * stack.step_um)
-    steps_mm = np.diff(stack.depths_um) * 1e-3
     middle_mm = (stack.depths_um[1:] + stack.depths_um[:-1]) / 2e3
-    names: dict[fisher.Normalisation, str] = {"sum": "sum", "l2": "L2 norm"}
-    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
-    for panel, (name, word) in zip(axes, names.items(), strict=True):
-        for bins in (1, 2, 3):
-            value = fisher.axial_information(
-                light[:, :-1],
-                light[:, 1:],
-                step_um=1e3,
-                sample_um=stack.step_um,
-                pixel_um=pitch * bins,
-                normalisation=name,
-            )
-            for i in sorted({0, len(value) - 1}):
-                x, y = np.rad2deg(stack.angles_rad[i])
-                label = f"{bins}×{bins}, ({x:.3g}°, {y:.3g}°)"
-                line = "-" if i == 0 else "--"
-                curve = value[i].numpy() / steps_mm**2
-                panel.plot(middle_mm, curve, line, color=f"C{bins}", label=label)
-        panel.set(title=f"normalised by the {word}", xlabel="source depth / mm")
-        panel.set(ylabel="I(z) / mm⁻²", ylim=(0, None))
-    axes[1].legend(fontsize=7, title=f"bins of {pitch:g} µm pixels", title_fontsize=7)
-    figure.suptitle(
-        "Axial information of Eq. 11, mean over 9 sub-pixel positions; the normalisation decides the ranking"
-    )
+    figure, panel = make_figure(1, 1, size=(5.5, 3.6))
+    for bins in (1, 2, 3):
+        value = fisher.axial_information(
+            light[:, :-1],
+            light[:, 1:],
+            step_um=1e3,
+            sample_um=stack.step_um,
+            pixel_um=pitch * bins,
+            normalisation="l2",
+        )
+        for i in sorted({0, len(value) - 1}):
+            x, y = np.rad2deg(stack.angles_rad[i])
+            label = f"{bins}×{bins}, ({x:.3g}°, {y:.3g}°)"
+            curve = value[i].numpy() / (np.diff(stack.depths_um) * 1e-3) ** 2
+            line = "-" if i == 0 else "--"
+            panel.plot(middle_mm, curve, line, color=f"C{bins}", label=label)
+    panel.set(xlabel="source depth / mm", ylabel="I(z) / mm⁻²", ylim=(0, None))
+    panel.legend(fontsize=7, title=f"bins of {pitch:g} µm pixels", title_fontsize=7)
     return figure_png(figure)
 
 
@@ -830,23 +835,6 @@ def _own_cell(device: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
 
 
 DARK = 0.1  # least share of the light in a window that holds an image
-BUDGET_WORDS = (
-    "What computation and model are wrong by, each alone, the worst over angles: the terms of the model are those "
-    "of a perfect lens of the same aperture."
-)
-FIGURES = (
-    "x / deg",
-    "y / deg",
-    "source / mm",
-    "FWHM / um",
-    "limit",
-    "Strehl ratio",
-    "MTF50 along x / mm",
-    "along y",
-    "limit",
-    "efficiency",
-    "limit",
-)
 
 
 def tolerance_excess(stack: psf.PsfStack) -> str:
@@ -871,7 +859,10 @@ def dark_window(computed: ComputedPsfs) -> str:
     dark = [metrics for metrics in computed.figures if not metrics.window_share >= DARK]
     if not dark:
         return ""
-    angles = ", ".join(_angle(metrics.angle_rad) for metrics in dark)
+    angles = ", ".join(
+        "({:.3g}, {:.3g}) deg".format(*np.rad2deg(metrics.angle_rad))
+        for metrics in dark
+    )
     share = max(metrics.window_share for metrics in dark)
     meets = computed.meets_um
     where = (
@@ -882,74 +873,16 @@ def dark_window(computed: ComputedPsfs) -> str:
     return f"the window of {angles} holds {share:.2g} of the light: {where}"
 
 
-def psf_text(target: Path, computed: ComputedPsfs) -> str:
-    """Result of the command in words: error budget, figures of each angle, scan.
-
-    Args:
-        target: output file.
-        computed: PSFs and figures.
-    """
-    stack = computed.stack
-    counts = (
-        ("angle", stack.angles_rad),
-        ("depth", stack.depths_um),
-        ("wavelength", stack.weights),
-    )
-    shape = " x ".join(
-        f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts
-    )
-    lines = [
-        f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})",
-        f"  {stack.budget.text}",
-        *(_figures(metrics) for metrics in computed.figures),
-    ]
-    if computed.scan is not None:
-        ends = computed.scan.shift_um[[0, -1]]
-        lines.append(
-            f"  scan behind the lens, {ends[0]:+.3g} to {ends[1]:+.3g} um about the sensor: brightest at "
-            f"{computed.scan.best_um:+.2g} um"
-        )
+def _place_note(computed: ComputedPsfs) -> str:
+    """Where rays of the design source meet, in words, where that is off the axis."""
     meets = computed.meets_um
-    if meets is not None and math.hypot(*meets[:2]) > stack.step_um:
-        lines.append(f"  rays of the design source meet {format_place(meets)}")
-    return "\n".join(lines)
+    if meets is None or math.hypot(*meets[:2]) <= computed.stack.step_um:
+        return ""
+    return f"rays of the design source meet {format_place(meets)}"
 
 
-def _figures(spot: psf.FocusMetrics) -> str:
-    """Figures of the sharpest depth of one field angle, in words.
-
-    Args:
-        spot: FWHM, Strehl ratio, MTF50 and efficiency, with errors and limits.
-    """
-    where = f"  at {_angle(spot.angle_rad)}, source at {_depth(spot.depth_um)}"
-    if not spot.window_share >= DARK:
-        return f"{where}: no image, {spot.window_share:.2g} of the light in the window"
-    mtf = " / ".join(f"{1e3 * f:.4g}" for f in spot.mtf50_per_um)
-    error = 1e3 * max(spot.mtf50_error_per_um)
-    return (
-        f"{where}: FWHM {spot.fwhm_um:.4g} +- {spot.fwhm_error_um:.2g} um (diffraction limit {spot.limit.fwhm_um:.4g}), "
-        f"Strehl ratio {spot.strehl:.3f} +- {spot.strehl_error:.2g},\n"
-        f"    MTF50 along x / y {mtf} +- {error:.2g} cycles/mm (limit {1e3 * spot.limit.mtf50_per_um:.4g}, cut-off "
-        f"{1e3 * spot.limit.cutoff_per_um:.4g}),\n"
-        f"    focusing efficiency {spot.efficiency:.3f} +- {spot.efficiency_error:.2g}: power within three FWHM over "
-        f"power on the aperture (limit {spot.limit.efficiency:.3f}); {spot.window_share:.1%} of the light in the window"
-    )
-
-
-def _angle(angle_rad: tuple[float, float]) -> str:
-    """A field angle (x, y) in deg, in words."""
-    x, y = np.rad2deg(angle_rad)
-    return f"({x:.3g}, {y:.3g}) deg"
-
-
-def _depth(depth_um: float) -> str:
-    """A source depth in mm, in words."""
-    return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
-
-
-def psf_numbers(computed: ComputedPsfs) -> dict[str, Any]:
-    """Result of the command as a dictionary for JSON; None for numbers that are not
-    finite.
+def psf_values(computed: ComputedPsfs) -> dict[str, Any]:
+    """Result of the command as a dictionary for JSON.
 
     Args:
         computed: PSFs and figures.
@@ -958,121 +891,18 @@ def psf_numbers(computed: ComputedPsfs) -> dict[str, Any]:
     values: dict[str, Any] = {
         "error": stack.error,
         "computed_error": stack.budget.computed,
-        "budget": {name: _plain(v) for name, v in asdict(stack.budget).items()},
+        "budget": asdict(stack.budget),
         "tolerance": stack.tolerance,
         "converged": stack.converged,
         "reason": stack.reason,
-        "depths_um": [_plain(depth) for depth in stack.depths_um.tolist()],
+        "depths_um": stack.depths_um.tolist(),
         "angles_rad": stack.angles_rad.tolist(),
         "wavelengths_um": stack.wavelengths_um.tolist(),
-        "focus": [_plain(asdict(metrics)) for metrics in computed.figures],
+        "focus": [asdict(metrics) for metrics in computed.figures],
+        "rays_meet_um": computed.meets_um,
     }
-    meets = computed.meets_um
-    values["rays_meet_um"] = None if meets is None else list(meets)
     if computed.scan is not None:
         names = ("shift_um", "peak", "fwhm_um")
-        scan = {name: _plain(getattr(computed.scan, name).tolist()) for name in names}
+        scan = {name: getattr(computed.scan, name).tolist() for name in names}
         values["z_scan"] = scan | {"best_um": computed.scan.best_um}
     return values
-
-
-def _plain(value: Any) -> Any:
-    """A value with None in place of numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def key_figures(computed: ComputedPsfs) -> list[KeyFigure]:
-    """Key figures of the report: counts, errors, efficiency and Strehl ratio on axis.
-
-    Args:
-        computed: PSFs and figures.
-    """
-    stack = computed.stack
-    budget = computed.stack.budget
-    focus = computed.figures[0]
-    shape = len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)
-    figures = [
-        KeyFigure("field angles × depths × wavelengths", " × ".join(map(str, shape))),
-        KeyFigure(
-            "relative error of what is computed",
-            f"{budget.computed:.2g}",
-            stack.converged,
-        ),
-        KeyFigure("with what the model leaves out", f"{budget.total:.2g}"),
-        KeyFigure("focusing efficiency", f"{focus.efficiency:.3f}"),
-        KeyFigure("Strehl ratio", f"{focus.strehl:.3f}"),
-    ]
-    if math.isnan(budget.outside):
-        return figures
-    outside = KeyFigure("of the light falls beside the window", f"{budget.outside:.2g}")
-    return [*figures, outside]
-
-
-def psf_sections(computed: ComputedPsfs, pictures: dict[str, bytes]) -> list[Section]:
-    """Sections of the report: pictures, focus, error by cause, energy.
-
-    Args:
-        computed: PSFs and figures.
-        pictures: PNG by caption.
-    """
-    stack = computed.stack
-    figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]
-    focus_rows = [
-        [
-            *(f"{x:.3g}" for x in np.rad2deg(spot.angle_rad)),
-            "∞" if math.isinf(spot.depth_um) else f"{1e-3 * spot.depth_um:.4g}",
-            f"{spot.fwhm_um:.4g} ± {spot.fwhm_error_um:.2g}",
-            spot.limit.fwhm_um,
-            f"{spot.strehl:.3f} ± {spot.strehl_error:.2g}",
-            *(f"{1e3 * f:.4g}" for f in spot.mtf50_per_um),
-            1e3 * spot.limit.mtf50_per_um,
-            f"{spot.efficiency:.3f} ± {spot.efficiency_error:.2g}",
-            spot.limit.efficiency,
-        ]
-        for spot in computed.figures
-    ]
-    focus = Table(
-        FIGURES,
-        focus_rows,
-        "The sharpest depth of every field angle; efficiency: power within three FWHM over power on the aperture.",
-    )
-    energy = np.asarray(stack.energy_um2)
-    energy_rows = [
-        [f"{x:.3g}", f"{y:.3g}", float(e.min()), float(e.max())]
-        for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
-    ]
-    energy_table = Table(
-        ("x / deg", "y / deg", "least", "most"),
-        energy_rows,
-        "Light in the window for unit irradiance, µm², over depth.",
-    )
-    return [
-        Section("Pictures", items=figures),
-        Section("Focus", items=[focus]),
-        Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
-        Section("Energy", f"Method: {stack.reason}.", [energy_table]),
-    ]
-
-
-def _budget_table(stack: psf.PsfStack) -> Table:
-    """Table of the relative L2 error by cause, with both sums."""
-    budget = stack.budget
-    rows = [
-        [name, "not known" if math.isnan(v) else f"{v:.2g}"]
-        for name, v in asdict(budget).items()
-    ]
-    rows += [
-        ["computed", f"{budget.computed:.2g}"],
-        ["of the device", f"{budget.total:.2g}"],
-    ]
-    return Table(
-        ("cause", "relative L2"),
-        rows,
-        "The tolerance is about what is computed; outside is a share of light.",
-    )

@@ -28,7 +28,6 @@ OWN = {
     "axes-library": "axes_panels",
     "lens": "lens_panels",
     "psf": "psf_panels",
-    "lights": "lights_panels",
     "far-field": "far_field_panels",
     "near-field": "near_field_panels",
 }
@@ -41,8 +40,7 @@ class Options(CommonOptions):
     Attributes:
         file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the
             toolchain; a mask (GDSII or OASIS);
-            or the folder of a mask, of captures, of a co-design run, or of PSFs alone
-            (one lens in several lights).
+            or the folder of a mask, of captures or of a co-design run.
         output: the page to write; by default the file's name with .html, beside it, or
             with _view.html where a report
             of that name stands there.
@@ -60,7 +58,8 @@ def run(options: Options) -> int:
     """
     target = options.output or _default_page(options.file)
     with options.claim(target) as draft:
-        title, panels = _title_and_panels(options.file)
+        kind = kind_of(options.file)
+        title, panels = f"{options.file.name} ({kind})", panels_of(kind)(options.file)
         write_page(draft.path, title, panels, about=_about(options.file))
     size = target.stat().st_size
     options.console.result(
@@ -85,60 +84,24 @@ def _default_page(path: Path) -> Path:
     return target if GENERATOR in head else target.with_name(f"{target.stem}_view.html")
 
 
-def _title_and_panels(path: Path) -> tuple[str, list[Panel]]:
-    """Title of the page and panels of an artefact."""
-    kind = kind_of(path)
-    return f"{path.name} ({kind})", panels_of(kind)(path)
-
-
 def kind_of(path: Path) -> str:
-    """Kind of an artefact: that of an HDF5 file, ``mask``, ``run``, ``capture`` or
-    ``lights``.
+    """Kind of an artefact: that of an HDF5 file, ``mask``, ``run`` or ``capture``.
 
     Args:
         path: of the file or folder.
 
     Raises:
-        ConfigError: a folder of none of these kinds; what can be shown of it is named.
+        ConfigError: a folder of none of these kinds.
         StoreError: no artefact.
     """
-    if path.is_dir():
-        if kind := _folder_kind(path):
-            return kind
-        inside = [str(p) for p in _inside(path)]
-        pages = [str(p) for p in sorted(path.glob("*.html"))]
-        hint = "" if pages else "; give a file"
-        if inside:
-            hint = f"; give one of {', '.join(inside[:9])}"
-        if pages:
-            hint += f"; its own page is {', '.join(pages[:3])}"
-        raise ConfigError(
-            f"{path} is no folder of a mask, of captures or of a run{hint}"
-        )
-    return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
-
-
-def _folder_kind(path: Path) -> str | None:
-    """Kind of a folder by the names of its files; None where none fits."""
+    if not path.is_dir():
+        return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
     for kind, patterns in FOLDERS.items():
         if any(True for pattern in patterns for _ in path.glob(pattern)):
             return kind
-    return "lights" if _of_lights(path) else None
-
-
-def _of_lights(path: Path) -> bool:
-    """Whether a folder holds several PSF stacks and no other file of ours."""
-    files = [p for p in path.glob("*.h5") if p.is_file()]
-    return len(files) > 1 and all(store.kind_of(p) == "psf" for p in files)
-
-
-def _inside(path: Path) -> list[Path]:
-    """Artefacts below a folder: files, and folders of a kind."""
-    return [
-        p
-        for p in sorted(path.rglob("*"))
-        if p.suffix.lower() in (".h5", *MASKS) or (p.is_dir() and _folder_kind(p))
-    ]
+    raise ConfigError(
+        f"{path} is no folder of a mask, of captures or of a run; give one, or a file"
+    )
 
 
 def _about(path: Path) -> dict[str, object]:

@@ -3,16 +3,13 @@ nearest one.
 """
 
 import dataclasses
-import inspect
 import math
 import re
 import reprlib
-import textwrap
 import tomllib
 import types
 import typing
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,8 +24,6 @@ _BACKSLASH = (
     "a backslash in double quotes begins an escape: write a path of Windows in single "
     "quotes ('C:\\maps\\a.npy') or with /"
 )
-# ``name:`` or ``name, other:`` in the docstring of a record
-_KEY = re.compile(r"(?<!\S)((?:\w+,\s+)*\w+):\s")
 _EITHER_SIGN = ("_rad", "_deg", "_offset")  # endings of keys that may be negative
 # largest seed; largest magnitude of any other number, in the unit of its key
 _MOST, _LARGE = (1 << 63) - 1, 1e9
@@ -187,21 +182,18 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     hints = typing.get_type_hints(record)
     for key in table:
         if key not in fields:
-            elsewhere: dict[str, str] = getattr(record, "ELSEWHERE", {})
             raise ConfigError(
-                f"{where}: unknown key {prefix + key!r}{nearest_name_hint(key, fields, elsewhere)}"
+                f"{where}: unknown key {prefix + key!r}{nearest_name_hint(key, fields)}"
             )
     values = {}
     for key, value in table.items():
-        with _meaning(record, key):
-            values[key] = _convert(value, hints[key], where, prefix + key)
-            _check_range(fields[key], values[key], where, prefix + key)
+        values[key] = _convert(value, hints[key], where, prefix + key)
+        _check_range(fields[key], values[key], where, prefix + key)
     for name, entry in fields.items():
         if _required(entry) and name not in values:
-            with _meaning(record, name):
-                raise ConfigError(
-                    f"{where}: missing key {prefix + name!r} in {record.__name__}"
-                )
+            raise ConfigError(
+                f"{where}: missing key {prefix + name!r} in {record.__name__}"
+            )
     try:
         built = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -209,55 +201,8 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
             f"{where}: {_culprit(record, values, prefix, str(error))}"
         ) from error
     for key, value in values.items():  # signs that the record itself accepts
-        with _meaning(record, key):
-            _check_sign(fields[key], value, where, prefix + key)
+        _check_sign(fields[key], value, where, prefix + key)
     return built
-
-
-class _ExplainedError(ConfigError):
-    """A refusal that already explains its key."""
-
-
-@contextmanager
-def _meaning(record: type[Any], key: str) -> Iterator[None]:
-    """Context that appends the meaning of a key to a refusal of it."""
-    try:
-        yield
-    except _ExplainedError:
-        raise
-    except ConfigError as error:
-        text = textwrap.shorten(
-            describe_fields(record).get(key, ""), 160, placeholder=" ..."
-        )
-        raise _ExplainedError(
-            f"{error} ({key}: {text})" if text else str(error)
-        ) from None
-
-
-def describe_fields(record: type[Any]) -> dict[str, str]:
-    """{field: its description in the docstring of a record}.
-
-    A description is ``name: text`` or ``name, other: text``, up to an empty line.
-    """
-    names = {entry.name for entry in dataclasses.fields(record)}
-    doc = inspect.getdoc(record) or ""
-    if doc.startswith(
-        f"{record.__name__}("
-    ):  # the signature that stands for a docstring
-        return {}
-    matches = [
-        candidate
-        for candidate in _KEY.finditer(doc)
-        if set(re.split(r",\s+", candidate.group(1))) <= names
-    ]
-    descriptions: dict[str, str] = {}
-    for match, following in zip(matches, [*matches, None][1:], strict=True):
-        text = doc[match.end() : following.start() if following else len(doc)].split(
-            "\n\n"
-        )[0]
-        for name in re.split(r",\s+", match.group(1)):
-            descriptions.setdefault(name, " ".join(text.split()).rstrip(" ;."))
-    return descriptions
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:

@@ -5,7 +5,7 @@ exit code 2.
 """
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 # what libraries raise on damaged files
 DAMAGE = (
@@ -92,20 +92,14 @@ class TrainingError(MetalensError):
     """A co-design run cannot start, resume or go on."""
 
 
-def nearest_name_hint(
-    name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None
-) -> str:
+def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     """Hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known
     names.
 
     Args:
         name: that is unknown.
         known: names that are allowed.
-        elsewhere: {name: hint} of names that belong to another place (the ``ELSEWHERE``
-            of a record of settings).
     """
-    if elsewhere and name in elsewhere:
-        return f"; {elsewhere[name]}"
     options = sorted(known)
     close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
     return (

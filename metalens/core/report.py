@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import io
+import itertools
 import json
 import math
 import os
@@ -71,14 +72,7 @@ class Table:
         a long name  0.41
         b            –
         """
-        lines = [list(self.head), *self.cells]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        rows = [
-            "  ".join(
-                cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-            ).rstrip()
-            for row in lines
-        ]
+        rows = align_columns([list(self.head), *self.cells])
         return "\n".join([self.caption, *rows] if self.caption else rows)
 
     def _text(self, value: Any) -> str:
@@ -311,24 +305,64 @@ def format_summary(values: Mapping[str, Any], indent: str = "  ") -> list[str]:
         values: numbers, texts, lists and mappings by key; keys end in their unit.
         indent: blanks before every line.
 
-    >>> values = {"fwhm_um": 1.25, "depths_um": [1.0, 2.0], "focus": {"ok": True}}
+    >>> values = {"fwhm_um": 1.25, "focus": [{"ok": True}, {"ok": False}]}
     >>> print("\n".join(format_summary(values)))
       width at half maximum / µm  1.25
-      depths / µm                 1, 2
       focus
-        ok  yes
+        ok                        yes   no
     """
-    plain = {in_words(k): v for k, v in values.items() if not _is_nested(v)}
-    width = max(map(len, plain), default=0)
-    lines = [f"{indent}{k.ljust(width)}  {_list_text(v)}" for k, v in plain.items()]
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            lines += [f"{indent}{in_words(key)}", *format_summary(value, indent + "  ")]
-        elif _is_nested(value):
-            for entry in value:
-                lines.append(f"{indent}{in_words(key)}")
-                lines += format_summary(entry, indent + "  ")
-    return lines
+    return [indent + line for line in align_columns(list(summary_rows(values)))]
+
+
+def summary_rows(
+    values: Mapping[str, Any] | Sequence[Mapping[str, Any]], level: int = 0
+) -> Iterator[list[str]]:
+    """Rows of a result as text: label and value; inner mappings follow, indented.
+
+    Several results of the same keys stand side by side, a column for each.
+
+    Args:
+        values: a result, or several of the same keys.
+        level: steps by which labels are indented.
+    """
+    entries = [values] if isinstance(values, Mapping) else values
+    inner = []
+    for key, value in entries[0].items():
+        if _is_nested(value):
+            inner.append(key)
+            continue
+        shown = (_list_text(entry.get(key)) for entry in entries)
+        yield ["  " * level + in_words(key), *shown]
+    for key in inner:
+        parts = [entry.get(key) or {} for entry in entries]
+        for group in [parts] if isinstance(parts[0], Mapping) else filter(None, parts):
+            yield ["  " * level + in_words(key)]
+            yield from summary_rows(group, level + 1)
+
+
+def summary_table(values: Mapping[str, Any], caption: str = "") -> Table:
+    """A result as a table of a page, by :func:`summary_rows`."""
+    rows = [
+        [label.replace("  ", "\u2003"), *shown]
+        for label, *shown in summary_rows(values)
+    ]
+    return Table(("quantity", "value"), rows, caption)
+
+
+def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of text of rows of cells, each column as wide as its widest cell."""
+    columns = itertools.zip_longest(*rows, fillvalue="")
+    widths = [max(map(len, column)) for column in columns]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+
+
+def _finite(value: Any) -> Any:
+    """A value for JSON: None in place of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _is_nested(value: Any) -> bool:
@@ -407,20 +441,25 @@ class Console:
         Args:
             title: first line for a person.
             values: the result; see :func:`format_summary`.
-            notes: sentences that explain the result; empty ones are left out.
+            notes: sentences that explain the result, added to it; empty ones are left
+                out.
             failures: checks that the result failed, as sentences; empty ones are none.
 
         Returns:
             The exit status of the command: 1 with a failure, else 0.
         """
-        lines = [title, *format_summary(values)]
-        lines += [f"  {note.strip()}" for note in notes if note]
-        return self.judged(dict(values), "\n".join(lines), failures)
+        told = [note.strip() for note in notes if note]
+        lines = [title, *format_summary(values), *(f"  {note}" for note in told)]
+        text = "\n".join(lines)
+        return self.judged({**values, "notes": told}, text, failures)
 
     def result(self, values: dict[str, Any], text: str) -> None:
-        """Print the outcome: ``values`` as JSON with --json, else ``text``."""
+        """Print the outcome: ``values`` as JSON with --json, else ``text``.
+
+        In JSON None stands for numbers that are not finite.
+        """
         if self.json:
-            flush_output(json.dumps(values, indent=1, default=float) + "\n")
+            flush_output(json.dumps(_finite(values), indent=1, default=float) + "\n")
         else:
             self.say(text)
 
@@ -450,49 +489,18 @@ class Console:
         """
         if self.quiet or self.json:
             yield from items
-        elif sys.stdout.isatty():
-            yield from _bar(items, total, label)
-        else:
-            yield from self._lines(items, total, label)
-
-    def _lines(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        """Yield ``items``, with a line of progress every 10 s and at the end of long
-        work.
-        """
+            return
+        live = sys.stdout.isatty()
         start = last_shown = time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            if now - last_shown > 10 or (done == total and now - start > 2):
+            ended = done == total and (live or now - start > 2)
+            if now - last_shown > (0.2 if live else 10) or ended:
                 rate = done / (now - start)
-                remaining = (total - done) / rate
-                self.say(
-                    f"{label}: {done}/{total}, {rate:.3g}/s, {remaining:.0f} s left"
-                )
+                left = (total - done) / rate
+                text = f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left"
+                # on a terminal the line is written over: return, and erase to its end
+                end = "\n" if ended or not live else ""
+                flush_output(f"\r{text}\033[K{end}" if live else f"{text}\n")
                 last_shown = now
-
-
-def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    """Yield ``items`` under a progress bar with rate and remaining time."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, transient=True) as bar:
-        task = bar.add_task(label, total=total, rate="")
-        start = time.monotonic()
-        for done, item in enumerate(items, 1):
-            yield item
-            rate = done / max(time.monotonic() - start, 1e-9)
-            bar.update(task, advance=1, rate=f"{rate:.3g}/s")

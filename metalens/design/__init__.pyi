@@ -13,7 +13,6 @@ from .assign import phase_coverage_hint as phase_coverage_hint
 from .assign import phase_of as phase_of
 from .focus_check import FocusCheck as FocusCheck
 from .focus_check import check_focus as check_focus
-from .focus_check import focus_figures as focus_figures
 from .focusing import field_angle as field_angle
 from .focusing import has_focus as has_focus
 from .focusing import lens_has_focus as lens_has_focus
@@ -32,4 +31,5 @@ from .profiles import DoubleHelix as DoubleHelix
 from .profiles import Focus as Focus
 from .profiles import PhaseMap as PhaseMap
 from .profiles import hyperbolic_phase as hyperbolic_phase
+from .profiles import lens_focus as lens_focus
 from .sites import PhaseOf as PhaseOf

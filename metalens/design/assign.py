@@ -44,7 +44,7 @@ class Quality:
     numerical_aperture: of the cone that leaves the lens towards the sensor.
     wavefront_efficiency: |sum T exp(i error)|² / N²: power on the aperture that leaves
     in the target wave front. The focusing efficiency is that of the PSF
-    (:func:`metalens.design.focus_figures`).
+    (:func:`metalens.design.check_focus`).
     transmission: mean |T|².
     strehl: |sum T exp(i error)|² / (sum T)²: Strehl ratio left by the phase errors.
     field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a

@@ -3,12 +3,11 @@ meet the sensor.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from metalens.core.arrays import Array
-from metalens.design.profiles import Focus, hyperbolic_phase
+from metalens.design.profiles import Focus, hyperbolic_phase, lens_focus
 from metalens.design.sites import PhaseOf
 from metalens.lens import Lens
 from metalens.optics import media
@@ -17,9 +16,7 @@ RAYS = 25  # along an axis
 _SCALE = 0.98764321  # of the even ray spacing: incommensurate with a map's samples
 SPREAD = 0.2  # largest rms width of rays that meet, over their rms width on the lens
 DARK = 1e-3  # of a perfect lens's peak; a darker meeting point is a vortex
-PLACES = 61  # points across the illuminated part of a lens
-SEARCHED = 121  # points across the lens in the search for that part
-HALF_LIGHT = 0.5  # of the light at angle 0: the field behind a stop ends there
+PLACES = 121  # points across the lens at which its wave front is sampled
 
 
 def has_focus(
@@ -89,9 +86,7 @@ def _nearest_pillar_phase(lens: Lens) -> tuple[PhaseOf, Focus, float]:
         ]
         return np.stack([row[columns] for row in row_phases])
 
-    distances = lens.sensor_distance_um, lens.source_distance_um
-    focus = Focus(lens.wavelength_um, *distances, lens.layers)
-    return nearest, focus, d.radius_um + d.pitch_um / 2
+    return nearest, lens_focus(lens), d.radius_um + d.pitch_um / 2
 
 
 def meeting_um(
@@ -173,8 +168,8 @@ def _trace_rays(
 
 
 def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:
-    """Half field in rad within which the hyperbolic lens keeps a Strehl ratio on its
-    sensor.
+    """Half field in rad along x within which the hyperbolic lens keeps a Strehl ratio
+    on its sensor.
 
     exp(-sigma²) = ``strehl``, sigma in rad the rms wave-front error over the
     illuminated aperture with piston and tilt removed (coma, astigmatism, field
@@ -197,20 +192,6 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
 
 
 def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
-    """Wave-front variance in rad² at a field angle, the largest over four azimuths.
-
-    The azimuths turn the stop about the axis; one where it is centred.
-    """
-    stop = focus.layers.stop
-    variances = []
-    for _ in range(4 if stop is not None and not stop.centred else 1):
-        turned = replace(focus, layers=replace(focus.layers, stop=stop))
-        variances.append(_variance_along_x(turned, radius_um, angle_rad))
-        stop = stop and replace(stop, centre_um=(-stop.centre_um[1], stop.centre_um[0]))
-    return max(variances)
-
-
-def _variance_along_x(focus: Focus, radius_um: float, angle_rad: float) -> float:
     """Wave-front variance in rad² at a field angle along x, piston and tilt removed.
 
     inf where less than half of the illuminated area of angle 0 is left.
@@ -221,47 +202,30 @@ def _variance_along_x(focus: Focus, radius_um: float, angle_rad: float) -> float
         angle_rad: field angle.
     """
     tangent = math.tan(angle_rad)
-    x, y, area_um2 = _illuminated_places(focus, radius_um, tangent)
-    if (
-        area_um2 <= 0
-        or area_um2 < HALF_LIGHT * _illuminated_places(focus, radius_um, 0.0)[2]
-    ):
+    x, y = _illuminated_places(focus, radius_um, tangent)
+    if not x.size or 2 * x.size < _illuminated_places(focus, radius_um, 0.0)[0].size:
         return math.inf
     phase = hyperbolic_phase(x, y, focus)
     for path_um in focus.paths_from(x, y, tangent):
         phase = phase + 2 * np.pi / focus.wavelength_um * path_um
-    basis = np.stack([np.ones_like(x), x, y], axis=1)
-    basis /= np.abs(basis).max(axis=0)
+    basis = np.stack([np.ones_like(x), x, y], axis=1) / [1.0, radius_um, radius_um]
     residual = phase - basis @ np.linalg.lstsq(basis, phase, rcond=None)[0]
     return float((residual**2).mean())
 
 
 def _illuminated_places(
     focus: Focus, radius_um: float, tangent: float
-) -> tuple[Array, Array, float]:
-    """Grid (x,) and (y,) of the illuminated part of the lens, and its area in um².
-
-    With a stop the part is searched on a coarse grid of 121, then sampled by 61 across.
+) -> tuple[Array, Array]:
+    """(n,) x and y in um of an even grid over the illuminated part of the lens.
 
     Args:
         focus: source and sensor distances of the design.
         radius_um: radius of the aperture, um.
         tangent: of the field angle along x.
     """
-    middle = (0.0, 0.0)
-    half = radius_um
-    for count in (PLACES,) if focus.layers.stop is None else (SEARCHED, PLACES):
-        unit, step = np.linspace(-half, half, count, retstep=True)
-        x, y = np.meshgrid(middle[0] + unit, middle[1] + unit)
-        illuminated = np.hypot(x, y) <= radius_um * (1 + 1e-12)
-        if focus.layers.stop is not None:
-            source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um
-            illuminated &= (
-                focus.layers.stop_share(*source, (x, y), 1e-6 * radius_um) > 0
-            )
-        x, y = x[illuminated], y[illuminated]
-        if not x.size:
-            break
-        middle = (float(x.max() + x.min()) / 2, float(y.max() + y.min()) / 2)
-        half = float(max(np.ptp(x), np.ptp(y)) / 2 + step)
-    return x, y, x.size * float(step) ** 2
+    axis = np.linspace(-radius_um, radius_um, PLACES)
+    x, y = np.meshgrid(axis, axis)
+    illuminated = np.hypot(x, y) <= radius_um * (1 + 1e-12)
+    source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um
+    illuminated &= focus.layers.stop_share(*source, (x, y), 1e-6 * radius_um) > 0
+    return x[illuminated], y[illuminated]

@@ -12,7 +12,7 @@ from metalens import rcwa
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.design.neighbours import drawn_diameter_range, estimate_neighbour_coupling
-from metalens.design.profiles import Focus
+from metalens.design.profiles import lens_focus
 from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.psf import NEIGHBOURS, LeftOut
 
@@ -181,12 +181,7 @@ def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
     """
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
-    focus = Focus(
-        lens.wavelength_um,
-        lens.sensor_distance_um,
-        lens.source_distance_um,
-        lens.layers,
-    )
+    focus = lens_focus(lens)
     sine = np.array(
         [
             focus.aperture(r) + r / math.hypot(r, lens.source_distance_um)

@@ -12,6 +12,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, LensError
+from metalens.lens import Lens
 from metalens.optics import Layers, check_gaps, media
 from metalens.optics.paths import path_difference, source_path
 
@@ -102,6 +103,12 @@ class Focus:
             path = media.path_difference(pairs, sine**2, reach**2, change)[1]
             paths.append(np.asarray(path))
         return paths[0], paths[1]
+
+
+def lens_focus(lens: Lens) -> Focus:
+    """What a lens images onto what: wavelength, distances and films of its design."""
+    distances = lens.sensor_distance_um, lens.source_distance_um
+    return Focus(lens.wavelength_um, *distances, lens.layers)
 
 
 @dataclass(frozen=True, slots=True)

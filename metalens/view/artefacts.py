@@ -14,7 +14,6 @@ from metalens import library as libraries
 from metalens import psf
 from metalens.core import report, store
 from metalens.core.arrays import Array
-from metalens.core.errors import StoreError
 from metalens.library import axes
 from metalens.view import standing
 from metalens.view.panels import (
@@ -148,11 +147,7 @@ def lens_panels(path: Path) -> list[Panel]:
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
-        return [
-            standing.draw_pillars(lens),
-            standing.draw_phase(lens),
-            _section(diameter, lens),
-        ]
+        return [standing.draw_pillars(lens), _section(diameter, lens)]
     index, sizes = classes_of(diameter)
     return [
         ClassMapPanel(
@@ -190,130 +185,56 @@ def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
 
 
 def psf_panels(path: Path) -> list[Panel]:
-    """PSFs with sliders over angle, depth and so on, and the error by cause.
+    """PSFs with sliders over angle, depth and so on, their peak and energy over depth,
+    and the error by cause.
+
+    Of a large stack every n-th depth is shown.
 
     Args:
         path: of the PSFs.
     """
     stack = psf.load(path)
-    return [*_psfs([stack], [path.stem]), _budgets([stack], ["error"])]
-
-
-def lights_panels(path: Path) -> list[Panel]:
-    """PSFs of all files of a folder with a slider over the files.
-
-    One lens in light of several wavelengths or polarisations.
-
-    Args:
-        path: of the folder.
-
-    Raises:
-        StoreError: a file that is no PSF stack, or of other depths, angles or samples
-            than the first.
-    """
-    files = sorted(path.glob("*.h5"))
-    stacks = [psf.load(file) for file in files]
-    for file, stack in zip(files, stacks, strict=True):
-        for what in ("depths_um", "angles_rad", "step_um"):
-            if not np.array_equal(getattr(stack, what), getattr(stacks[0], what)):
-                raise StoreError(
-                    f"{file} has other {what} than {files[0].name}: look at them one by one"
-                )
-        if np.shape(stack.intensity) != np.shape(stacks[0].intensity):
-            raise StoreError(
-                f"{file} has other samples than {files[0].name}: look at them one by one"
-            )
-    names = [
-        f"{file.stem}, {_light(stack)}"
-        for file, stack in zip(files, stacks, strict=True)
-    ]
-    return [*_psfs(stacks, names), _budgets(stacks, names)]
-
-
-def _light(stack: psf.PsfStack) -> str:
-    """Its wavelength, or the first and last of a spectrum."""
-    waves = [
-        f"{1e3 * w:.4g}" for w in np.asarray(stack.wavelengths_um)[[0, -1]].tolist()
-    ]
-    return f"{waves[0]} nm" if waves[0] == waves[1] else f"{waves[0]} to {waves[1]} nm"
-
-
-def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
-    """Images of PSF stacks on one grid, and their peak and energy over depth.
-
-    A slider over the stacks where there are several. Of large stacks every n-th depth
-    is shown.
-
-    Args:
-        stacks: of equal shape.
-        lights: name of each.
-    """
-    first = stacks[0]
-    shown = slice(
-        None, None, math.ceil(len(stacks) * first.intensity.size / MOST_SAMPLES)
-    )  # of the depths
-    values = np.stack(
-        [np.asarray(stack.intensity)[..., shown, :, :] for stack in stacks]
-    )
-    energy = np.stack([np.asarray(stack.energy_um2)[..., shown] for stack in stacks])
-    depth = 1e-3 * first.depths_um[shown]
+    shown = slice(None, None, math.ceil(stack.intensity.size / MOST_SAMPLES))
+    values = np.asarray(stack.intensity)[..., shown, :, :]
+    energy = np.asarray(stack.energy_um2)[..., shown]
+    depth = 1e-3 * stack.depths_um[shown]
     sliders = [SliderAxis("depth", depth.tolist(), "mm")]
-    if values.ndim >= 5:
-        sliders.insert(
-            0, SliderAxis("field angle", [_angle(pair) for pair in first.angles_rad])
-        )
-    while values.ndim - 3 > len(sliders):
+    if values.ndim >= 4:
+        angles = [_degrees(np.degrees(pair)) for pair in stack.angles_rad]
+        sliders.insert(0, SliderAxis("field angle", angles))
+    while values.ndim - 2 > len(sliders):
         count = values.shape[values.ndim - 3 - len(sliders)]
         sliders.insert(0, SliderAxis("lens", list(range(count))))
-    if len(stacks) > 1:
-        sliders.insert(0, SliderAxis("light", lights))
-    else:
-        values, energy = values[0], energy[0]
     peak = float(values.max())
     sliders = at_brightest(sliders, values)
     lines = {
         "peak": values.max(axis=(-2, -1)) / peak,
         "light in the window": energy / energy.max(),
     }
-    worst = max(stacks, key=lambda stack: stack.error)
+    causes = [
+        (report.in_words(cause), "–" if math.isnan(error) else error)
+        for cause, error in dataclasses.asdict(stack.budget).items()
+    ]
     return [
         ImagePanel(
             "Point spread function",
             values / peak,
             sliders,
-            first.step_um,
+            stack.step_um,
             "of the highest peak",
-            f"Samples of {first.step_um:g} um; stated relative error {worst.error:.1e} ({worst.reason}).",
+            f"Samples of {stack.step_um:g} um; stated relative error {stack.error:.1e} ({stack.reason}).",
             optics=True,
         ),
         CurvePanel(
             "Over depth", depth, "depth / mm", lines, "of the largest", sliders[:-1]
         ),
+        TablePanel(
+            "Budget of the error",
+            ("cause", "error"),
+            causes,
+            "Relative L2 error of the intensity that each cause brings; –: not known for this lens.",
+        ),
     ]
-
-
-def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
-    """Table of the relative L2 error of the PSFs by cause, one column for every stack.
-
-    A dash where the error by a cause is not known.
-
-    Args:
-        stacks: with their error budgets.
-        names: of the columns.
-    """
-    budgets = [dataclasses.asdict(stack.budget) for stack in stacks]
-    rows = [
-        (
-            report.in_words(cause),
-            *(
-                "–" if math.isnan(budget[cause]) else budget[cause]
-                for budget in budgets
-            ),
-        )
-        for cause in budgets[0]
-    ]
-    words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
-    return TablePanel("Budget of the error", ("cause", *names), rows, words)
 
 
 def far_field_panels(path: Path) -> list[Panel]:
@@ -417,10 +338,6 @@ def near_field_panels(path: Path) -> list[Panel]:
             )
         )
     return panels
-
-
-def _angle(pair: Array) -> str:
-    return _degrees(np.degrees(pair))
 
 
 def _degrees(pair: Array) -> str:

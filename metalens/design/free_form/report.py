@@ -18,15 +18,13 @@ from metalens.design.free_form.search import (
     vortex_phase,
 )
 from metalens.design.free_form.settings import ResolvedFisherSettings, between_mm
-from metalens.image import Field, Pupil
+from metalens.image import Pupil
 from metalens.image import pupil as pupils
 
 # range of foci of the simple lenses: shares of the depth range in 1/z, 0 the near end
 FOCI = (-0.87, 1.77)  # of the hyperbolic lens
 HELIX_FOCI = (-0.37, 1.21)  # of the double helix
 ZONES = (1, 2, 3, 4, 5, 6)  # of the double helix
-SHOWN = 3  # width of the window over that of a PSF in the picture
-STRIP = 6  # depths of the PSFs in the picture
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -165,19 +163,15 @@ def report_values(
 
 
 def report_picture(
-    lenses: tuple[JudgedLens, ...], pupil: Pupil, settings: ResolvedFisherSettings
+    lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings
 ) -> bytes:
-    """PNG of information and energy over depth at the first angle, and PSFs over depth.
+    """PNG of information and encircled energy over depth at the first angle.
 
     Args:
         lenses: judged designs.
-        pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
     """
-    figure, _ = make_figure(1, 1, size=(10, 7.6))
-    figure.clear()
-    top, bottom = figure.subfigures(2, 1, height_ratios=(3, 0.4 + 1.3 * len(lenses)))
-    left, right = top.subplots(1, 2)
+    figure, (left, right) = make_figure(1, 2, size=(10, 3.8))
     depths, angle = _depths(lenses, settings), settings.angles_deg[0]
     for lens in lenses:
         left.plot(depths, lens.score.information[0].numpy(), ".-", label=lens.name)
@@ -192,34 +186,10 @@ def report_picture(
     right.set(
         ylabel=f"energy in {settings.radius_um:g} µm",
         xlabel="source depth / mm",
+        title="encircled energy; dotted: what was asked for",
         ylim=(0, 1),
     )
-    right.set_title("encircled energy; dotted: what was asked for")
     left.legend(fontsize=7)
-    planes = torch.linspace(
-        1e3 * settings.depths_mm[0],
-        1e3 * settings.depths_mm[1],
-        STRIP,
-        dtype=torch.float64,
-    )
-    fields = [Field(float(np.radians(angle)))] * STRIP
-    samples = max(2, int(settings.window_um / SHOWN / settings.sample_um))
-    panels = bottom.subplots(len(lenses), STRIP, squeeze=False)
-    for row, lens in enumerate(lenses):
-        stack = pupils.psf(lens.phase_rad, pupil, depths_um=planes, fields=fields, focus_um=lens.focus_um,
-                                  sample_um=settings.sample_um, samples=samples)  # fmt: skip
-        for column, image in enumerate(stack):
-            panel = panels[row, column]
-            panel.imshow(torch.sqrt(image).numpy(), cmap="inferno")
-            panel.set(xticks=[], yticks=[])
-            if row == 0:
-                panel.set_title(f"{planes[column] / 1e3:g} mm", fontsize=8)
-            if column == 0:
-                panel.set_ylabel(lens.name.replace(", ", "\n"), fontsize=7)
-    bottom.supxlabel(
-        f"PSFs, {samples * settings.sample_um:.3g} µm wide, square root of the intensity, each at its own scale",
-        fontsize=8,
-    )
     return figure_png(figure)
 
 

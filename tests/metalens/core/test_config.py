@@ -71,51 +71,6 @@ def test_bad_config_is_refused_by_name(text, message):
         config.loads(text, Outer)
 
 
-@dataclass(frozen=True)
-class Told:
-    """Two keys, explained.
-
-    reach_um: (nearest, farthest) place of
-        the stage. count: how many,
-        again again again again again again again again again again
-        again again again again again again again again again again
-        again again again again again again again again again again
-
-    Not of any key.
-    """
-
-    reach_um: tuple[float, float]
-    count: int = 1
-    inner: Outer | None = None
-
-
-@pytest.mark.parametrize(
-    ("text", "ends"),
-    [
-        (
-            "reach_um = [1.0]",
-            "need 2 (reach_um: (nearest, farthest) place of the stage)",
-        ),
-        (
-            "count = 2",
-            "missing key 'reach_um' in Told (reach_um: (nearest, farthest) place of the stage)",
-        ),
-        (
-            "reach_um = [1, 2]\ncount = -1",
-            f"need 0 or more (count: how many,{' again' * 24} ...)",  # 160 characters
-        ),
-        (
-            "reach_um = [1, 2]\n[inner]\npitch_um = true",
-            "(bool), need float",
-        ),  # of a record that says nothing
-    ],
-)
-def test_a_refused_key_is_explained(text, ends):
-    with pytest.raises(ConfigError) as refusal:
-        config.loads(text, Told)
-    assert str(refusal.value).endswith(ends)
-
-
 def test_missing_file_and_binary_file_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         config.load(tmp_path / "absent.toml", Outer)

@@ -1,6 +1,4 @@
-"""The exact sum sees the focus of a good lens, and says so when a lens focuses
-elsewhere.
-"""
+"""The focus of a good lens passes, and a lens that focuses elsewhere does not."""
 
 from dataclasses import replace
 
@@ -38,17 +36,15 @@ def _lens(proxy, phase=None):
 def test_a_hyperbolic_lens_focuses_on_the_axis_in_the_sensor_plane(proxy):
     found = check_focus(_lens(proxy))
     assert found.passed
-    assert abs(found.x_um) < 0.02 * found.resolution_um
-    assert abs(found.y_um) < 0.02 * found.resolution_um
+    assert max(abs(found.x_um), abs(found.y_um)) < 0.01 * found.resolution_um
     # The brightest point of the axis lies 12 d / (pi N)² before the focus (Li and Wolf
-    # 1981), N = R² / (lambda d);
-    # the next order in NA adds 6 %.
+    # 1981), N = R² / (lambda d); the scan leaves out light beyond its window.
     fresnel_number = 50.0**2 / (0.85 * 200.0)
     assert found.z_um == pytest.approx(
-        -12 * 200.0 / (np.pi * fresnel_number) ** 2, rel=0.1
+        -12 * 200.0 / (np.pi * fresnel_number) ** 2, abs=0.03 * found.depth_um
     )
-    # every pillar makes its phase within 2e-5 rad
-    assert found.strehl == pytest.approx(1.0, abs=1e-8)
+    # every pillar makes its phase within 2e-5 rad; the tolerance of the PSF is 1e-3
+    assert found.figures.strehl == pytest.approx(1.0, abs=2e-3)
 
 
 def test_a_lens_that_focuses_to_the_side_is_told_which_side(proxy):

@@ -79,13 +79,15 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
         assert seen.sensor_distance_um == focus.sensor_distance_um
         found = design.check_focus(seen)
         assert found.passed
-        assert found.strehl == pytest.approx(1, abs=3e-3)
+        assert found.figures.strehl == pytest.approx(1, abs=4e-3)
         assert quality.wavefront_efficiency == pytest.approx(level**2, rel=3e-3)
         assert quality.rms_phase_error_rad < 0.05
     wrong = dataclasses.replace(
         made_lens.seen("y"), sensor_distance_um=NEAR.sensor_distance_um
     )
-    assert design.check_focus(wrong, axial=False).strehl < 0.7  # a depth of focus away
+    assert (
+        design.check_focus(wrong, axial=False).figures.strehl < 0.7
+    )  # a depth of focus away
     assert split.multiplexed
     assert split.leaked == pytest.approx((LEAK**2, LEAK**2 / 4))
     assert split.wavefront_efficiency_error[0] == pytest.approx(
@@ -223,9 +225,6 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
     assert sides == {
         (o.notes["size / nm"], o.notes["length / nm"]) for o in drawing.outlines
     }
-    images = standing.draw_phase(again)
-    assert list(images.axes[0].values) == ["along x", "along y"]
-    assert np.abs(images.values[0] - images.values[1]).max() > 0.4
 
 
 def test_targets_are_checked():

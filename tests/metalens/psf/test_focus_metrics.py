@@ -240,7 +240,7 @@ def test_a_window_without_light_ends_1_and_says_where_the_rays_meet(saved, capsy
 def test_design_psf_and_the_definition_agree_on_the_efficiency():
     """Power of a plain sum within three FWHM about the focus over the lens's area."""
     made = flat_lens(n=120)
-    found = design.focus_figures(made)
+    found = design.check_focus(made, axial=False).figures
     step = found.fwhm_um / 9
     axis = (np.arange(29) - 14) * step
     x, y = np.meshgrid(axis, axis)
@@ -269,6 +269,6 @@ def test_a_lens_of_a_tenth_of_a_fresnel_zone_has_its_figures_too():
     four times as wide as the lens.
     """
     made = replace(flat_lens(n=54), sensor_distance_um=2000.0)
-    found = design.focus_figures(made)
+    found = design.check_focus(made, axial=False).figures
     assert found.fwhm_um == pytest.approx(1.029 * WAVE * 2000 / (54 * PITCH), rel=0.03)
     assert 0 < found.efficiency < LEVEL**2

@@ -202,39 +202,6 @@ def test_figures_that_do_not_fit_are_refused():
         ClassMapPanel("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
 
 
-def test_psfs_of_several_lights_have_a_slider(folder, tmp_path):
-    stack = psf.load(folder / "psf.h5")
-    red = dataclasses.replace(
-        stack,
-        intensity=0.5 * stack.intensity[..., ::-1],
-        wavelengths_um=np.array([0.94]),
-    )
-    broad = dataclasses.replace(
-        red,
-        wavelengths_um=np.array([0.93, 0.95]),
-        weights=np.array([0.5, 0.5]),
-        error=0.03,
-    )
-    for name, one in (("a", stack), ("b", red), ("c", broad)):
-        psf.save(tmp_path / f"{name}.h5", one)
-    assert view.kind_of(tmp_path) == "lights"
-    images, curves, budget = artefacts.lights_panels(tmp_path)
-    wave = f"{1e3 * float(stack.wavelengths_um[0]):.4g}"
-    assert images.axes[0].values == [f"a, {wave} nm", "b, 940 nm", "c, 930 to 950 nm"]
-    assert images.values.shape == (3, *stack.intensity.shape)
-    assert images.values[1] == pytest.approx(
-        0.5 * stack.intensity[..., ::-1] / stack.intensity.max()
-    )
-    assert "3.0e-02" in images.caption  # of the worst
-    assert len(budget.head) == 4
-    assert curves.lines["peak"].shape == (3, *stack.intensity.shape[:-2])
-    psf.save(
-        tmp_path / "d.h5", dataclasses.replace(stack, depths_um=1.5 * stack.depths_um)
-    )
-    with pytest.raises(StoreError, match=r"d.h5 has other depths_um than a.h5"):
-        artefacts.lights_panels(tmp_path)
-
-
 def test_points_need_a_place_and_a_name_each():
     with pytest.raises(StoreError, match="as many finite x"):
         PointPanel("networks", [1.0, 2.0], [0.5], "cost", "error", ["a", "b"])
