@@ -133,11 +133,6 @@ class DistributedOptions(CommonOptions):
 
     workers: int | None = None
 
-    @property
-    def spread(self) -> bool:
-        """Whether workers were asked for."""
-        return self.workers is not None
-
     def shared(self) -> contextlib.AbstractContextManager[None]:
         """Where the work of the block is done.
 

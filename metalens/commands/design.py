@@ -319,12 +319,7 @@ def _design_two_sizes(
     designed, metrics = design.assign_polarization_multiplexed(
         (phase, phase_y), (focus, focus_y), library=pillars, **_common(settings, inputs)
     )
-    values: dict[str, Any] = {
-        "pillars": metrics.x.pillars,
-        "pairs_of_sizes": metrics.pairs,
-        "multiplexed": metrics.multiplexed,
-        "covered": metrics.covered,
-    }
+    values: dict[str, Any] = {"pillars": metrics.x.pillars}
     failures = []
     lights: tuple[Literal["x", "y"], ...] = ("x", "y")
     profiles = settings.profile, (settings.along_y or settings).profile
@@ -417,7 +412,7 @@ def _design_one_size(
             f"for {designed.one_light} only: {cell.described} has another response for x "
             "and y (lengths_um in [sweep] makes a library for both)"
         )
-    designed, coupling = _couple(designed, quality, radius_um, options, rotated=rotated)
+    designed, coupling = _couple(designed, quality, options, rotated=rotated)
     checkable = settings.profile == "hyperbolic"
     expected = quality.strehl if others else 1.0
     own, failure = _judge(
@@ -591,12 +586,7 @@ def format_place(at_um: tuple[float, float, float]) -> str:
 
 
 def _couple(
-    designed: Lens,
-    quality: Quality,
-    radius_um: float,
-    options: Options,
-    *,
-    rotated: bool,
+    designed: Lens, quality: Quality, options: Options, *, rotated: bool
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
     """The lens, with solved rows under ``--own-cell``, and its neighbour coupling loss.
 
@@ -605,7 +595,6 @@ def _couple(
     Args:
         designed: the lens.
         quality: of its pillars.
-        radius_um: radius of the aperture.
         options: of the command line.
         rotated: whether its phase is geometric.
 
@@ -620,12 +609,9 @@ def _couple(
             )
         return designed, None
     if not options.own_cell:
-        return designed, design.estimate_neighbour_coupling_loss(
-            designed, radius_um=radius_um
-        )
-    rows = design.solve_coupling_rows(designed, radius_um=radius_um)
-    designed = replace(designed, neighbours=rows)
-    return designed, design.neighbour_coupling_loss(designed, radius_um=radius_um)
+        return designed, design.estimate_neighbour_coupling_loss(designed)
+    designed = replace(designed, neighbours=design.solve_coupling_rows(designed))
+    return designed, design.neighbour_coupling_loss(designed)
 
 
 def _judge(

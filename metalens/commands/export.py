@@ -54,13 +54,9 @@ def run(options: Options) -> int:
             options.output, 12 * options.samples**2 if grid else 4 * rows * columns
         )
         error = export.export_lens(draft.path, device, samples=options.samples)
-    how = ""
-    if grid:
-        how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"
     values = {
         "file": options.output.name,
         "bytes": options.output.stat().st_size,
         "interpolation_error_rad": error,
     }
-    options.console.result(values, f"{options.output}: {values['bytes']:,} bytes{how}")
-    return 0
+    return options.console.report(f"{options.output}", values)

@@ -142,7 +142,13 @@ def _finish(
         inputs: SHA-256 of each input file.
         seconds: time of the sweep.
     """
-    fitted, refusal = _fit(pillars, settings.proxy)
+    from metalens.library import library_figure
+
+    fitted, refusal = None, ""
+    try:
+        fitted = proxy_fit.fit(pillars, settings.proxy)
+    except DomainError as error:
+        refusal = str(error)
     added = (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
     notes = pillars.notes + added
     provenance = store.Provenance(config.dumps(settings), inputs)
@@ -153,7 +159,7 @@ def _finish(
         provenance=provenance,
     )
     library.save(path, pillars)
-    _draw(path, pillars, fitted)
+    library_figure(path.with_suffix(".png"), pillars, fitted)
     failures = _failures(
         pillars,
         fitted,
@@ -174,22 +180,6 @@ def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     return {
         file.name: store.sha256(file) for file in (path, *workers.material_files(cell))
     }
-
-
-def _fit(
-    pillars: PillarLibrary, tolerances: ProxyTolerances
-) -> tuple[ProxyFit | None, str]:
-    """The fitted proxy and "", or None and why there is none."""
-    try:
-        return proxy_fit.fit(pillars, tolerances), ""
-    except DomainError as refused:
-        return None, str(refused)
-
-
-def _draw(target: Path, pillars: PillarLibrary, fitted: ProxyFit | None) -> None:
-    from metalens.library import library_figure
-
-    library_figure(target.with_suffix(".png"), pillars, fitted)
 
 
 def _failures(
@@ -420,13 +410,4 @@ def _two_size_values(pillars: axes.AxesLibrary, seconds: float) -> dict[str, Any
         "held_out_median_error": float(np.median(pillars.held_out[:, 3])),
         "held_out_max_error": float(pillars.held_out[:, 3].max()),
         "held_out_above_bar": pillars.missed,
-        "least_transmission": [float(v) for v in _least(pillars)],
     }
-
-
-def _least(pillars: axes.AxesLibrary) -> list[float]:
-    """Least |t| of both polarisations among the usable pairs; 0 where there is none."""
-    return [
-        float(np.abs(pillars.t[..., k, k])[pillars.usable].min(initial=1.0))
-        for k in (0, 1)
-    ]

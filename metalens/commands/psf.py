@@ -82,11 +82,11 @@ class PsfSettings:
     light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean
     of the two, where they are
         focused from and to the same distances (any light, for other lenses).
-    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell
-    (seconds to minutes): the PSFs then
+    own_cell: solve rows of non-identical pillars of the lens's own cell (seconds to
+    minutes): the PSFs then
         hold the factor of those neighbours, the error budget what is left. A lens of
         ``design --own-cell`` holds its
-        rows. Without either, pillars are taken one by one, and those terms are rough,
+        rows. Without either, pillars are taken one by one, and that term is rough,
         of the default cell.
     """
 
@@ -613,10 +613,9 @@ def _compute(
         figures = psf.focus_metrics(stack, device)
         return ComputedPsfs(stack, figures, design.lens_meeting_um(device))
     device = _in_light(path, device, settings)
-    left_out = _own_cell(device, settings) if settings.own_cell else None
-    if left_out is not None and isinstance(left_out.neighbours, lens.NeighbourRows):
-        device = replace(device, neighbours=left_out.neighbours)
-    stack = _of_design(device, settings, left_out, _provenance(path, settings))
+    if settings.own_cell:
+        device = replace(device, neighbours=design.solve_coupling_rows(device))
+    stack = _of_design(device, settings, _provenance(path, settings))
     figures = psf.focus_metrics(stack, device, power_error=design.power_error(device))
     bright = figures[0].window_share >= DARK
     scan = _scan(device, settings, stack) if bright else None
@@ -773,17 +772,13 @@ def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens
 
 
 def _of_design(
-    device: lens.Lens,
-    settings: PsfSettings,
-    left_out: psf.LeftOut | None,
-    provenance: Provenance,
+    device: lens.Lens, settings: PsfSettings, provenance: Provenance
 ) -> psf.PsfStack:
     """PSFs of a design; with pillars of two sizes the mean of light along x and y.
 
     Args:
         device: the lens.
         settings: with nothing left to the lens.
-        left_out: solved terms of the error budget; None for rough ones.
         provenance: of the stack.
 
     Raises:
@@ -798,7 +793,6 @@ def _of_design(
             spectrum=settings.spectrum_of(polarised),
             provenance=provenance,
             polarisation=settings.polarisation,
-            left_out=left_out,
         )
 
     if device.pairs is None or settings.light != "both":
@@ -819,19 +813,6 @@ def _provenance(path: Path, settings: PsfSettings) -> Provenance:
     return Provenance(
         config.dumps(settings), {file.name: store.sha256(file) for file in files}
     )
-
-
-def _own_cell(device: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
-    """Terms of the error budget by the lens's own cell: neighbours and angle of
-    incidence.
-
-    Solved at the largest aperture and angle of the view.
-    """
-    apertures = [psf.sine_aperture(device, angle) for angle in settings.view.angles_rad]
-    incidence = max(
-        float(np.arctan(np.hypot(*np.tan(angle)))) for angle in settings.view.angles_rad
-    )
-    return design.left_out(device, aperture=max(apertures), incidence_rad=incidence)
 
 
 DARK = 0.1  # least share of the light in a window that holds an image

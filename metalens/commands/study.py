@@ -62,18 +62,15 @@ def run(options: Options) -> int:
         plots.write_study(draft.path, study, verdicts, command=command)
     journal.finish()
     best = cell_study.best_cell(study, verdicts)
-    values = {
-        "pitch_um": best and best[0],
-        "height_um": best and best[1],
-        "cells": len(verdicts),
-    }
-    text = f"{options.output}: {len(verdicts)} cells"
-    if best is not None:
-        text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
-    uncertain = cell_study.uncertain_entries(study, verdicts)
-    text += f"\n  {uncertain}" if uncertain else ""
-    return options.console.judged(
-        values, text, [] if best else ["no cell covers a full turn at all wavelengths"]
+    return options.console.report(
+        f"{options.output}: the lowest cell with a full turn everywhere",
+        {
+            "pitch_um": best and best[0],
+            "height_um": best and best[1],
+            "cells": len(verdicts),
+        },
+        notes=[cell_study.uncertain_entries(study, verdicts)],
+        failures=[] if best else ["no cell covers a full turn at all wavelengths"],
     )
 
 

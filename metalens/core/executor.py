@@ -65,17 +65,13 @@ def run_on(processes: int | None = None) -> Iterator[None]:
 
 
 def run_parallel(
-    work: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    *,
-    processes: int | None = None,
+    work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task, in the order in which they finish.
 
     Args:
         work: a function of a module (workers import it by name).
         tasks: its arguments.
-        processes: where :func:`run_on` does not set it; by default one per core.
 
     Raises:
         WorkerError: a worker process died, with its cause. Whatever ``work`` raises.
@@ -86,26 +82,21 @@ def run_parallel(
     if place is not None:
         yield from place(_plain, work, tasks)
         return
-    with _pool(min(processes or usable_cores(), len(tasks))) as pool:
+    with _pool(min(usable_cores(), len(tasks))) as pool:
         yield from _run_in_pool(pool, _plain, work, tasks)
 
 
 def gather_parallel(
-    work: Callable[[Common, Task], Result],
-    common: Common,
-    tasks: Sequence[Task],
-    *,
-    beside: bool = True,
+    work: Callable[[Common, Task], Result], common: Common, tasks: Sequence[Task]
 ) -> list[Result]:
     """``work(common, task)`` of every task, in their order, each with one BLAS thread.
 
+    Without workers of :func:`run_on` tasks run in parallel threads of this process.
+
     Args:
-        work: a function of a module.
+        work: a function of a module that mostly releases the interpreter lock.
         common: what all tasks need.
         tasks: the second arguments.
-        beside: without workers of :func:`run_on`, run the tasks in parallel threads of
-            this process. That is for work that mostly releases the interpreter lock;
-            else they run in turn, each with all threads.
 
     Raises:
         WorkerError: as :func:`run_parallel`. Whatever ``work`` raises.
@@ -114,13 +105,8 @@ def gather_parallel(
     if place is not None and tasks:
         results: dict[int, Result] = dict(place(work, common, tasks))
         return [results[i] for i in range(len(tasks))]
-    with_common = functools.partial(work, common)
     with threads.one_blas_thread():
-        return (
-            threads.run_each(with_common, tasks)
-            if beside
-            else [with_common(task) for task in tasks]
-        )
+        return threads.run_each(functools.partial(work, common), tasks)
 
 
 def _plain(work: Callable[[Task], Result], task: Task) -> Result:

@@ -79,14 +79,13 @@ def run_concurrently(*works: Callable[[], Any]) -> list[Any]:
     """Results of several calls in parallel threads, in the order of ``works``; see
     :func:`run_split`.
     """
-    results = dict[int, Any]()
+    results: list[Any] = [None] * len(works)
 
     def run_range(start: int, stop: int) -> None:
-        for i in range(start, stop):
-            results[i] = works[i]()
+        results[start:stop] = [work() for work in works[start:stop]]
 
     run_split(len(works), run_range)
-    return [results[i] for i in range(len(works))]
+    return results
 
 
 def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:

@@ -22,7 +22,6 @@ from .own_cell import NeighbourCouplingLoss as NeighbourCouplingLoss
 from .own_cell import (
     estimate_neighbour_coupling_loss as estimate_neighbour_coupling_loss,
 )
-from .own_cell import left_out as left_out
 from .own_cell import neighbour_coupling_loss as neighbour_coupling_loss
 from .own_cell import power_error as power_error
 from .own_cell import solve_coupling_rows as solve_coupling_rows

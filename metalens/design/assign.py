@@ -26,8 +26,6 @@ from metalens.library.axes import AxesLibrary, cell_of_sizes
 
 EDGE_UM = 2e-3  # a proxy that ends this near a printable limit is ended by the process
 _STEP_RAD = 0.05  # phase step between tabulated diameters (parabolic interpolation)
-_COVERED_RAD = 0.2  # largest phase error at which a pillar covers a target phase
-_COVERED_LEVEL = 0.7  # least |t| at which a pillar covers a target phase
 _GAPS = 12  # grid of sizes along each axis for the gaps of oblique pillars
 
 # target phases (channels, sites) -> (maps (k, sites), [(phase, |t|) of each channel])
@@ -117,19 +115,12 @@ class PolarizationMetrics:
     x, y: quality for either; ``wavefront_efficiency`` is the share of that light.
     wavefront_efficiency_error: its error for x and y, from the library's error bars.
     leaked: mean power that leaves in the other polarisation, for x and y.
-    covered: share of phase pairs (of phases, where both are one) that a pillar gives
-    within 0.2 rad at |t| of 0.7 or more.
-    multiplexed: whether the two phases differ.
-    pairs: distinct pairs of sizes used.
     """
 
     x: Quality
     y: Quality
-    wavefront_efficiency_error: tuple[float, float]
-    leaked: tuple[float, float]
-    covered: float
-    multiplexed: bool
-    pairs: int
+    wavefront_efficiency_error: tuple[float, ...]
+    leaked: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +331,6 @@ def assign_polarization_multiplexed(
     limits = limits or Limits()
     cell = library.cell
     wave = library.at(focuses[0].wavelength_um)  # index along the wavelength axis
-    isotropic = phases[1] is None
     printable = library.usable[wave] & _is_printable(library, limits)
     if not printable.any():
         x, y = library.x_um, library.y_um
@@ -353,7 +343,7 @@ def assign_polarization_multiplexed(
     jones = library.t[wave, row, column]  # (candidates, 2, 2)
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]])
     sizes = np.array([library.x_um[row], library.y_um[column]], np.float32)
-    table = make_candidates(t, np.ones(2), common_piston=isotropic)
+    table = make_candidates(t, np.ones(2), common_piston=phases[1] is None)
     counts = np.zeros(t.shape[1], int)  # sites at which each candidate stands
 
     def choose_pairs(targets: Array) -> tuple[Array, list[tuple[Array, Array]]]:
@@ -389,15 +379,7 @@ def assign_polarization_multiplexed(
         float(np.average(np.abs(crossed) ** 2, weights=counts))
         for crossed in (jones[:, 1, 0], jones[:, 0, 1])
     ]
-    return lens, PolarizationMetrics(
-        quality[0],
-        quality[1],
-        (errors[0], errors[1]),
-        (leaked[0], leaked[1]),
-        _covered_share(t, isotropic=isotropic),
-        not isotropic,
-        int(np.count_nonzero(counts)),
-    )
+    return lens, PolarizationMetrics(*quality, tuple(errors), tuple(leaked))
 
 
 def assign_geometric_phase(
@@ -728,29 +710,6 @@ def _is_printable(library: AxesLibrary, limits: Limits) -> Array:
         for nodes, v in zip(grid, (x, y), strict=True)
     )
     return np.asarray(wide & (np.array(gaps)[row[:, None], column] >= least_gap))
-
-
-def _covered_share(t: Array, *, isotropic: bool) -> float:
-    """Share of a grid of target phases that some candidate realises.
-
-    A target is covered at a phase error of 0.2 rad or less and |t| of 0.7 or more.
-
-    Args:
-        t: (2, n) complex transmission of the candidates for light along x and y.
-        isotropic: targets are single phases in place of pairs of phases.
-    """
-    steps = 72 if isotropic else 36
-    phases = 2 * np.pi * np.arange(steps) / steps
-    x, y = (
-        (phases, phases)
-        if isotropic
-        else (v.ravel() for v in np.meshgrid(phases, phases))
-    )
-    targets = np.stack([x, y])
-    chosen = t[:, make_candidates(t, np.ones(2)).nearest(targets)]
-    error = np.abs(np.angle(chosen * np.exp(-1j * targets))).max(axis=0)
-    bright = np.abs(chosen).min(axis=0) >= _COVERED_LEVEL
-    return float((bright & (error <= _COVERED_RAD)).mean())
 
 
 def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:

@@ -1,65 +1,22 @@
-"""What a lens's own pillars leave out of its PSF: non-identical neighbours and the angle of
-the light, solved for its cell.
-"""
+"""Coupling between the non-identical neighbours of a lens, solved for its own cell."""
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from metalens import rcwa
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
-from metalens.design.neighbours import drawn_diameter_range, estimate_neighbour_coupling
+from metalens.design.neighbours import estimate_neighbour_coupling
 from metalens.design.profiles import lens_focus
 from metalens.lens import CURVED, Lens, NeighbourRows
-from metalens.psf import NEIGHBOURS, LeftOut
+from metalens.psf import NEIGHBOURS
 
 RINGS = 48  # of a lens, over which light is summed
 # pillars in a row; zones of fewer or more pillars take the row of that length (with
 # two, rows of shifted phases separate the light to both sides)
 FEWEST = 2
 MOST = 12
-DIAMETERS = 5  # at which t is compared over the angle
-TOLERANCE = 1e-2  # of t
-
-
-def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
-    """The terms of the error budget that belong to the lens's own cell.
-
-    Args:
-        aperture: sine of the largest angle by which the lens turns light.
-        incidence_rad: of the light on the pillars; 0 leaves the term of the angle at 0.
-
-    Raises:
-        CellError: the cell has films or tilted walls, whose rows no solver here knows.
-
-    Accuracy: the factor c(s) = 1 + a s + b s² goes through the rows; a few 1e-2 of it
-    are truncation.
-    """
-    if lens.pairs is not None:
-        raise CellError(
-            "own_cell: rows of pillars of two sizes are not solved here; leave own_cell out"
-        )
-    rows = lens.neighbours or estimate_neighbour_coupling(
-        lens, counts=_counts(lens, aperture)
-    )
-    angle = (
-        angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2
-        if incidence_rad
-        else 0.0
-    )
-    return LeftOut(rows, angle, "the lens's own cell")
-
-
-def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
-    """Pillars in rows from the zone of the rim on, where light is turned by the sine
-    ``aperture``.
-    """
-    rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * aperture)))
-    shortest = min(rim, MOST // 2)
-    return shortest, math.ceil(1.5 * shortest), 2 * shortest
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,23 +34,31 @@ class NeighbourCouplingLoss:
     pillars: tuple[int, ...] = ()
 
 
-def solve_coupling_rows(lens: Lens, *, radius_um: float) -> NeighbourRows:
+def solve_coupling_rows(lens: Lens) -> NeighbourRows:
     """Rows of the lens's own pillars with the zones of its rim and longer ones, for the
     lens to hold.
 
     Args:
-        radius_um: radius of the aperture, um.
+        lens: the lens; rows that it holds are not solved again.
 
     Raises:
         CellError: the cell has films or tilted walls, or no round pillars on a square
             lattice.
     """
-    return estimate_neighbour_coupling(
-        lens, counts=_counts(lens, float(_rings(lens, radius_um)[0].max()))
-    )
+    if lens.pairs is not None:
+        raise CellError(
+            "own_cell: rows of pillars of two sizes are not solved; leave own_cell out"
+        )
+    if lens.neighbours is not None:
+        return lens.neighbours
+    steepest = float(_rings(lens)[0].max())
+    rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * steepest)))
+    shortest = min(rim, MOST // 2)
+    counts = shortest, math.ceil(1.5 * shortest), 2 * shortest
+    return estimate_neighbour_coupling(lens, counts=counts)
 
 
-def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplingLoss:
+def neighbour_coupling_loss(lens: Lens) -> NeighbourCouplingLoss:
     """Focus power with coupling over that without, from solved rows of the lens's
     pillars.
 
@@ -106,13 +71,12 @@ def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplin
 
     Args:
         lens: the lens; rows that it holds are not solved again.
-        radius_um: radius of the aperture, um.
 
     Raises:
         CellError: as :func:`solve_coupling_rows`.
     """
-    rows = lens.neighbours or solve_coupling_rows(lens, radius_um=radius_um)
-    sine, weight = _rings(lens, radius_um)
+    rows = solve_coupling_rows(lens)
+    sine, weight = _rings(lens)
     share = rows.share(sine, weight)
     reduced = [other.share(sine, weight) for other in rows.others]
     truncation = abs(rows.coarser.share(sine, weight) - share)
@@ -127,9 +91,7 @@ def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplin
     )
 
 
-def estimate_neighbour_coupling_loss(
-    lens: Lens, *, radius_um: float
-) -> NeighbourCouplingLoss:
+def estimate_neighbour_coupling_loss(lens: Lens) -> NeighbourCouplingLoss:
     """Rough :func:`neighbour_coupling_loss` with the coupling factor of another cell.
 
     share = |sum_r w_r (1 + a s_r + b s_r²)|², a and b of
@@ -138,9 +100,8 @@ def estimate_neighbour_coupling_loss(
 
     Args:
         lens: the lens.
-        radius_um: radius of the aperture, um.
     """
-    sine, weight = _rings(lens, radius_um)
+    sine, weight = _rings(lens)
     a, b = NEIGHBOURS
     share = float(abs(weight @ (1 + a * sine + b * sine**2)) ** 2)
     return NeighbourCouplingLoss(share, abs(1 - share))
@@ -160,16 +121,15 @@ def power_error(lens: Lens) -> float:
         if lens.pairs is None
         else lens.pairs.entry_error
     )
-    radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
     coupling_loss = (
         estimate_neighbour_coupling_loss
         if lens.neighbours is None
         else neighbour_coupling_loss
     )
-    return math.hypot(2 * t_error, coupling_loss(lens, radius_um=radius_um).error)
+    return math.hypot(2 * t_error, coupling_loss(lens).error)
 
 
-def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
+def _rings(lens: Lens) -> tuple[Array, Array]:
     """(m,) sines by which rings of a lens turn light, and their shares of the area.
 
     Gauss-Legendre nodes in the squared radius; sine = NA towards the sensor plus
@@ -177,8 +137,8 @@ def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
 
     Args:
         lens: the lens.
-        radius_um: radius of the aperture, um.
     """
+    radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
     focus = lens_focus(lens)
@@ -189,55 +149,3 @@ def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
         ]
     )
     return sine, weight / 2
-
-
-def angle_change(lens: Lens, incidence_rad: float) -> float:
-    """Root mean square relative change of t at an angle, over diameters and
-    polarisations.
-
-    |t(angle) - c t(0)|² / |t(angle)|² with the best common factor c: a factor that all
-    pillars share changes no PSF of sum 1.
-
-    Args:
-        lens: the lens.
-        incidence_rad: angle of incidence in air, rad.
-    """
-    low, high = drawn_diameter_range(lens)
-    diameters = np.linspace(low, high, DIAMETERS)
-    changes = []
-    both: tuple[Literal["s", "p"], ...] = ("s", "p")
-    for polarization in both:
-        flat, tilted = (
-            _transmissions(lens, diameters, angle, polarization)
-            for angle in (0.0, incidence_rad)
-        )
-        common = np.vdot(flat, tilted) / np.vdot(flat, flat)
-        residual = np.linalg.norm(tilted - common * flat) ** 2
-        changes.append(residual / np.linalg.norm(tilted) ** 2)
-    return float(np.sqrt(np.mean(changes)))
-
-
-def _transmissions(
-    lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]
-) -> Array:
-    """(n,) complex t of pillars of the lens's cell by RCWA.
-
-    Args:
-        lens: the lens.
-        diameters_um: (n,) diameters.
-        angle_rad: angle of incidence in air.
-        polarization: s or p.
-    """
-    return np.array(
-        [
-            rcwa.solve(
-                lens.cell,
-                diameter_um,
-                lens.wavelength_um,
-                angle_rad=angle_rad,
-                polarization=polarization,
-                tolerance=TOLERANCE,
-            ).t
-            for diameter_um in diameters_um.tolist()
-        ]
-    )

@@ -69,7 +69,7 @@ def read_phase_map(shape: PhaseMap) -> PhaseSamples:
         )
     ending = path.suffix.lower()
     if ending == ".dat":
-        samples = _zemax(path, shape.pitch_um)
+        samples = _zemax(path, shape)
     elif ending == ".npy":
         samples = _square(_npy(path, shape.variable), path, shape)
     elif ending in (".npz", ".mat"):
@@ -436,34 +436,30 @@ def _gridded(
     Raises:
         LensError: not one phase at every place of an even grid.
     """
-    axes, steps = [], []
     scales = [_length_scale(name) for name in header[:2]] or [1.0, 1.0]
-    for name, values, scale in zip("xy", table.T[:2], scales, strict=True):
-        coordinates = np.unique(values) * scale
-        step = np.diff(coordinates)
-        if len(coordinates) < 2 or np.ptp(step) > EVEN_STEP * step.mean():
+    places = [np.unique(table[:, k], return_inverse=True) for k in (0, 1)]
+    axes = [values * scale for (values, _), scale in zip(places, scales, strict=True)]
+    for name, axis in zip("xy", axes, strict=True):
+        if len(axis) < 2 or np.ptp(np.diff(axis)) > EVEN_STEP * np.diff(axis).mean():
             raise LensError(
-                f"{path}: {len(coordinates)} values of {name}, not evenly spaced; need x, y and "
+                f"{path}: {len(axis)} values of {name}, not evenly spaced; need x, y and "
                 "phase on an even grid, or a matrix of the phase"
             )
-        axes.append(coordinates)
-        steps.append(float((coordinates[-1] - coordinates[0]) / (len(coordinates) - 1)))
     x, y = axes
-    phase = np.full((len(y), len(x)), np.nan)
-    cells = tuple(
-        np.unique(table[:, k], return_inverse=True)[1].ravel() for k in (1, 0)
-    )
-    if len(np.unique(cells[0] * len(x) + cells[1])) < len(table):
+    column, row = (index.ravel() for _, index in places)
+    if len(np.unique(row * len(x) + column)) < len(table):
         raise LensError(f"{path}: two rows have the same x and y; need one phase each")
-    phase[cells] = table[:, 2]
-    pitch_um = shape.pitch_um
-    if pitch_um is not None and max(abs(s / pitch_um - 1) for s in steps) > EVEN_STEP:
+    phase = np.full((len(y), len(x)), np.nan)
+    phase[row, column] = table[:, 2]
+    steps = float(np.ptp(x) / (len(x) - 1)), float(np.ptp(y) / (len(y) - 1))
+    stated = shape.pitch_um
+    if stated is not None and max(abs(s / stated - 1) for s in steps) > EVEN_STEP:
         raise LensError(
             f"{path}: spacing of {steps[0]:g} x {steps[1]:g} um, but pitch_um = "
-            f"{pitch_um}; leave pitch_um out (x and y are um)"
+            f"{stated}; leave pitch_um out (x and y are um)"
         )
     centre = (float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2)
-    return PhaseSamples(_checked(phase, path, shape), (steps[0], steps[1]), centre)
+    return PhaseSamples(_checked(phase, path, shape), steps, centre)
 
 
 def _no_variable(path: Path, variable: str | None) -> None:
@@ -499,7 +495,7 @@ def _named(path: Path, arrays: dict[str, Array], variable: str | None) -> Array:
     return next(iter(arrays.values()))
 
 
-def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
+def _zemax(path: Path, shape: PhaseMap) -> PhaseSamples:
     """Samples of a Zemax grid-phase file, rad.
 
     Head ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy [nodata]`` for
@@ -509,7 +505,7 @@ def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
 
     Args:
         path: of the file.
-        pitch_um: stated spacing, compared with that of the file; None for none.
+        shape: stated settings; its spacing is compared with that of the file.
 
     Raises:
         LensError: not text, empty, damaged, or of another spacing than stated.
@@ -520,87 +516,39 @@ def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
         raise LensError(
             f"{path}: not a text file; a binary .dat of an interferometer is no grid phase"
         ) from error
-    rows = [
-        (i, line.split())
-        for i, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("!")
-    ]
-    if not rows:
+    rows = [line.split() for line in lines if not line.lstrip().startswith("!")]
+    head, *points = [words for words in rows if words] or [[]]
+    if not head:
         raise LensError(f"{path}: empty; need a Zemax grid phase")
-    columns, count, step, centre = _zemax_head(path, rows[0][1])
-    if len(rows) - 1 != columns * count:
-        raise LensError(
-            f"{path}: {len(rows) - 1} points for a grid of {columns} x {count} = {columns * count}"
-        )
-    phase = np.array(
-        [_zemax_point(path, number, words) for number, words in rows[1:]]
-    ).reshape(count, columns)
-    if pitch_um is not None and max(abs(s / pitch_um - 1) for s in step) > SAME_STEP:
-        raise LensError(
-            f"{path}: spacing of {step[0]} x {step[1]} um, but pitch_um = {pitch_um}; leave pitch_um out"
-        )
-    return PhaseSamples(phase, step, centre)
-
-
-def _zemax_head(
-    path: Path, words: list[str]
-) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
-    """Size, spacing and centre of the grid in the head of a grid-phase file.
-
-    Args:
-        path: of the file, for messages.
-        words: of the first line, ``nx ny delx dely unitflag [xdec ydec]``.
-
-    Returns:
-        Columns and rows, spacing (x, y) and centre (x, y) in um, +y down.
-
-    Raises:
-        LensError: words that are no head, or a grid below 2 by 2 points.
-    """
     try:
-        columns = int(words[0])
-        rows = int(words[1])
-        unit = ZEMAX_UNIT_UM[int(words[4])]
-        step_x = abs(float(words[2])) * unit
-        step_y = abs(float(words[3])) * unit
-        right, up = (
-            (float(w) * unit for w in words[5:7]) if len(words) >= 7 else (0.0, 0.0)
-        )
+        columns, count = int(head[0]), int(head[1])
+        unit = ZEMAX_UNIT_UM[int(head[4])]
+        step = abs(float(head[2])) * unit, abs(float(head[3])) * unit
+        right, up = (float(w) * unit for w in [*head[5:7], "0", "0"][:2])
     except (ValueError, IndexError):
         raise LensError(
-            f"{path}: first line is {' '.join(words)[:60]!r}, need nx ny delx dely unitflag xdec ydec (unitflag 0 to 3)"
+            f"{path}: first line is {' '.join(head)[:60]!r}, need nx ny delx dely unitflag xdec ydec (unitflag 0 to 3)"
         ) from None
-    if min(columns, rows) < 2 or not (
-        0 < step_x < math.inf and 0 < step_y < math.inf and math.isfinite(right + up)
+    if min(columns, count) < 2 or not (
+        0 < min(step) <= max(step) < math.inf and math.isfinite(right + up)
     ):
         raise LensError(
-            f"{path}: grid of {columns} x {rows} points, {step_x} x {step_y} um apart: need 2 or more"
+            f"{path}: grid of {columns} x {count} points, {step[0]} x {step[1]} um apart: need 2 or more"
         )
-    return columns, rows, (step_x, step_y), (right, -up)
-
-
-def _zemax_point(path: Path, number: int, words: list[str]) -> float:
-    """Phase in rad of one point of a grid-phase file; nan where its nodata flag is 1.
-
-    Args:
-        path: of the file, for messages.
-        number: of the line, for messages.
-        words: of the line.
-
-    Raises:
-        LensError: no number, or a phase that is not finite.
-    """
+    if len(points) != columns * count:
+        raise LensError(
+            f"{path}: {len(points)} points for a grid of {columns} x {count} = {columns * count}"
+        )
     try:
-        value = float(words[0])
-        missing = len(words) > 4 and int(words[4]) == 1
-    except ValueError:
-        raise LensError(
-            f"{path}: line {number} is {' '.join(words)[:60]!r}, need phase and derivatives"
-        ) from None
-    if missing:
-        return math.nan
-    if not math.isfinite(value):
-        raise LensError(
-            f"{path}: line {number}: phase is {value}, need finite radians, or a nodata flag of 1"
+        phase = np.array(
+            [math.nan if point[4:5] == ["1"] else float(point[0]) for point in points]
         )
-    return value
+    except ValueError as error:
+        raise LensError(f"{path}: not a grid phase: {error}") from None
+    stated = shape.pitch_um
+    if stated is not None and max(abs(s / stated - 1) for s in step) > SAME_STEP:
+        raise LensError(
+            f"{path}: spacing of {step[0]} x {step[1]} um, but pitch_um = {stated}; leave pitch_um out"
+        )
+    samples = _checked(phase.reshape(count, columns), path, shape)
+    return PhaseSamples(samples, step, (right, -up))

@@ -82,7 +82,6 @@ def from_lens(
     spectrum: SpectralNodes | Source | MeasuredSpectrum | None = None,
     provenance: Provenance | None = None,
     polarisation: Polarisation = "scalar",
-    left_out: LeftOut | None = None,
 ) -> PsfStack:
     """Point spread functions of a lens file, its pillars through their response table.
 
@@ -102,8 +101,6 @@ def from_lens(
         provenance: settings and input files, kept in the record.
         polarisation: as for :func:`psf_stack`, or ``"auto"``: the scalar where its
             error is below the tolerance, else the flux.
-        left_out: errors by neighbours and angles of the lens's own pillars
-            (:func:`metalens.design.left_out`); None for rough numbers of another cell.
 
     Returns:
         PsfStack: (angle, depth, y, x), with the error by cause.
@@ -123,7 +120,7 @@ def from_lens(
     how: dict[str, Any] = {
         "tolerance": tolerance,
         "polarisation": polarisation,
-        "own": left_out or LeftOut(lens.neighbours or NEIGHBOURS),
+        "own": LeftOut(lens.neighbours or NEIGHBOURS),
         "provenance": provenance or Provenance(),
     }
     if isinstance(spectrum, Source | MeasuredSpectrum):

@@ -186,7 +186,6 @@ def test_two_phases_by_width_and_length_from_toml_to_mask(tmp_path, capsys):
         assert own["focus_passed"]
         assert 0.6 < own["wavefront_efficiency"] <= own["transmission"] <= 1
         assert own["leaked"] < 1e-20  # mirrors
-    assert found["multiplexed"]
     view = "depths_mm = [1e3, 1e3, 1.0]\nangles_deg = [0.0]\nsamples = 40\nwindow_um = 16.0\ntolerance = 1e-3\n"
     words = [
         "psf",

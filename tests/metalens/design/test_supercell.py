@@ -167,52 +167,6 @@ def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     assert np.abs(found.coarse - found.factor).max() > 0
 
 
-def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(
-    monkeypatch,
-):
-    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t.
-    Neighbours: of its rim's zone.
-    """
-    monkeypatch.setattr("metalens.design.own_cell.DIAMETERS", 2)
-    counts = []
-    monkeypatch.setattr(
-        "metalens.design.own_cell.estimate_neighbour_coupling",
-        lambda _, counts, told=counts: told.append(counts) or "rows",
-    )
-    lens, tilt = _lens(), 0.3
-    found = design.left_out(lens, aperture=0.5, incidence_rad=tilt)
-    assert counts == [
-        (6, 9, 12)
-    ]  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim
-    assert found.neighbours == "rows"
-    changes = []
-    for side in ("s", "p"):
-        flat, tilted = (
-            np.array(
-                [
-                    modal.solve(
-                        CELL,
-                        d,
-                        WAVE,
-                        angle_rad=angle,
-                        polarization=side,
-                        tolerance=5e-3,
-                    ).t
-                    for d in supercell.drawn_diameter_range(lens)
-                ]
-            )
-            for angle in (0.0, tilt)
-        )
-        common = (flat.conj() @ tilted) / (flat.conj() @ flat)
-        changes.append(
-            (np.abs(tilted - common * flat) ** 2).sum() / (np.abs(tilted) ** 2).sum()
-        )
-    assert found.angle * np.sin(tilt) ** 2 == pytest.approx(
-        np.sqrt(np.mean(changes)), abs=1.5e-2
-    )
-    assert found.angle > 0.1
-
-
 @pytest.mark.parametrize(
     ("cell", "row"),
     [
@@ -314,16 +268,15 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
         )  # a third of the time
 
     monkeypatch.setattr("metalens.design.own_cell.estimate_neighbour_coupling", kept)
-    rows = design.solve_coupling_rows(steep, radius_um=10.0)
-    found = design.neighbour_coupling_loss(
-        dataclasses.replace(steep, neighbours=rows), radius_um=10.0
-    )
+    rows = design.solve_coupling_rows(steep)
+    found = design.neighbour_coupling_loss(dataclasses.replace(steep, neighbours=rows))
     assert found.pillars == (
         2,
         3,
         4,
     )  # 0.532 / (0.32 · 0.8) = 2.1 pillars in a zone of the rim
-    r = 10.0 * np.sqrt((np.arange(4000) + 0.5) / 4000)
+    edge = steep.diameters.radius_um + steep.diameters.pitch_um / 2
+    r = edge * np.sqrt((np.arange(4000) + 0.5) / 4000)
     shares = [
         one.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000))
         for one in (rows, rows.coarser, *rows.others)
@@ -334,12 +287,12 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
         apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2
     )
     assert found.error < 0.4
-    rough = design.estimate_neighbour_coupling_loss(steep, radius_um=10.0)
+    rough = design.estimate_neighbour_coupling_loss(steep)
     assert (
         abs(rough.share - found.share) < rough.error
     )  # what is said without a solve covers it
     flat = design.estimate_neighbour_coupling_loss(
-        dataclasses.replace(steep, sensor_distance_um=75.0), radius_um=10.0
+        dataclasses.replace(steep, sensor_distance_um=75.0)
     )
     assert flat.share > 0.98
 
