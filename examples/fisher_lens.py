@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from metalens import fisher
-from metalens.design import Focus
+from metalens.design import Focus, vortex_phase
 from metalens.design.free_form import search as design_fisher
 from metalens.design.free_form.settings import FisherSettings
 from metalens.image import pupil
@@ -28,7 +28,7 @@ asked = FisherSettings().about(
 )  # depths, window and samples of this lens
 x, y = (a.numpy() for a in pupil.coordinates(optics))
 flat = torch.zeros(160, 160, dtype=torch.float64)
-helix = torch.from_numpy(design_fisher.vortex_phase(x, y, radius_um=500.0, zones=2))
+helix = torch.from_numpy(vortex_phase(x, y, radius_um=500.0, zones=2))
 
 # %% [markdown]
 # ## A short design

@@ -31,4 +31,5 @@ from .profiles import Focus as Focus
 from .profiles import PhaseMap as PhaseMap
 from .profiles import hyperbolic_phase as hyperbolic_phase
 from .profiles import lens_focus as lens_focus
+from .profiles import vortex_phase as vortex_phase
 from .sites import PhaseOf as PhaseOf

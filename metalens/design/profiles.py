@@ -201,11 +201,9 @@ def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
 def double_helix_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float
 ) -> Array:
-    """Hyperbolic phase plus annular vortices, (y, x) in rad: (2 l - 1) azimuth in ring
-    l.
+    """Hyperbolic phase plus annular vortices (:func:`vortex_phase`), (y, x) in rad.
 
-    The PSF has two lobes that rotate with depth. l = ceil(zones (r/R)^(1/exponent)), 1
-    to ``zones``.
+    The PSF has two lobes that rotate with depth.
 
     Args:
         x_um: places along x, um.
@@ -214,13 +212,31 @@ def double_helix_phase(
         shape: number of zones and exponent of their radii.
         radius_um: radius R of the aperture, um.
     """
+    vortices = vortex_phase(
+        x_um, y_um, radius_um=radius_um, zones=shape.zones, exponent=shape.exponent
+    )
+    return np.asarray(hyperbolic_phase(x_um, y_um, focus) + vortices)
+
+
+def vortex_phase(
+    x_um: Array, y_um: Array, *, radius_um: float, zones: int, exponent: float = 0.5
+) -> Array:
+    """Phase of annular vortices, (y, x) in rad: (2 l - 1) azimuth in ring l.
+
+    l = ceil(zones (r/R)^(1/exponent)), 1 to ``zones``; 0 for no zones.
+
+    Args:
+        x_um: places along x, um.
+        y_um: places along y, um; they broadcast to (y, x).
+        radius_um: radius R of the aperture, um.
+        zones: number of rings.
+        exponent: of their radii; 1/2 gives rings of equal area.
+    """
+    if zones == 0:
+        return np.zeros(np.broadcast_shapes(x_um.shape, y_um.shape))
     fraction = np.hypot(x_um, y_um) / radius_um
-    ring = np.clip(
-        np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones
-    )
-    return np.asarray(
-        hyperbolic_phase(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um)
-    )
+    ring = np.clip(np.ceil(zones * fraction ** (1 / exponent)), 1, zones)
+    return np.asarray((2 * ring - 1) * np.arctan2(y_um, x_um))
 
 
 def cubic_phase(

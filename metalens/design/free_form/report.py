@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from metalens.core.report import figure_png, make_figure
+from metalens.design import vortex_phase
 from metalens.design.free_form.search import (
     DesignScore,
     FisherPhase,
     phase_on,
     score_phase,
-    vortex_phase,
 )
 from metalens.design.free_form.settings import ResolvedFisherSettings, between_mm
 from metalens.image import Pupil

@@ -8,11 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from torch import Tensor
 
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.design import Focus, PhaseOf, hyperbolic_phase
+from metalens.design import Focus, PhaseOf, hyperbolic_phase, vortex_phase
 from metalens.design.free_form.settings import FisherSettings, ResolvedFisherSettings
 from metalens.image import (
     Field,
@@ -29,8 +30,6 @@ NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterati
 CHECKS = 20  # iterations between two evaluations of the deterministic figures
 CLIMB_IMAGES = 4  # images of a gradient step, at least two for every field angle
 DIRECTIONS = 4  # azimuths of the field from which the steps draw
-# (y, x) positions of the pixel grid, in pixels, where nothing is random
-STILL = torch.tensor([[-0.25, 0.25], [0.25, -0.25]])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,11 +50,9 @@ class SearchObjective(Protocol):
     """An objective of the gradient ascent."""
 
     def loss(
-        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
+        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """Loss, and encircled energy at some depths.
-
-        Without a generator the same function at every call.
 
         Args:
             phase_rad: (nodes, nodes) phase without its focus, rad.
@@ -79,7 +76,7 @@ class AxialObjective:
         self.pupil, self.settings = pupil, settings
 
     def loss(
-        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
+        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """Loss and encircled energy at some depths, see :class:`SearchObjective`.
 
@@ -89,7 +86,7 @@ class AxialObjective:
         Args:
             phase_rad: (nodes, nodes) phase without its focus, rad.
             focus_um: source distance of the hyperbolic part, um.
-            generator: of random depths, fields and positions; None for fixed ones.
+            generator: of random depths, fields and positions.
         """
         settings = self.settings
         depths, fields, positions = self._sample_views(generator)
@@ -117,12 +114,11 @@ class AxialObjective:
         return total, energy
 
     def _sample_views(
-        self, generator: torch.Generator | None
+        self, generator: torch.Generator
     ) -> tuple[Tensor, list[Field], Tensor]:
         """Source depths, fields and pixel positions of one step.
 
-        Without a generator: 7 even depths at every angle, no randomness. Otherwise
-        depths are stratified over the range, azimuths are multiples of 90 degrees.
+        Depths are stratified over the range, azimuths are multiples of 90 degrees.
 
         Returns:
             (images,) depths in um, as many fields with the angles in turn, and (2, 2)
@@ -130,10 +126,6 @@ class AxialObjective:
         """
         angles = self.settings.angles_deg
         low, high = (1e3 * d for d in self.settings.depths_mm)
-        if generator is None:
-            depths = torch.linspace(low, high, 7, dtype=torch.float64)
-            fields = [Field(math.radians(a)) for _ in range(7) for a in angles]
-            return depths.repeat_interleave(len(angles)), fields, STILL
         count = max(2, math.ceil(CLIMB_IMAGES / len(angles))) * len(angles)
         strata = torch.randperm(count, generator=generator) + torch.rand(
             count, generator=generator
@@ -246,9 +238,8 @@ class FisherPhase:
     zones: rings of the double helix below, 0 for none.
     cells: whether the controls are one value for every node.
     score: of this phase.
-    starts: (information, least encircled energy) of each start.
     converged: whether the encircled energy is kept at every depth.
-    reason: in words.
+    starts: (information, least encircled energy) of each start.
     """
 
     controls: Tensor
@@ -256,9 +247,20 @@ class FisherPhase:
     zones: int
     cells: bool
     score: DesignScore
-    starts: tuple[tuple[float, float], ...]
     converged: bool
-    reason: str
+    starts: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """What the best phase has most of: energy kept first, then mean information."""
+        return self.converged, float(self.score.information.mean())
+
+    @property
+    def reason(self) -> str:
+        """Whether the encircled energy is kept, in words."""
+        if self.converged:
+            return "encircled energy kept at every depth"
+        return "encircled energy missed: raise iterations"
 
 
 def fisher_profile(
@@ -373,8 +375,7 @@ def optimize_free_form(
                 f"objective {settings.objective!r} needs its scenes: give objective"
             )
         objective = AxialObjective(pupil, settings)
-    best: FisherPhase | None = None
-    figures = []
+    results = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
         focus = 1e3 * (
@@ -382,18 +383,9 @@ def optimize_free_form(
         )
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
         zones = settings.zones[start % len(settings.zones)]
-        result = _climb(pupil, settings, objective, focus, zones, generator)
-        information = float(result.score.information.mean())
-        least = float(result.score.encircled.min())
-        figures.append((information, least))
-        if best is None or (result.converged, information) > (
-            best.converged,
-            float(best.score.information.mean()),
-        ):
-            best = result
-    if best is None:
-        raise ConfigError("no start was tried")
-    return replace(best, starts=tuple(figures))
+        results.append(_climb(pupil, settings, objective, focus, zones, generator))
+    starts = tuple((r.rank[1], float(r.score.encircled.min())) for r in results)
+    return replace(max(results, key=lambda result: result.rank), starts=starts)
 
 
 def phase_on(pupil: Pupil, profile: FisherPhase) -> Tensor:
@@ -407,21 +399,6 @@ def phase_on(pupil: Pupil, profile: FisherPhase) -> Tensor:
     )
 
 
-def vortex_phase(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
-    """Phase of a double helix without its focus: ring l of equal areas carries the
-    charge 2l - 1; 0 for no zones.
-
-    Args:
-        x_um: places along x, um.
-        y_um: places along y, um.
-        radius_um: radius of the aperture, um.
-    """
-    if zones == 0:
-        return np.zeros(np.broadcast_shapes(x_um.shape, y_um.shape))
-    ring = np.clip(np.ceil(zones * (x_um**2 + y_um**2) / radius_um**2), 1, zones)
-    return np.asarray((2 * ring - 1) * np.arctan2(y_um, x_um))
-
-
 def bspline_weights(position: Array, count: int) -> Array:
     """(n, count) weights of uniform cubic B-splines at positions in [-1, 1].
 
@@ -432,51 +409,8 @@ def bspline_weights(position: Array, count: int) -> Array:
         count: number of control points, 4 or more.
     """
     scaled = (np.clip(position, -1, 1) + 1) / 2 * (count - 3)
-    first = np.clip(np.floor(scaled).astype(int), 0, count - 4)
-    u = scaled - first
-    cubics = (
-        (1 - u) ** 3,
-        3 * u**3 - 6 * u**2 + 4,
-        -3 * u**3 + 3 * u**2 + 3 * u + 1,
-        u**3,
-    )
-    weights = np.zeros((len(position), count))
-    for k, cubic in enumerate(cubics):
-        weights[np.arange(len(position)), first + k] = cubic / 6
-    return weights
-
-
-class _Best:
-    """The best iterate: first whether it keeps the energy, then its information."""
-
-    def __init__(
-        self,
-        objective: SearchObjective,
-        settings: ResolvedFisherSettings,
-        focus_um: float,
-    ) -> None:
-        self.objective, self.settings, self.focus_um = objective, settings, focus_um
-        self.rank: tuple[bool, float] = (False, -math.inf)
-        self.controls: Tensor | None = None
-        self.score: DesignScore | None = None
-
-    def update(self, controls: Tensor, phase: Tensor) -> float:
-        """Judge an iterate and keep it if best; least encircled energy minus the bound.
-
-        Args:
-            controls: of the last grid.
-            phase: (nodes, nodes) phase of these, rad.
-        """
-        score = self.objective.judge(phase.detach(), self.focus_um)
-        margin = float(score.encircled.min()) - self.settings.encircled
-        rank = (margin >= -5e-4, float(score.information.mean()))
-        if self.controls is None or rank > self.rank:
-            self.rank, self.controls, self.score = (
-                rank,
-                controls.detach().clone(),
-                score,
-            )
-        return margin
+    knots = np.arange(-3.0, count + 1)
+    return np.asarray(BSpline.design_matrix(scaled, knots, 3).toarray())
 
 
 def _climb(
@@ -504,8 +438,8 @@ def _climb(
     controls = _initial_controls(settings, zones, generator)
     total = settings.iterations
     done = 0
-    margin = 0.01  # encircled energy beyond the bound
-    best = _Best(objective, settings, focus_um)
+    margin = 0.01  # encircled energy beyond the bound that the penalty asks for
+    best: FisherPhase | None = None
     for grid, count in zip(settings.grids, _shares(settings), strict=True):
         if grid == 0:
             controls = _Phase(pupil, len(controls), 0)(controls)
@@ -526,26 +460,24 @@ def _climb(
             optimizer.step()
             done += 1
             if grid == settings.grids[-1] and (done % CHECKS == 0 or done == total):
-                spare = best.update(controls, build(controls))
-                margin = _margin(margin, spare)
+                score = objective.judge(build(controls).detach(), focus_um)
+                spare = float(score.encircled.min()) - settings.encircled
+                latest = FisherPhase(
+                    controls.detach().clone(),
+                    focus_um,
+                    zones,
+                    settings.grids[-1] == 0,
+                    score,
+                    converged=spare >= -5e-4,
+                )
+                if best is None or latest.rank > best.rank:
+                    best = latest
+                # proportional feedback, so that the figures exceed the bound by 0.0015
+                margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
         controls = controls.detach()
-    if best.controls is None or best.score is None:
+    if best is None:
         raise ConfigError("no iterate was judged")
-    reason = (
-        "encircled energy kept at every depth"
-        if best.rank[0]
-        else "encircled energy missed: raise iterations"
-    )
-    return FisherPhase(
-        best.controls,
-        focus_um,
-        zones,
-        settings.grids[-1] == 0,
-        best.score,
-        (),
-        best.rank[0],
-        reason,
-    )
+    return best
 
 
 def _initial_controls(
@@ -575,18 +507,6 @@ def _penalty(missing: Tensor, share: float) -> Tensor:
         share: of the iterations that are done; the penalty grows fivefold.
     """
     return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
-
-
-def _margin(margin: float, spare: float) -> float:
-    """Next margin above the energy bound, so that the figures exceed it by 0.0015.
-
-    Proportional feedback by 0.35, within -0.03 to 0.05.
-
-    Args:
-        margin: encircled energy beyond the bound that the penalty asks for.
-        spare: least encircled energy of the last judged iterate minus the bound.
-    """
-    return min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
 
 
 def _shares(settings: FisherSettings) -> list[int]:
