@@ -253,7 +253,7 @@ def run(options: Options) -> int:
     settings = config.load(options.config, DesignSettings, empty=False)
     folder, target = options.config.parent, options.output
     path = None if settings.library is None else folder / settings.library
-    two_size = path is not None and _is_two_size_library(path)
+    two_size = path is not None and store.kind_of(path) == axes.KIND
     maps = [one.map for one in (settings, settings.along_y) if one and one.map]
     inputs = [*([path] if path else []), *(folder / shape.file for shape in maps)]
     if two_size and (options.own_cell or settings.wavelengths):
@@ -453,10 +453,6 @@ def _design_one_size(
         "loss": pillars.mean_loss(designed.diameters.diameter_um, focus.wavelength_um),
     }
     return designed, settings, values, notes, failures
-
-
-def _is_two_size_library(path: Path) -> bool:
-    return path.is_file() and store.load(path).kind == axes.KIND
 
 
 def _common(settings: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:

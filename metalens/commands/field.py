@@ -5,7 +5,6 @@ across it, with a picture.
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
@@ -20,7 +19,7 @@ from metalens.core.report import figure_png, make_figure
 from metalens.library import workers
 from metalens.rcwa import FieldGrid, NearField, near_fields
 
-CUTS = {"xz": "y = 0", "yz": "x = 0"}
+CUTS = ("xz", "yz", "xy")
 SOUGHT = 0.1  # relative error of a field that is aimed at without a tolerance
 UNKNOWN = 0.5  # largest relative error of a field, and largest tolerance
 MOST_SAMPLES = 400  # along the pitch
@@ -196,7 +195,7 @@ def run(options: Options) -> int:
         store.write_bytes(
             draft.path.with_suffix(".png"), near_field_picture(request, fields)
         )
-    by_cut = dict(zip((*CUTS, "xy"), fields, strict=True))
+    by_cut = dict(zip(CUTS, fields, strict=True))
     missed = ", ".join(name for name, cut in by_cut.items() if not cut.converged)
     text = (
         f"{missed} above the tolerance {request.tolerance:g} at {fields[0].orders} "
@@ -210,7 +209,7 @@ def run(options: Options) -> int:
             "orders": fields[0].orders,
             "tolerance": request.tolerance,
             "cuts": {
-                name: {"error": cut.error, "largest_e": _largest(cut)}
+                name: {"error": cut.error, "largest_magnitude": _largest(cut)}
                 for name, cut in by_cut.items()
             },
         },
@@ -265,8 +264,7 @@ def save_near_field(
         "step_um": request.step_um,
     }
     about |= {
-        f"error_{name}": near.error
-        for name, near in zip((*CUTS, "xy"), fields, strict=True)
+        f"error_{name}": near.error for name, near in zip(CUTS, fields, strict=True)
     }
     provenance = store.Provenance(config.dumps(request), inputs)
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
@@ -280,62 +278,35 @@ def near_field_picture(request: NearFieldRequest, fields: list[NearField]) -> by
         request: the request.
         fields: fields on the cuts xz and yz, and on the maps.
     """
-    cuts = fields[:2]
-    maps = fields[2]
+    xz, yz, maps = fields
     columns = max(2, len(request.heights_um))
     figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
     top = max(_largest(near) for near in fields)
-    image = None
-    for panel, near, name in zip(panels[0], cuts, CUTS, strict=False):
-        across = np.asarray(near.grid.x_um if name == "xz" else near.grid.y_um)
-        e = field_magnitude(near.e).squeeze()
-        index = near.index.squeeze().real
-        image = _map(panel, across, np.asarray(near.grid.z_um), e, index, top)
-        panel.set(
-            title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
-        )
+    drawn = [
+        (panels[0, 0], "y = 0", "xz", xz.grid.x_um, xz.grid.z_um, xz.e, xz.index),
+        (panels[0, 1], "x = 0", "yz", yz.grid.y_um, yz.grid.z_um, yz.e, yz.index),
+    ]
     for i, height in enumerate(request.heights_um):
-        x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
-        image = _map(
-            panels[1, i], x, y, field_magnitude(maps.e)[i], maps.index[i].real, top
-        )
-        panels[1, i].invert_yaxis()
-        panels[1, i].set(
-            title=f"|E| at z = {height:.4g} µm", xlabel="x / µm", ylabel="y / µm"
-        )
-    for panel in (*panels[0, 2:], *panels[1, len(request.heights_um) :]):
+        place = panels[1, i], f"z = {height:.4g} µm", "xy"
+        axes = maps.grid.x_um, maps.grid.y_um
+        drawn.append((*place, *axes, maps.e[:, i], maps.index[i]))
+    for panel in panels.flat:
         panel.set_axis_off()
+    for panel, at, names, x, y, e, index in drawn:
+        panel.set_axis_on()
+        panel.grid(False)
+        panel.set(
+            title=f"|E| at {at}", xlabel=f"{names[0]} / µm", ylabel=f"{names[1]} / µm"
+        )
+        magnitude = field_magnitude(e).squeeze()
+        image = panel.pcolormesh(x, y, magnitude, vmin=0, vmax=top, cmap="magma")
+        panel.set_aspect("equal")
+        n = index.squeeze().real
+        levels = np.unique(n)
+        if len(levels) > 1:
+            middles = (levels[1:] + levels[:-1]) / 2
+            panel.contour(x, y, n, levels=middles, colors="w", linewidths=0.7)
+        if names == "xy":
+            panel.invert_yaxis()
     figure.colorbar(image, ax=panels, label="|E| of the light that comes", shrink=0.6)
     return figure_png(figure)
-
-
-def _map(panel: Any, x: Array, y: Array, e: Array, index: Array, top: float) -> Any:
-    """Draw |E| on a panel with the boundaries of the materials; returns the image.
-
-    Args:
-        panel: of the figure.
-        x, y: (columns,) and (rows,) coordinates, um.
-        e: (rows, columns) |E|.
-        index: (rows, columns) real refractive index.
-        top: |E| at the end of the colour scale.
-    """
-    edges = [
-        axis[k] + step * (axis[1] - axis[0]) / 2
-        for axis in (x, y)
-        for k, step in ((0, -1), (-1, 1))
-    ]
-    image = panel.imshow(
-        e, origin="lower", extent=edges, vmin=0, vmax=top, aspect="equal", cmap="magma"
-    )
-    if np.ptp(index) > 0:
-        levels = np.unique(index)
-        panel.contour(
-            x,
-            y,
-            index,
-            levels=(levels[1:] + levels[:-1]) / 2,
-            colors="w",
-            linewidths=0.7,
-        )
-    panel.grid(False)
-    return image

@@ -352,26 +352,6 @@ def _angles_deg(
     return (0.0, float(f"{half:.2g}")), (0.0, 0.0)
 
 
-def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
-    """Settings of a PSF.toml, replaced by those of the command line where these are
-    stated.
-
-    Args:
-        path: of PSF.toml; None for the defaults.
-        over: settings of the command line by name, None where not stated.
-
-    Raises:
-        ConfigError: as :func:`metalens.core.config.load`.
-    """
-    table = {} if path is None else config.read(path, PsfSettings, empty=False)
-    stated = {name: value for name, value in over.items() if value is not None}
-    sources = [str(path)] if path is not None else []
-    if stated:
-        sources.append("the command line")
-    where = " and ".join(sources)
-    return config.from_table(table | stated, PsfSettings, where=where or "metalens psf")
-
-
 @dataclass(frozen=True, slots=True)
 class ComputedPsfs:
     """stack: PSFs. figures: of the sharpest depth of every angle. meets_um: (x, y, z)
@@ -477,14 +457,23 @@ class Options(CommonOptions):
 
     @property
     def settings(self) -> PsfSettings:
-        """Those of the file with the options in their place."""
-        table: dict[str, Any] = {}
+        """Those of the file with the options in their place.
+
+        Raises:
+            ConfigError: as :func:`metalens.core.config.load`.
+        """
+        stated: dict[str, Any] = {}
         for name in PsfSettings.__slots__:
             value = getattr(self, name, None)
             if isinstance(value, tuple):
                 value = [str(v) if isinstance(v, Path) else v for v in value]
-            table[name] = value
-        return read_psf_settings(self.config, table)
+            if value is not None:
+                stated[name] = value
+        if self.config is None:
+            return config.from_table(stated, PsfSettings, where="the command line")
+        table = config.read(self.config, PsfSettings, empty=False)
+        where = f"{self.config}{' and the command line' if stated else ''}"
+        return config.from_table(table | stated, PsfSettings, where=where)
 
 
 def run(options: Options) -> int:

@@ -113,8 +113,6 @@ UNITS = {
     "s": "s",
     "seconds": "s",
     "e": "electrons",
-}
-UNITS |= {
     "px": "px",
     "mb": "MB",
     "waves": "waves",
@@ -122,30 +120,7 @@ UNITS |= {
     "rad2": "rad²",
     "e2": "electrons²",
     "percent": "%",
-}
-UNITS |= {"mmacs": "million MACs"}
-WORDS = {
-    "max": "largest",
-    "min": "least",
-    "rms": "root-mean-square",
-    "psf": "PSF",
-    "mtf": "MTF",
-    "iou": "overlap of masks",
-    "strehl": "Strehl ratio",
-}
-WORDS |= {"mmacs": "million MACs"}
-WORDS |= {
-    "fwhm": "width at half maximum",
-    "macs": "MACs",
-    "chi2": "chi²",
-    "dof": "degree of freedom",
-    "t": "t",
-}
-WORDS |= {
-    "std": "standard deviation of",
-    "ee80": "radius of 80 % of the light",
-    "mb": "size",
-    "seconds": "time / s",
+    "mmacs": "million MACs",
 }
 
 
@@ -153,9 +128,9 @@ def in_words(key: str) -> str:
     """A key of a result in words, with its unit after a slash.
 
     >>> in_words("max_phase_error_rad")
-    'largest phase error / rad'
-    >>> [in_words(key) for key in ("mtf50_x_per_um", "depth_response_mm_per_mm", "mmacs")]
-    ['mtf50 x / (1/µm)', 'depth response / (mm/mm)', 'million MACs']
+    'max phase error / rad'
+    >>> [in_words(key) for key in ("mtf50_x_per_um", "depth_response_mm_per_mm")]
+    ['mtf50 x / (1/µm)', 'depth response / (mm/mm)']
     """
     *parts, last = key.split("_")
     unit = UNITS.get(last, "") if parts else ""
@@ -163,10 +138,7 @@ def in_words(key: str) -> str:
         numerator = UNITS.get(parts[-2], "") if len(parts) > 2 else ""
         unit = f"({numerator or 1}/{unit})"
         parts = parts[: -2 if numerator else -1]
-    words = " ".join(
-        WORDS.get(part, part) for part in (parts if unit else [*parts, last])
-    )
-    return f"{words} / {unit}" if unit else words
+    return f"{' '.join(parts)} / {unit}" if unit else key.replace("_", " ")
 
 
 def in_figures(value: Any, digits: int = 4) -> str:
@@ -307,9 +279,9 @@ def format_summary(values: Mapping[str, Any], indent: str = "  ") -> list[str]:
 
     >>> values = {"fwhm_um": 1.25, "focus": [{"ok": True}, {"ok": False}]}
     >>> print("\n".join(format_summary(values)))
-      width at half maximum / µm  1.25
+      fwhm / µm  1.25
       focus
-        ok                        yes   no
+        ok       yes   no
     """
     return [indent + line for line in align_columns(list(summary_rows(values)))]
 
