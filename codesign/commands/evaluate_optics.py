@@ -28,7 +28,7 @@ from metalens import lens as lenses
 from metalens.core import config, reading, store
 from metalens.core.errors import ConfigError, PropagationError
 from metalens.core.report import Figure, Section, Table, write_report
-from metalens.design import DoubleHelix, Focus
+from metalens.design import DoubleHelix
 from metalens.design.free_form import FisherSettings, design_pupil, tune_baselines
 from metalens.lens import Lens
 
@@ -195,12 +195,7 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
     """
     radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
     measured = setting.about(lens)
-    focus = Focus(
-        lens.wavelength_um,
-        lens.sensor_distance_um,
-        lens.source_distance_um,
-        lens.layers,
-    )
+    focus = design.lens_focus(lens)
     fisher = FisherSettings(
         depths_mm=measured.depths_mm,
         pixel_um=measured.pixel_um * min(setting.binnings),

@@ -268,12 +268,9 @@ def run(options: Options) -> int:
             "along_y: one phase for x and one for y need a library over two sizes "
             "(lengths_um); give it"
         )
-    ends = (".png",) if two_size else (".png", "_fisher.png")
-    with options.claim(target, companions=ends, inputs=inputs) as draft:
+    with options.claim(target, companions=(".png",), inputs=inputs) as draft:
         design_lens = _design_two_sizes if two_size else _design_one_size
-        designed, settings, values, notes, failures = design_lens(
-            settings, options, draft.path
-        )
+        designed, settings, values, notes, failures = design_lens(settings, options)
         lens.save(draft.path, designed)
         write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(designed))
     title = (
@@ -290,15 +287,12 @@ def run(options: Options) -> int:
 _Outcome = tuple[Lens, DesignSettings, dict[str, Any], list[str], list[str]]
 
 
-def _design_two_sizes(
-    settings: DesignSettings, options: Options, draft: Path
-) -> _Outcome:
+def _design_two_sizes(settings: DesignSettings, options: Options) -> _Outcome:
     """Design a lens of pillars of two sizes, for light along x and along y.
 
     Args:
         settings: of the design.
         options: of the command line.
-        draft: file that will be written, for pictures beside it.
 
     Returns:
         Lens, settings as filled in, values for JSON, notes, and failures.
@@ -309,7 +303,7 @@ def _design_two_sizes(
     settings = settings.at(pillars.wavelength_um.tolist())
     pillars.at(settings.focus.wavelength_um)
     settings = _fill_limits(settings, options, pillars.cell, inputs)
-    phase, focus, _ = _find_phase(settings, options, draft)
+    phase, focus, _ = _find_phase(settings, options)
     phase_y: PhaseOf | None = None
     focus_y = focus
     if settings.along_y is not None:
@@ -337,15 +331,12 @@ def _design_two_sizes(
     return designed, settings, values, [lost], failures
 
 
-def _design_one_size(
-    settings: DesignSettings, options: Options, draft: Path
-) -> _Outcome:
+def _design_one_size(settings: DesignSettings, options: Options) -> _Outcome:
     """Design a lens of pillars of one size: at one wavelength or several, or rotated.
 
     Args:
         settings: of the design.
         options: of the command line.
-        draft: file that will be written, for pictures beside it.
 
     Returns:
         Lens, settings as filled in, values for JSON, notes, and failures.
@@ -368,7 +359,7 @@ def _design_one_size(
         and (folder / settings.map.file).is_file()
     ):
         inputs[settings.map.file.name] = store.sha256(folder / settings.map.file)
-    phase, focus, values = _find_phase(settings, options, draft)
+    phase, focus, values = _find_phase(settings, options)
     common = _common(settings, inputs)
     rotated = pillars.turned is not None
     targets: list[DesignSettings] = []
@@ -514,47 +505,38 @@ def _pillars(
 
 
 def _find_phase(
-    settings: DesignSettings, options: Options, draft: Path
+    settings: DesignSettings, options: Options
 ) -> tuple[PhaseOf, Focus, dict[str, Any]]:
-    """Target phase of the profile, its focus, and the comparison of a free form.
-
-    A free form for axial information is compared with simple lenses; the comparison is
-    returned for JSON and its picture is written.
+    """Target phase of the profile, its focus, and figures of a free form for JSON.
 
     Args:
         settings: of the design.
         options: of the command line.
-        draft: lens file that will be written; the picture is NAME_fisher.png.
     """
     if settings.profile != "fisher":
         return settings.phase(options.config.parent), settings.focus, {}
     from metalens.design.free_form import design_pupil, fisher_profile
-    from metalens.design.free_form import report as reports
 
     radius_um = settings.aperture_mm * 500
-    console = options.console
     search = settings.fisher.about(settings.focus, radius_um)
-    pupil = design_pupil(settings.focus, radius_um, search)
-    scenes = search.objective == "scenes"
-    objective = load_above("scenes").SceneObjective(pupil, search) if scenes else None
-    console.say(f"free form: {search.starts} starts of {search.iterations} steps")
+    objective = None
+    if search.objective == "scenes":
+        pupil = design_pupil(settings.focus, radius_um, search)
+        objective = load_above("scenes").SceneObjective(pupil, search)
+    options.console.say(
+        f"free form: {search.starts} starts of {search.iterations} steps"
+    )
     phase, free_form = fisher_profile(
         settings.focus, radius_um=radius_um, settings=search, objective=objective
     )
-    mean = float(free_form.score.information.mean())
-    goal = f"Eq. 6 {-mean:.3f} (0 without blur)" if scenes else f"I(z) {mean:.3f} /mm²"
-    least = float(free_form.score.encircled.min())
-    console.say(
-        f"free form: {goal}, encircled energy {least:.2f} or more; {free_form.reason}"
-    )
+    figures = {
+        "focus_um": free_form.focus_um,
+        "mean_information": float(free_form.score.information.mean()),
+        "least_encircled_energy": float(free_form.score.encircled.min()),
+        "outcome": free_form.reason,
+    }
     focus = replace(settings.focus, source_distance_um=free_form.focus_um)
-    if scenes:
-        return phase, focus, {}
-    console.say("tuning a hyperbolic lens and a double helix for the same task")
-    lenses = reports.judge_designs(free_form, pupil, search)
-    picture = reports.report_picture(lenses, search)
-    write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
-    return phase, focus, {"fisher": reports.report_values(lenses, search)}
+    return phase, focus, {"fisher": figures}
 
 
 def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:

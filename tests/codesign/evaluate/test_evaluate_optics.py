@@ -16,7 +16,7 @@ from codesign.eye import dataset
 from codesign.train import bootstrap_ratio
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
-from metalens.design.free_form import report
+from metalens.design.free_form import baselines
 from metalens.design.profiles import DoubleHelix, Focus
 from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
@@ -144,7 +144,7 @@ def test_nothing_to_evaluate_is_refused():
 def test_simple_lenses_stand_in_the_surroundings_of_the_lens_that_they_are_compared_with(
     monkeypatch,
 ):
-    monkeypatch.setattr(report, "ZONES", (1,))  # of the double helix
+    monkeypatch.setattr(baselines, "ZONES", (1,))  # of the double helix
     layers = Layers(
         front=(Film(Index(1.5), 60.0),),
         behind=(Film(Index(1.4), 90.0),),
