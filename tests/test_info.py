@@ -14,7 +14,7 @@ import torch
 from codesign.train import checkpoint
 from codesign.train.trainer import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.core import store, transaction
+from metalens.core import store
 from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
@@ -126,20 +126,3 @@ def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
         assert main(["info", str(path)]) == BAD_INPUT
         assert "make it again" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "absent.safetensors")]) == BAD_INPUT
-
-
-def test_a_file_of_a_folder_is_told_by_its_manifest_as_long_as_it_is_as_written(
-    tmp_path, capsys
-):
-    (tmp_path / "report.html").write_text("<p>as made</p>", encoding="utf-8")
-    transaction.write_manifest(tmp_path, "layout lens.h5 -o mask")
-    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    assert main(["info", str(tmp_path / "report.html")]) == SUCCESS
-    assert (
-        "14 bytes, as it was written by\n  metalens layout lens.h5 -o mask"
-        in capsys.readouterr().out
-    )
-    assert main(["info", str(tmp_path / "notes.txt")]) == BAD_INPUT  # not of the folder
-    (tmp_path / "report.html").write_text("<p>changed</p>", encoding="utf-8")
-    assert main(["info", str(tmp_path / "report.html")]) == BAD_INPUT
-    assert "report.html: not as `metalens layout" in capsys.readouterr().err

@@ -5,6 +5,7 @@ across it, with a picture.
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -282,7 +283,7 @@ def near_field_picture(request: NearFieldRequest, fields: list[NearField]) -> by
     columns = max(2, len(request.heights_um))
     figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
     top = max(_largest(near) for near in fields)
-    drawn = [
+    drawn: list[tuple[Any, ...]] = [
         (panels[0, 0], "y = 0", "xz", xz.grid.x_um, xz.grid.z_um, xz.e, xz.index),
         (panels[0, 1], "x = 0", "yz", yz.grid.y_um, yz.grid.z_um, yz.e, yz.index),
     ]

@@ -14,7 +14,6 @@ from metalens.core.errors import DAMAGE, StoreError
 
 NETWORK = ".safetensors"
 _DRAWINGS = {*MASKS, ".dxf", ".cif"}  # the latter two are refused by name
-_HDF5 = b"\x89HDF"  # first bytes
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Options(CommonOptions):
 
     Attributes:
         file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or
-            checkpoint (safetensors), a folder with a manifest, or any file of one.
+            checkpoint (safetensors), or a folder with a manifest.
         top: cell of a mask to count with all below it; omitted: all top cells.
     """
 
@@ -49,12 +48,6 @@ def run(options: Options) -> int:
         masks = load_above("mask")  # also a compressed one (chip.gds.gz)
         values = masks.mask_summary(path, options.top)
         text = masks.mask_summary_text(values)
-    elif (listed := manifest_entry(path)) is not None:
-        values = listed
-        text = (
-            f"{values['file']}: {values['bytes']:,} bytes, as it was written by\n"
-            f"  metalens {values['command']}\n{_versions_line(values)}"
-        )
     else:
         stored = store.load(path)
         values = _stored_values(path.name, stored)
@@ -112,36 +105,6 @@ def _short(value: object) -> str:
     if isinstance(value, float):
         text = repr(float(f"{value:.12g}"))
     return text if len(text) <= 100 else text[:97] + "..."
-
-
-def manifest_entry(path: Path) -> dict[str, Any] | None:
-    """Entry of a file in the manifest of its folder, with command and versions.
-
-    None for HDF5 files, and where no manifest lists the file.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        StoreError: it is not as it was written.
-    """
-    manifest = transaction.read_manifest(path.parent) if path.is_file() else None
-    listed = (manifest or {}).get("files", {}).get(path.name)
-    if manifest is None or listed is None:
-        return None
-    with open(path, "rb") as file:
-        if file.read(len(_HDF5)) == _HDF5:
-            return None
-    if store.sha256(path) != listed["sha256"]:
-        raise StoreError(
-            f"{path}: not as `metalens {manifest['command']}` wrote it; make it again"
-        )
-    return {
-        "file": path.name,
-        "command": manifest["command"],
-        "versions": manifest["versions"],
-        **listed,
-    }
 
 
 def folder_manifest(path: Path) -> dict[str, Any]:

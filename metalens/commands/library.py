@@ -144,7 +144,8 @@ def _finish(
     """
     from metalens.library import library_figure
 
-    fitted, refusal = None, ""
+    fitted: ProxyFit | None = None
+    refusal = ""
     try:
         fitted = proxy_fit.fit(pillars, settings.proxy)
     except DomainError as error:

@@ -379,7 +379,9 @@ def assign_polarization_multiplexed(
         float(np.average(np.abs(crossed) ** 2, weights=counts))
         for crossed in (jones[:, 1, 0], jones[:, 0, 1])
     ]
-    return lens, PolarizationMetrics(*quality, tuple(errors), tuple(leaked))
+    return lens, PolarizationMetrics(
+        quality[0], quality[1], tuple(errors), tuple(leaked)
+    )
 
 
 def assign_geometric_phase(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from metalens.core import reading, store
 from metalens.core.arrays import Array
@@ -257,21 +258,12 @@ def _interpolated_phasor(
     """
     finite = np.isfinite(phase_rad)
     phasor = np.where(finite, np.exp(1j * np.where(finite, phase_rad, 0.0)), 0.0)
+    places = np.meshgrid(row, column, indexing="ij")
     total, weight = (
-        _blend(_blend(values, row).T, column).T
+        ndimage.map_coordinates(values, places, order=1, mode="nearest")
         for values in (phasor, finite.astype(float))
     )
     return total / np.where(weight > 0, weight, 1.0), weight
-
-
-def _blend(samples: Array, position: Array) -> Array:
-    """Linear interpolation of (n, m) samples along the first axis at (k,) positions.
-
-    Positions beyond the ends take the end sample.
-    """
-    low = np.clip(np.floor(position).astype(int), 0, len(samples) - 2)
-    weight = np.clip(position - low, 0, 1)[:, None]
-    return np.asarray(samples[low] * (1 - weight) + samples[low + 1] * weight)
 
 
 def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
