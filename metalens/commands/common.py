@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from metalens.core import executor, transaction
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.core.transaction import ClaimTerms, OutputDraft
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -38,9 +38,9 @@ class CommonOptions:
     force: bool = False
 
     @property
-    def console(self) -> Console:
+    def console(self) -> CommandConsole:
         """Where the verb shows its progress and result."""
-        return Console(self.quiet, self.json)
+        return CommandConsole(self.quiet, self.json)
 
     def claim(
         self,

@@ -17,16 +17,16 @@ from metalens.cli import load_above
 from metalens.commands.common import CommonOptions, Output
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.core.store import write_bytes
 from metalens.design import (
     Cubic,
+    DesignMetrics,
     DoubleHelix,
     Focus,
     Limits,
     PhaseMap,
     PhaseOf,
-    Quality,
 )
 from metalens.design.free_form import FisherSettings
 from metalens.lens import Lens
@@ -363,7 +363,7 @@ def _design_one_size(settings: DesignSettings, options: Options) -> _Outcome:
     common = _common(settings, inputs)
     rotated = pillars.turned is not None
     targets: list[DesignSettings] = []
-    others: list[Quality] = []
+    others: list[DesignMetrics] = []
     if settings.wavelengths:
         if rotated:
             raise ConfigError(
@@ -484,7 +484,7 @@ def _fill_limits(
 
 
 def _pillars(
-    settings: DesignSettings, folder: Path, console: Console
+    settings: DesignSettings, folder: Path, console: CommandConsole
 ) -> tuple[PillarLibrary, dict[str, str]]:
     """The library of the pillars, and the SHA-256 of its file by name.
 
@@ -564,7 +564,7 @@ def format_place(at_um: tuple[float, float, float]) -> str:
 
 
 def _couple(
-    designed: Lens, quality: Quality, options: Options, *, rotated: bool
+    designed: Lens, quality: DesignMetrics, options: Options, *, rotated: bool
 ) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
     """The lens, with solved rows under ``--own-cell``, and its neighbour coupling loss.
 
@@ -594,13 +594,13 @@ def _couple(
 
 def _judge(
     designed: Lens,
-    quality: Quality,
+    quality: DesignMetrics,
     options: Options,
     *,
     wanted: bool,
     expected: float = 1.0,
 ) -> tuple[dict[str, Any], str]:
-    """Quality of a lens and of the PSF of its design source for JSON, and its failure.
+    """DesignMetrics of a lens and of the PSF of its design source for JSON, and its failure.
 
     The PSF is left out of a phase without a focus, of a lens of more pillars than fit
     in memory at once, and where torch is not installed. The failure is empty where the

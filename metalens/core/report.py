@@ -313,7 +313,12 @@ def summary_rows(
 
 
 def summary_table(values: Mapping[str, Any], caption: str = "") -> Table:
-    """A result as a table of a page, by :func:`summary_rows`."""
+    """A result as a table of a page, by :func:`summary_rows`.
+
+    Args:
+        values: a result.
+        caption: below the table.
+    """
     rows = [
         [label.replace("  ", "\u2003"), *shown]
         for label, *shown in summary_rows(values)
@@ -385,7 +390,7 @@ def silence_output() -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Console:
+class CommandConsole:
     """Standard output of one command.
 
     quiet: only errors are shown.

@@ -162,7 +162,7 @@ def hold_lock(target: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file, or the directory entries of a folder, to the disk."""
+    """Flush a file, or the directory entries of a folder, at ``path`` to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,9 +1,9 @@
 from . import neighbours as neighbours
 from . import profiles as profiles
 from .assign import ConversionMetrics as ConversionMetrics
+from .assign import DesignMetrics as DesignMetrics
 from .assign import Limits as Limits
 from .assign import PolarizationMetrics as PolarizationMetrics
-from .assign import Quality as Quality
 from .assign import WavelengthTarget as WavelengthTarget
 from .assign import assign_geometric_phase as assign_geometric_phase
 from .assign import assign_multi_wavelength as assign_multi_wavelength

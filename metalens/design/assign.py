@@ -35,8 +35,8 @@ _Choice = Callable[
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
-    """Quality of the assigned pillars at the design wavelength.
+class DesignMetrics:
+    """DesignMetrics of the assigned pillars at the design wavelength.
 
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
@@ -110,15 +110,15 @@ class WavelengthTarget:
 
 @dataclass(frozen=True, slots=True)
 class PolarizationMetrics:
-    """Quality of a lens of two-size pillars for light along x and along y.
+    """DesignMetrics of a lens of two-size pillars for light along x and along y.
 
     x, y: quality for either; ``wavefront_efficiency`` is the share of that light.
     wavefront_efficiency_error: its error for x and y, from the library's error bars.
     leaked: mean power that leaves in the other polarisation, for x and y.
     """
 
-    x: Quality
-    y: Quality
+    x: DesignMetrics
+    y: DesignMetrics
     wavefront_efficiency_error: tuple[float, ...]
     leaked: tuple[float, ...]
 
@@ -192,7 +192,7 @@ def make(
     profile: str = "map",
     provenance: Provenance | None = None,
     accept_partial_turn: bool = False,
-) -> tuple[Lens, Quality]:
+) -> tuple[Lens, DesignMetrics]:
     """Assign the pillar of the target phase to every site (paper Eq. 2 inverted).
 
     Args:
@@ -242,7 +242,7 @@ def assign_multi_wavelength(
     limits: Limits | None = None,
     profile: str = "map",
     provenance: Provenance | None = None,
-) -> tuple[Lens, tuple[Quality, ...]]:
+) -> tuple[Lens, tuple[DesignMetrics, ...]]:
     """Assign pillars of least squared error over several wavelengths.
 
     Args:
@@ -394,7 +394,7 @@ def assign_geometric_phase(
     limits: Limits | None = None,
     profile: str = "map",
     provenance: Provenance | None = None,
-) -> tuple[Lens, Quality, ConversionMetrics]:
+) -> tuple[Lens, DesignMetrics, ConversionMetrics]:
     """Rotate pillars of one size by half the target phase (Pancharatnam-Berry phase).
 
     Args:
@@ -510,7 +510,7 @@ def phase_coverage_hint(proxy: Proxy, cell: Cell, limits: Limits, turns: float) 
 
 
 class _MetricSums:
-    """Running sums over all pillars that :class:`Quality` is computed from."""
+    """Running sums over all pillars that :class:`DesignMetrics` is computed from."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -535,8 +535,8 @@ class _MetricSums:
 
     def quality(
         self, focus: Focus, place: LatticeSites, cell: Cell, turns: float
-    ) -> Quality:
-        """Quality of all added pillars from the running sums.
+    ) -> DesignMetrics:
+        """DesignMetrics of all added pillars from the running sums.
 
         With N pillars, F = sum T exp(i error) and L = sum T: wave-front efficiency
         |F|² / N², Strehl ratio |F|² / L².
@@ -550,7 +550,7 @@ class _MetricSums:
         peak = abs(self.field) ** 2
         radius = place.aperture_um / 2
         source, wave = focus.source_distance_um, focus.wavelength_um
-        return Quality(
+        return DesignMetrics(
             pillars=self.count,
             numerical_aperture=focus.aperture(
                 min(radius, focus.layers.footprint_um(source, wave))

@@ -17,7 +17,7 @@ from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance, typed_reader
 from metalens.library import rational
 from metalens.library.record import Sweep, check_light
@@ -330,7 +330,7 @@ class _Nodes:
         self.solves = 0
 
     def solve(
-        self, pairs: list[tuple[float, float]], console: Console, label: str
+        self, pairs: list[tuple[float, float]], console: CommandConsole, label: str
     ) -> list[SolvedPillar]:
         """Jones matrix and error bar of every pair; new pairs are solved in parallel.
 
@@ -378,7 +378,7 @@ class _Nodes:
         return SolvedPillar(pillar.t[::-1, ::-1], pillar.error)
 
     def grid(
-        self, x: Array, y: Array, console: Console, label: str
+        self, x: Array, y: Array, console: CommandConsole, label: str
     ) -> tuple[Array, Array]:
         """(m, n, 4) Jones matrices and (m, n) error bars of all pairs of nodes.
 
@@ -401,7 +401,7 @@ def sweep_two_sizes(
     cell: Cell,
     settings: Sweep,
     *,
-    console: Console | None = None,
+    console: CommandConsole | None = None,
     checkpoint: Path | None = None,
 ) -> AxesLibrary:
     """Compute a library over two sizes, by exact solves on a grid of nodes and rational
@@ -424,7 +424,7 @@ def sweep_two_sizes(
     """
     check_axes_sweep(cell, settings)
     settings = settings.with_tolerance(cell)
-    console = console or Console(quiet=True)
+    console = console or CommandConsole(quiet=True)
     journal = SweepJournal(checkpoint, cell, settings)
     places = size_entries(settings)
     reach = _choose_truncation(cell, settings)
@@ -505,7 +505,9 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     return most
 
 
-def _choose_lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
+def _choose_lines(
+    nodes: _Nodes, sweep: Sweep, console: CommandConsole
+) -> tuple[Array, Array]:
     """(x, y) nodes: seven Chebyshev points each, and lines added between them where the
     interpolations disagree most.
 
@@ -557,7 +559,7 @@ def _held_out(
     places: tuple[Array, Array],
     value: Array,
     doubt: Array,
-    console: Console,
+    console: CommandConsole,
 ) -> Array:
     """(k, 4) x and y in um, error, and error estimate of the interpolation at the
     held-out entries, which are solved but not interpolated.

@@ -12,7 +12,7 @@ import numpy as np
 from metalens.cell import Blend, Cell, Incidence, Material, index, materials
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.library import engines
 from metalens.library.curve import ResponseCurve
 from metalens.library.fit import REACH, UNKNOWN, find_runs
@@ -133,7 +133,7 @@ class CellVerdict:
 
 def run_study(
     study: CellStudy,
-    console: Console | None = None,
+    console: CommandConsole | None = None,
     *,
     journal: SweepJournal | None = None,
 ) -> list[CellVerdict]:
@@ -165,7 +165,9 @@ def run_study(
         for wavelength, height, pitch in combinations
     ]
     journal = journal or SweepJournal(None)
-    verdicts = _judge_cells(study, cases, journal, console or Console(quiet=True))
+    verdicts = _judge_cells(
+        study, cases, journal, console or CommandConsole(quiet=True)
+    )
     best = best_cell(study, verdicts)
     if best is None:
         return verdicts
@@ -173,7 +175,9 @@ def run_study(
     best_cases = [
         (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
     ]
-    return verdicts + _judge_cells(study, best_cases, journal, Console(quiet=True))
+    return verdicts + _judge_cells(
+        study, best_cases, journal, CommandConsole(quiet=True)
+    )
 
 
 def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -199,7 +203,7 @@ def _judge_cells(
     study: CellStudy,
     cases: list[tuple[Cell, float]],
     journal: SweepJournal,
-    console: Console,
+    console: CommandConsole,
 ) -> list[CellVerdict]:
     """Verdict on every case, from one rational curve t(D) each, solved on all cores.
 

@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter1d
 from metalens.cell import Cell, Incidence, Polarization
 from metalens.core import config
 from metalens.core.arrays import Array
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance
 from metalens.library import engines, workers
 from metalens.library.curve import ResponseCurve
@@ -30,7 +30,7 @@ def sweep(
     settings: Sweep | None = None,
     *,
     wavelengths_um: tuple[float, ...] | None = None,
-    console: Console | None = None,
+    console: CommandConsole | None = None,
     checkpoint: Path | None = None,
 ) -> PillarLibrary:
     """Compute a library: response over diameter at all wavelengths, angles and
@@ -59,12 +59,16 @@ class _SweepRun:
     """The curves t(D) of a checked sweep, by plane wave."""
 
     def __init__(
-        self, cell: Cell, sweep: Sweep, console: Console | None, checkpoint: Path | None
+        self,
+        cell: Cell,
+        sweep: Sweep,
+        console: CommandConsole | None,
+        checkpoint: Path | None,
     ) -> None:
         self.cell = cell
         self.sweep = sweep
         self.span = sweep.span_um(cell)
-        self.console = console or Console(quiet=True)
+        self.console = console or CommandConsole(quiet=True)
         self.engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
         self.journal = SweepJournal(checkpoint, cell, sweep)
         self.curves: dict[Incidence, ResponseCurve] = {}

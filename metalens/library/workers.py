@@ -13,7 +13,7 @@ from metalens import __version__
 from metalens.cell import Cell, Incidence, materials
 from metalens.core import config, executor, store
 from metalens.core.errors import StoreError
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.library import curve, engines
 from metalens.library.curve import ResponseCurve, SolvedNodes
 
@@ -155,7 +155,7 @@ class SweepJournal:
             return
 
     def run(
-        self, tasks: list[Task], console: Console, label: str
+        self, tasks: list[Task], console: CommandConsole, label: str
     ) -> list[list[SolvedNodes]]:
         """Solves of the tasks in order; those in the journal are not computed again.
 

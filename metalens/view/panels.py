@@ -29,7 +29,12 @@ class SliderAxis:
 
 
 def at_brightest(axes: Sequence[SliderAxis], values: Array) -> list[SliderAxis]:
-    """The sliders of images (*axes, y, x), set to the one with the highest peak."""
+    """The sliders ``axes`` of images, set to the one with the highest peak.
+
+    Args:
+        axes: sliders, one for each leading axis.
+        values: (*axes, y, x) images.
+    """
     places = np.unravel_index(int(values.argmax()), values.shape)
     return [
         replace(axis, first=int(place))

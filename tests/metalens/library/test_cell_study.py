@@ -12,7 +12,7 @@ from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
 from metalens.core import executor
 from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.library import plots, workers
 from metalens.library import study as cell_study
 from metalens.library.curve import SolvedNodes
@@ -262,7 +262,7 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     def done(settings):
         solved.clear()
         workers.SweepJournal(path, settings).run(
-            ["curve"], Console(quiet=True), "cells"
+            ["curve"], CommandConsole(quiet=True), "cells"
         )
         return any(solved)
 
@@ -294,7 +294,7 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
     monkeypatch.setattr(executor, "run_parallel", told)
     with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
         workers.SweepJournal(path, study).run(
-            ["curve", "other"], Console(quiet=True), "cells"
+            ["curve", "other"], CommandConsole(quiet=True), "cells"
         )
     assert len(path.read_text().splitlines()) == 2  # its title and the first
 

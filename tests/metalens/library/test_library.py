@@ -23,7 +23,7 @@ from metalens.core.errors import (
     MaterialError,
     StoreError,
 )
-from metalens.core.report import Console
+from metalens.core.report import CommandConsole
 from metalens.library import engines
 from metalens.library.record import DEFAULT_CELL, PillarLibrary, Sweep
 
@@ -100,7 +100,7 @@ def test_store_round_trip(made, tmp_path):
         library.load(tmp_path / "other.h5")
 
 
-class Interrupted(Console):
+class Interrupted(CommandConsole):
     """A console whose user presses Ctrl-C after the first finished task."""
 
     def track(self, items: Iterable[Any], *, total: int, label: str) -> Iterator[Any]:
