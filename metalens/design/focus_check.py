@@ -11,7 +11,6 @@ from metalens.design.own_cell import power_error
 from metalens.design.profiles import lens_focus
 from metalens.lens import Lens
 from metalens.psf import FocusMetrics
-from metalens.psf.of_lens import lens_stop_shadow
 
 _FRESNEL_ZONES = 5  # of fewer, the brightest point lies before the focus
 # (width in wavelength / (2 NA), samples) of the windows that are tried
@@ -120,6 +119,6 @@ def _stop_strehl(lens: Lens) -> float:
     """
     if lens.layers.stop is None:
         return 1.0
-    shadow = lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
+    shadow = psf.lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
     wave = shadow[np.asarray(lens.diameters.diameter_um) > 0]
     return float(abs(wave.sum()) ** 2 / np.abs(wave).sum() ** 2)

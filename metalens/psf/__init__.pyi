@@ -22,6 +22,7 @@ from .metrics import fwhm as fwhm
 from .of_lens import View as View
 from .of_lens import all_maps as all_maps
 from .of_lens import from_lens as from_lens
+from .of_lens import lens_stop_shadow as lens_stop_shadow
 from .of_lens import library_incidence as library_incidence
 from .of_lens import mean_over_polarizations as mean_over_polarizations
 from .of_lens import passed_um2 as passed_um2
