@@ -13,8 +13,7 @@ from typing import Any
 from layout.arrange import joined, parts, separation, wafer
 from layout.arrange.record import CellPart, Floorplan, Placement, WaferSettings
 from layout.commands import make, page
-from layout.commands.job import FloorplanWork, Options
-from layout.commands.stages import StageTimes
+from layout.commands.job import FloorplanWork, Options, StageTimes
 from layout.drc.klayout import write_lyp
 from layout.drc.lattice import check_plan
 from layout.drc.library import check_library

@@ -1,6 +1,8 @@
 """What ``metalens layout`` was asked for, and what it has made so far."""
 
 import contextlib
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,6 @@ import tyro
 
 from layout.arrange import joined, wafer
 from layout.arrange.record import Floorplan
-from layout.commands.stages import StageTimes
 from layout.drc.report import DrcReport, Violation
 from layout.formats import compare, handover
 from layout.formats.dxf import DxfWindow
@@ -85,6 +86,22 @@ class Options(DistributedOptions):
     def writes_gds(self) -> bool:
         """Whether GDSII is written: asked for, or the default."""
         return self.gds or not self.oasis
+
+
+@dataclass(eq=False, slots=True)
+class StageTimes:
+    """Seconds of each stage; ``say`` is told when one begins."""
+
+    say: Callable[[str], None]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time what happens inside as ``stage``."""
+        self.say(stage)
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - start
 
 
 @dataclass(eq=False, slots=True)

@@ -5,7 +5,6 @@ verified, with its companions.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from layout.commands import page
-from layout.commands.job import LayoutJob, Options
-from layout.commands.stages import StageTimes
+from layout.commands.job import LayoutJob, Options, StageTimes
 from layout.drc.klayout import write_lyp, write_lyrdb
 from layout.drc.lattice import check_plan
 from layout.formats import (
@@ -128,13 +126,9 @@ def make_mask(
             )
     job = _checked(drawing, *solved)
     handover.write_dose_table(job.plan, job.process, folder / "doses.csv")
-    with ThreadPoolExecutor(1, thread_name_prefix="pictures") as pool:
-        shots = pool.submit(
-            page.draw_pictures, job.stages.rows.unwatched(job.plan), job.drc
-        )
-        _write_masks(job, folder)
-        with job.stages("report"):
-            _accompany(job, shots.result(), folder)
+    _write_masks(job, folder)
+    with job.stages("report"):
+        _accompany(job, folder)
     store.write_text(
         folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n"
     )
@@ -151,7 +145,7 @@ def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> Lay
         write_fields = fields.split_write_fields(
             source.diameters, process, pillar_classes=mask.cells
         )
-        plan = stages.rows.watched(with_fields(plan, write_fields, process))
+        plan = with_fields(plan, write_fields, process)
     with stages("check"):
         drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
     return LayoutJob(
@@ -277,8 +271,8 @@ def _verified(
     )
 
 
-def _accompany(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
-    """Layer properties, markers, report and its pictures."""
+def _accompany(job: LayoutJob, target: Path) -> None:
+    """Layer properties, markers, job sheet and report."""
     write_lyp(job.plan, target / "mask.lyp")
     write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
@@ -286,7 +280,7 @@ def _accompany(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
     store.write_text(target / "job.txt", job.sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))
-    page.write_mask_page(job, shots, target)
+    page.write_mask_page(job, target)
 
 
 def values_of(job: LayoutJob) -> dict[str, Any]:

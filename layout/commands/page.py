@@ -5,18 +5,13 @@ it was checked.
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from layout.arrange import joined, separation
 from layout.commands import pictures
 from layout.commands.job import FloorplanWork, LayoutJob
 from layout.drc.report import DrcReport, format_size
-from layout.formats import handover
-from layout.formats.dxf import DxfWindow
-from layout.formats.library import MaskLibrary, library_of
-from layout.mask.plan import MaskPlan
+from layout.formats.library import MaskLibrary
 from layout.pec.psf import PointExposure, point_exposure
-from layout.process.process import ExposureSettings, Process
-from layout.shapes import polygon
+from layout.process.process import ExposureSettings
 from metalens.core import report
 from metalens.core.report import Figure, KeyFigure, Section, Table
 from metalens.core.units import nm
@@ -24,31 +19,16 @@ from metalens.core.units import nm
 _LISTED = 50  # rows of a table
 
 
-def draw_pictures(plan: MaskPlan, drc_report: DrcReport) -> dict[str, bytes]:
-    """{file name: picture} of what will be written.
-
-    Args:
-        plan: of the die.
-        drc_report: its design-rule check.
-    """
-    windows = DxfWindow(0, 0, 8), pictures.edge_window(plan, 8)
-    return {
-        "die.png": pictures.plot_die(plan, drc_report),
-        "pillars.png": pictures.plot_pillars(plan, windows),
-        "diameters.png": pictures.plot_diameters(plan),
-    }
-
-
-def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
-    """Write report.html of one lens, and its pictures.
+def write_mask_page(job: LayoutJob, target: Path) -> None:
+    """Write report.html of one lens, and die.png.
 
     Args:
         job: of the command.
-        shots: from :func:`draw_pictures`.
         target: folder.
     """
-    for name, png in shots.items():
-        (target / name).write_bytes(png)
+    die_png = pictures.plot_die(job.plan, job.drc)
+    (target / "die.png").write_bytes(die_png)
+    die_caption = "The whole die. Colour: share of the area that pillars cover."
     sections = [
         Section(
             "Die",
@@ -56,25 +36,14 @@ def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> No
             "array and witness cells) and the aperture layer, which draws the openings "
             "of the opaque film. The F stands in the upper left corner. The mask is "
             "seen from the pillar side, against the light, in the coordinates of the "
-            "lens: +y is up here, so the first row of the diameter map is the lowest.",
-            [
-                Figure(
-                    shots["die.png"],
-                    "The whole die. Colour: share of the area that pillars cover, "
-                    "averaged.",
-                    wide=True,
-                ),
-                Figure(
-                    shots["pillars.png"],
-                    "Polygons as they are written, in the middle and at the rim.",
-                    wide=True,
-                ),
-            ],
+            "lens: +y is up here, so the first row of the diameter map is the lowest. "
+            "metalens view shows every polygon.",
+            [Figure(die_png, die_caption, wide=True)],
         ),
         _rules(job.drc),
-        _classes(job, shots),
+        _classes(job),
         *_exposure(job),
-        _job_sheet(job),
+        _write_fields(job),
     ]
     if job.options.study:
         from layout.study import page as study_page
@@ -159,55 +128,28 @@ def _rules(drc_report: DrcReport) -> Section:
     return Section("Design rules", drc_report.summary + ".", items)
 
 
-def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    """Section on the drawn pillars: sizes and steps, and for discs a table of polygons.
-
-    Args:
-        job: of the command.
-        shots: pictures, from :func:`draw_pictures`.
-    """
+def _classes(job: LayoutJob) -> Section:
+    """Section on the drawn pillars: shape, sizes and steps."""
     rules = job.process.rules
     classes = job.plan.classes
-    if not classes[0].round:
-        shape = job.source.cell.shape
-        area = [made.twice_area / 2 for made in classes]
+    shape = job.source.cell.shape
+    if classes[0].round:
+        kind, corners = "disc", "as a polygon of its area"
+    else:
         two = job.source.pairs is not None
         kind = f"{shape.kind} of its own width and length" if two else shape.name
-        turned = job.source.diameters.angle_rad is not None
-        turns = f" and turns in steps of {rules.angle_step_deg:g} degrees" * turned
-        return Section(
-            "Pillars",
-            f"Each is a {kind}, drawn in sizes in steps of {rules.diameter_step_nm} nm"
-            f"{turns}, its corners on the grid; rounding by the etch is not made up "
-            f"for. {len(area)} classes of {min(area):,.0f} to {max(area):,.0f} nm².",
+        corners = (
+            "with its corners on the grid; rounding by the etch is not made up for"
         )
-    shapes = {made.diameter_units: made for made in classes}
-    grid = job.plan.grid
-    unit = job.plan.grid * job.plan.unit_nm
-    made = [
-        polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)
-    ]
-    picked = np.unique(np.linspace(0, len(made) - 1, 12).round().astype(int))
-    rows = [
-        [
-            m.diameter * unit,
-            m.width * unit,
-            len(m.points),
-            m.shots,
-            f"{100 * m.area_error:+.3f}",
-            m.edge_error * unit,
-        ]
-        for m in (made[i] for i in picked)
-    ]
-    worst = max(abs(m.area_error) for m in made)
-    text = (
-        f"Diameters are drawn in steps of {rules.diameter_step_nm} nm after the bias "
-        f"was taken off; that rounds each by at most {job.made.cells.rounding_nm:g} nm. "
-        f"Polygons have the area of their circle to {100 * worst:.3f} %."
+    turned = job.source.diameters.angle_rad is not None
+    turns = f" and turns in steps of {rules.angle_step_deg:g} degrees" * turned
+    areas = [pillar.twice_area / 2 * job.plan.unit_nm**2 for pillar in classes]
+    return Section(
+        "Pillars",
+        f"Each is a {kind}, drawn in sizes in steps of {rules.diameter_step_nm} nm"
+        f"{turns} after the bias was taken off, {corners}: {len(classes)} cells of "
+        f"{min(areas):,.0f} to {max(areas):,.0f} nm².",
     )
-    head = "diameter / nm, width / nm, vertices, shots, area error / %, edge error / nm"
-    picture = Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True)
-    return Section("Pillars", text, [picture, Table(head.split(", "), rows)])
 
 
 def _exposure(job: LayoutJob) -> list[Section]:
@@ -275,29 +217,17 @@ def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
     )
 
 
-def _job_sheet(job: LayoutJob) -> Section:
-    """Section on write fields and charge."""
+def _write_fields(job: LayoutJob) -> Section:
+    """Section on write fields."""
     split = job.fields
-    text = (
+    return Section(
+        "Write fields",
         f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
         f"by {split.size_um[1]:.1f} µm at most; no border cuts a pillar: they keep "
         f"{split.clearance_um / nm:.0f} nm. A raster centred on the axis would have cut "
         f"{split.cut_before:,} pillars. fields.csv lists them in the order of writing; "
-        "job.txt is the sheet for the operator, with currents left open."
+        "job.txt is the sheet for the operator, with doses and charge.",
     )
-    areas = library_of(job.plan).areas_um2()
-    charge = handover.charge_uC(areas, job.plan.doses, job.process)
-    return Section("Job sheet", text, [_charge(charge)])
-
-
-def _charge(charges: dict[str, float]) -> Table:
-    """Table of the charge of each step, and its time at 1 nA."""
-    rows = [
-        [step, f"{charge_uC:.4g}", f"{charge_uC / 3.6:.3g}"]
-        for step, charge_uC in charges.items()
-    ]
-    head = ("step", "charge / µC", "hours at 1 nA")
-    return Table(head, rows, "Without stage and settling times.")
 
 
 def _files(
@@ -326,51 +256,32 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
         work: of the command.
         library: mask that was written.
     """
-    shots = {"die.png": pictures.plot_floorplan(work.placed, work.near)}
+    die_png = pictures.plot_floorplan(work.placed, work.near)
+    (work.folder / "die.png").write_bytes(die_png)
     notes = " ".join(f"{note}." for note in work.notes)
-    sections = [
-        Section(
-            "Die",
-            f"Seen from the pillar side, +y up. {notes}".strip(),
-            [Figure(shots["die.png"], "Parts on the die.", wide=True), _places(work)],
-        )
-    ]
+    figure = Figure(die_png, "Parts on the die.", wide=True)
+    text = f"Seen from the pillar side, +y up. {notes}".strip()
+    sections = [Section("Die", text, [figure, _places(work)])]
     dies = 1
     if work.dies is not None and work.record.wafer is not None:
         dies = len(work.dies.index)
-        box = pictures.floorplan_box_um(work.placed)
-        shots["wafer.png"] = pictures.plot_wafer(work.record.wafer, work.dies, box)
+        box = separation.extent_of_copies(work.placed) / joined.PER_UM
+        wafer_png = pictures.plot_wafer(work.record.wafer, work.dies, box)
+        (work.folder / "wafer.png").write_bytes(wafer_png)
         caption = "Dies within the edge exclusion, and marks."
         text = f"{dies:,} whole dies; dies.csv lists them."
-        shown = Figure(shots["wafer.png"], caption, wide=True)
-        sections.append(Section("Wafer", text, [shown]))
-    for name, png in shots.items():
-        (work.folder / name).write_bytes(png)
+        figure = Figure(wafer_png, caption, wide=True)
+        sections.append(Section("Wafer", text, [figure]))
     read_back = {
         name: "DIFFERENT" if name in work.different else "as planned"
         for name in work.written
     }
-    charges = handover.charge_uC(work.areas_um2, library.doses, work.process)
-    sections += [
-        _checks(work),
-        Section(
-            "Dose",
-            "One dose for each layer and datatype: doses.csv; write fields of the "
-            "lenses: fields.csv.",
-            [_charge(charges), _dose_table(library, work.process)],
-        ),
-        _files(work.written, read_back, work.stages.seconds),
-    ]
-    pillars = sum(
-        values["pillars"]
-        * sum(copies.count for copies in placement.copies(placement.part.top))
-        for placement in work.placed
-        for name, values in work.lenses.items()
-        if name == placement.part.name
-    )
+    sections.append(_checks(work))
+    sections.append(_files(work.written, read_back, work.stages.seconds))
     lead = (
-        f"{work.verdict} {len(work.lenses)} lenses with {pillars:,} pillars on a die; "
-        f"process “{work.process.name}”."
+        f"{work.verdict} {len(work.lenses)} lenses on a die; process "
+        f"“{work.process.name}”. doses.csv: one dose for each layer and datatype; "
+        "job.txt: places, charge and doses; fields.csv: write fields of the lenses."
     )
     report.write_report(
         work.folder / "report.html",
@@ -384,16 +295,6 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
             KeyFigure("what fails", str(len(work.failures)), not work.failures),
         ],
     )
-
-
-def _dose_table(library: MaskLibrary, process: Process) -> Table:
-    """Table of the dose of each layer and datatype."""
-    base = process.exposure.base_uC_cm2
-    rows = [
-        [*layer, f"{dose:.6f}", dose * base, library.layer_names.get(layer, "")]
-        for layer, dose in sorted(library.doses.items())
-    ]
-    return Table(("layer", "datatype", "relative dose", "µC/cm²", "name"), rows)
 
 
 def _places(work: FloorplanWork) -> Table:

@@ -1,4 +1,4 @@
-"""Pictures of a mask for its report: the die, single pillars, diameters, the wafer."""
+"""Pictures of a mask for its report: the die, its exposure, the wafer."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,6 @@ from layout.arrange import joined, separation
 from layout.arrange.record import WaferSettings
 from layout.arrange.wafer import WaferDies
 from layout.drc.report import DrcReport, Violation
-from layout.formats.dxf import DxfWindow, sites_in
 from layout.mask.plan import MaskPlan, PillarArray
 from layout.shapes import rectilinear
 from layout.verify.report import ExposureReport
@@ -69,65 +68,6 @@ def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
     return report.figure_png(figure)
 
 
-def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
-    """The drawn polygons in some windows as PNG.
-
-    Args:
-        plan: of the die.
-        windows: of the mask.
-    """
-    from matplotlib.collections import PolyCollection
-
-    size = (4.0 * len(windows), 4.0)
-    figure, axes = report.make_figure(1, len(windows), size=size, squeeze=False)
-    scale = plan.unit_nm * 1e-3
-    sizes_nm = [pillar.diameter_nm for pillar in plan.classes]
-    for ax, window in zip(axes[0], windows, strict=True):
-        shapes = []
-        sizes = []
-        for lattice in plan.lattices:
-            for number, x, y in sites_in(plan, lattice, window):
-                for corners in plan.classes[number - 1].polygons:
-                    shapes.append((corners + np.array([x, y])) * scale)
-                    sizes.append(sizes_nm[number - 1])
-        style: dict[str, Any] = {
-            "cmap": "viridis",
-            "edgecolors": "#222",
-            "linewidths": 0.4,
-        }
-        drawn = PolyCollection(shapes, array=np.array(sizes), **style)
-        drawn.set_clim(min(sizes_nm), max(sizes_nm))
-        ax.grid(False)
-        ax.add_collection(drawn)
-        u = window.x_um
-        v = window.y_um
-        half = window.size_um / 2
-        ax.set(xlim=(u - half, u + half), ylim=(v - half, v + half), aspect="equal")
-        ax.set(xlabel="x / µm", ylabel="y / µm")
-        ax.set_title(f"{window.size_um:g} µm at ({u:.6g}, {v:.6g})")
-    return report.figure_png(figure)
-
-
-def plot_diameters(plan: MaskPlan) -> bytes:
-    """How many pillars of each drawn diameter the lens has, as PNG.
-
-    Args:
-        plan: with the lens as its first lattice.
-    """
-    counts = plan.lattices[0].counts(len(plan.classes))[1:]
-    sizes = np.array([pillar.diameter_nm for pillar in plan.classes])
-    diameters, diameter_number = np.unique(sizes[counts > 0], return_inverse=True)
-    total = np.bincount(diameter_number, counts[counts > 0])
-    figure, axes = report.make_figure(size=(7.6, 2.9))
-    step = float(np.diff(diameters).min(initial=np.inf)) if len(diameters) > 1 else 1.0
-    axes.bar(diameters, total / 1e3, width=0.9 * step)
-    axes.set(xlabel="drawn diameter / nm", ylabel="pillars / 1000")
-    axes.set_title(
-        f"{int(total.sum()):,} pillars of the lens in {len(diameters)} diameters"
-    )
-    return report.figure_png(figure)
-
-
 def plot_verification(verification: ExposureReport) -> bytes:
     """Difference of resist and drawn diameters over the die, and its histogram, as PNG.
 
@@ -147,20 +87,6 @@ def plot_verification(verification: ExposureReport) -> bytes:
     at_right.stairs(pillars, edges, fill=True)
     at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
     return report.figure_png(figure)
-
-
-def edge_window(plan: MaskPlan, size_um: float) -> DxfWindow:
-    """A window at the rim of the lens, on the +x axis.
-
-    Args:
-        plan: with the lens as its first lattice.
-        size_um: side of the window.
-    """
-    lattice = plan.lattices[0]
-    middle = lattice.source(lattice.rows // 2, lattice.rows // 2 + 1)[0]
-    last = int(np.flatnonzero(middle)[-1]) if middle.any() else lattice.columns // 2
-    x = (lattice.x0 + last * lattice.pitch) * plan.unit_nm * 1e-3
-    return DxfWindow(x - size_um / 3, 0.0, size_um)
 
 
 def _coverage(plan: MaskPlan, lattice: PillarArray) -> Array:
@@ -211,15 +137,6 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
 # arrangements
 
 
-def floorplan_box_um(placed: Sequence[joined.PartPlacement]) -> Array:
-    """(4,) left, bottom, right, top of everything on a die.
-
-    Args:
-        placed: parts on the die.
-    """
-    return separation.extent_of_copies(placed) / joined.PER_UM
-
-
 def plot_floorplan(
     placed: Sequence[joined.PartPlacement], near: Sequence[Violation]
 ) -> bytes:
@@ -244,7 +161,8 @@ def plot_floorplan(
     if near:
         x, y = np.array([violation.centre for violation in near]).T / joined.PER_UM
         axes.plot(x, y, "x", color="red", ms=6, mew=1.5)
-    left, bottom, right, top = floorplan_box_um(placed).tolist()
+    box = separation.extent_of_copies(placed) / joined.PER_UM
+    left, bottom, right, top = box.tolist()
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.set(xlabel="x / µm", ylabel="y / µm")
     return report.figure_png(figure)

@@ -11,17 +11,11 @@ import numpy as np
 from layout.mask.build import check_layers
 from layout.mask.held import hold_on_disk
 from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarClass
-from layout.pec import bodies, psf, rects
+from layout.pec import bodies, psf
 from layout.pec.bodies import ExposureTable, ScatterRanges
 from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
-from layout.pec.fracture import fracture_boxes
-from layout.pec.nodes import (
-    NodeGrid,
-    RadialConvolution,
-    gather_to_nodes,
-    gaussian_convolution,
-    interpolate_from_nodes,
-)
+from layout.pec.marks import ExposedMarks, cut_marks
+from layout.pec.nodes import Background, RadialConvolution, gaussian_convolution
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.process.process import ExposureSettings, LayerNumber, LayerTable
 from layout.shapes import rectilinear
@@ -30,7 +24,6 @@ from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
-_SPOTS = 10  # of a piece on the nodes, along the narrowest Gaussian of these
 _ROUNDED = 0.75  # of the tolerance, for doses rounded to the ladder
 _SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
 NONE = 255  # dose class of a site without pillar
@@ -136,64 +129,20 @@ def dose_ladder(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ExposedMarks:
-    """Marks and labels in pieces of one dose each, as masses on the nodes.
-
-    boxes: (pieces, 4) left, bottom, right, top, database units. figure: (pieces, 2)
-    number of the figure, and of the layer in it. own: (pieces,) exposure of the outer
-    edges by their own shape at unit dose. points: (n, 2) points on the outer edges, um.
-    piece: (n,) piece of each point. spots: points, areas and pieces of the samples that
-    represent the pieces on the nodes.
-    """
-
-    grid: NodeGrid
-    boxes: Array
-    figure: Array
-    own: Array
-    points: Array
-    piece: Array
-    spots: tuple[Array, Array, Array]
-
-    def deposited(self, dose: Array) -> Array:
-        """(y, x) masses of doses (pieces,)."""
-        points, area, piece = self.spots
-        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
-
-    def doses(self, field: Array) -> Array:
-        """(pieces,) doses that give the outer edges their exposure on a background.
-
-        dose = (THRESHOLD - mean background over the points of the piece) / own.
-
-        Args:
-            field: (y, x) background on the nodes.
-        """
-        if not len(self.own):
-            return np.empty(0)
-        count = len(self.own)
-        total = np.bincount(
-            self.piece, self.grid.sample(field, *self.points.T), minlength=count
-        )
-        background = total / np.bincount(self.piece, minlength=count)
-        return np.asarray((THRESHOLD - background) / self.own)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class WantedDoses:
     """Doses that give every edge of a plan its exposure, before they are rounded.
 
     lattices: of pillars, in um.
     table: what each kind of pillar exposes.
     ranges: of the point exposure.
-    far: (y, x) background on the nodes of ``marks.grid`` that belongs to the doses.
-    near: (rows, columns) of each lattice, of the middle ranges; empty for none.
+    background: that belongs to the doses.
     """
 
     plan: MaskPlan
     lattices: Sequence[PillarArray]
     table: ExposureTable
     ranges: ScatterRanges
-    far: Array
-    near: Sequence[Array]
+    background: Background
     marks: ExposedMarks
 
     def of_pillars(self, number: int, first: int, block: Array) -> Array:
@@ -211,15 +160,8 @@ class WantedDoses:
             (rows, columns) relative doses; values at sites without pillar mean nothing.
         """
         lattice = self.lattices[number]
-        grid = self.marks.grid
         table = self.table
-        background = np.empty(block.shape, np.float32)
-        down = grid.y.at(lattice.rows_um(first, len(block)))
-        interpolate_from_nodes(
-            self.far, *down, *grid.x.at(lattice.columns_um), background
-        )
-        if self.near:
-            background += self.near[number][first : first + len(block)]
+        background = self.background.at_sites(lattice, number, first, len(block))
         own_exposure = np.where(table.used, table.own, 1.0)
         return np.asarray(
             ((THRESHOLD * table.goal)[block] - background) / own_exposure[block]
@@ -268,7 +210,7 @@ class WantedDoses:
         point = (
             self.ranges.near if len(self.ranges.near.widths_um) else self.ranges.middle
         )
-        dose = self.marks.doses(self.far)
+        dose = self.marks.doses(self.background.far)
         allowed_change = np.minimum(tolerance, straight_edge_error(point) * dose)
         update(dose, dose * self.marks.own / THRESHOLD / allowed_change)
         return least, largest, finest
@@ -315,22 +257,12 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
     table = bodies.exposure_table(
         kinds, goal, counts, point=point, ranges=ranges, body=densest
     )
-    boxes, figure, shape = _pieces(plan, lattices, point, exposure.tolerance)
-    narrowest_um = (
-        float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
-    )
-    boxes_um = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
-    die_box = (*boxes_um[:, :2].min(0).tolist(), *boxes_um[:, 2:].max(0).tolist())
-    grid = NodeGrid.over(die_box, narrowest_um)
-    near_and_middle = PointExposure(
-        np.r_[ranges.near.widths_um, ranges.middle.widths_um],
-        np.r_[ranges.near.weights, ranges.middle.weights],
-    )
-    edges = rects.self_exposure(boxes * unit, shape, near_and_middle)
-    spots = rects.rectangle_samples(boxes * unit, narrowest_um / _SPOTS)
-    marks = ExposedMarks(grid, boxes, figure, *edges, spots)
-    far, near = _backgrounds(lattices, table, ranges, marks)
-    return WantedDoses(plan, lattices, table, ranges, far, near, marks)
+    is_close = point.widths_um < bodies.COARSE * densest.nearest_um
+    close = PointExposure(point.widths_um[is_close], point.weights[is_close])
+    tolerance = min(exposure.tolerance, straight_edge_error(point))
+    marks = cut_marks(plan, lattices, close, ranges.far, tolerance)
+    background = _backgrounds(lattices, table, ranges, marks)
+    return WantedDoses(plan, lattices, table, ranges, background, marks)
 
 
 def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
@@ -358,24 +290,23 @@ def _backgrounds(
     table: ExposureTable,
     ranges: ScatterRanges,
     marks: ExposedMarks,
-) -> tuple[Array, list[Array]]:
+) -> Background:
     """Background exposure at the doses sought, by alternating relaxation.
 
     The far field comes from all shapes, through the nodes; the middle field from
     neighbours on the same lattice. Both depend on the doses, and the doses on both:
     dose = (THRESHOLD goal - far - middle) / own. Each is relaxed with the other fixed,
     until the far field changes by less than 1e-7, at most 12 times.
-
-    Returns:
-        (y, x) far field on the nodes, and (rows, columns) middle field of each lattice;
-        the list is empty where the point exposure has no middle range.
     """
     grid = marks.grid
-    mass, goal = _masses(lattices, table, grid)
-    spacing = grid.y.spacing_um, grid.x.spacing_um
-    far_convolution = gaussian_convolution(
-        grid.shape, spacing, point=ranges.far, hollow=False
-    )
+    # a pillar of dose (THRESHOLD goal - field) / own deposits area times that dose
+    sums = np.zeros((2, *grid.shape))
+    for lattice in lattices:
+        grid.gather(
+            lattice, np.stack([table.per_own, table.per_own * table.goal]), sums
+        )
+    mass, goal = sums
+    far_convolution = grid.convolution(ranges.far)
     middles = [
         middle_convolution(lattice, ranges)
         for lattice in lattices
@@ -386,12 +317,10 @@ def _backgrounds(
     for _ in range(12 if middles else 0):
         middle_fields = []
         carried = np.zeros(grid.shape)
+        far = Background(grid, field, ())
         for lattice, middle in zip(lattices, middles, strict=True):
-            classes = np.concatenate([block for _, block in lattice.blocks()])
-            across = grid.x.at(lattice.columns_um)
-            down = grid.y.at(lattice.rows_um(0, lattice.rows))
-            far_field = np.empty(classes.shape, np.float32)
-            interpolate_from_nodes(field, *down, *across, far_field)
+            classes = lattice.whole()
+            far_field = far.at_sites(lattice, 0, 0, lattice.rows)
             per_own = table.per_own.take(classes)
             source = (THRESHOLD * table.goal.take(classes) - far_field) * per_own
             middle_field = _relaxed(middle, per_own, source, bound_below=0.9)
@@ -404,25 +333,7 @@ def _backgrounds(
         field = _relaxed(far_convolution, mass, THRESHOLD * goal - carried, marks=marks)
         if np.abs(field - previous).max() < 1e-7:
             break
-    return field, middle_fields
-
-
-def _masses(
-    lattices: Sequence[PillarArray], table: ExposureTable, grid: NodeGrid
-) -> tuple[Array, Array]:
-    """(y, x) sums over the nodes of area / own, and of goal area / own.
-
-    A pillar of dose (THRESHOLD goal - field) / own deposits area times that dose, so
-    both sums give the deposited mass for any field.
-    """
-    per_class = np.stack([table.per_own, table.per_own * table.goal])
-    sums = np.zeros((2, *grid.shape))
-    for lattice in lattices:
-        across = grid.x.at(lattice.columns_um)
-        for first, block in lattice.blocks():
-            down = grid.y.at(lattice.rows_um(first, len(block)))
-            gather_to_nodes(block, per_class, *down, *across, sums)
-    return sums[0], sums[1]
+    return Background(grid, field, middle_fields)
 
 
 def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:
@@ -487,90 +398,6 @@ def _relaxed(
         if np.abs(change).max() < 1e-9:
             break
     return field
-
-
-# marks
-
-
-def _pieces(
-    plan: MaskPlan,
-    lattices: Sequence[PillarArray],
-    point: PointExposure,
-    tolerance: float,
-) -> tuple[Array, Array, Array]:
-    """Rectangles of all exposed figures, fractured to pieces of one dose each.
-
-    Args:
-        plan: with marks and labels.
-        lattices: of pillars, in um; pieces are shorter near them.
-        point: exposure of a beam.
-        tolerance: relative, of the exposure.
-
-    Returns:
-        (n, 4) left, bottom, right, top in database units, (n, 2) numbers of the figure
-        and of the layer in it, and (n,) number of the connected shape.
-    """
-    rectangles = [np.empty((0, 4), np.int64)]
-    layer_of_box = [np.empty((0, 2), np.int64)]
-    shape = [np.empty(0, np.int64)]
-    shapes = 0
-    for figure_number, figure in enumerate(plan.figures):
-        if figure.name not in EXPOSED:
-            continue
-        for layer_number, polygons in enumerate(figure.polygons.values()):
-            boxes = np.concatenate(
-                [rectilinear.split_rectilinear(polygon) for polygon in polygons]
-            )
-            rectangles.append(boxes)
-            layer_of_box.append(np.tile([figure_number, layer_number], (len(boxes), 1)))
-            shape.append(shapes + _touching(boxes))
-            shapes = int(shape[-1].max()) + 1
-    pieces, rectangle = fracture_boxes(
-        np.concatenate(rectangles) // plan.grid,
-        np.array([lattice.box_um for lattice in lattices]),
-        step_um=plan.grid * plan.unit_nm * nm,
-        point=point,
-        tolerance=min(tolerance, straight_edge_error(point)),
-    )
-    return (
-        pieces * plan.grid,
-        np.concatenate(layer_of_box)[rectangle],
-        np.concatenate(shape)[rectangle],
-    )
-
-
-def _touching(boxes: Array) -> Array:
-    """(n,) number of the connected shape that each rectangle belongs to.
-
-    Rectangles that touch or overlap are connected. They are swept along the longer side
-    of the area, so memory grows with the number of such pairs.
-
-    Args:
-        boxes: (n, 4) left, bottom, right, top.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    axis = int(np.argmax(boxes[:, 2:].max(0) - boxes[:, :2].min(0)))
-    order = np.argsort(boxes[:, axis], kind="stable")
-    sorted_boxes = boxes[order]
-    ends = np.searchsorted(
-        sorted_boxes[:, axis], sorted_boxes[:, 2 + axis], side="right"
-    )
-    across = 1 - axis
-    first = []
-    second = []
-    for n, end in enumerate(ends.tolist()):
-        later = sorted_boxes[n + 1 : end]
-        meets = (later[:, across] <= sorted_boxes[n, 2 + across]) & (
-            later[:, 2 + across] >= sorted_boxes[n, across]
-        )
-        touching = order[n + 1 : end][meets]
-        second.append(touching)
-        first.append(np.full(len(touching), order[n]))
-    i, j = np.concatenate(first), np.concatenate(second)
-    pairs = coo_matrix((np.ones(len(i)), (i, j)), (len(boxes), len(boxes)))
-    return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
 
 
 # the dosed plan
@@ -706,15 +533,16 @@ def _figures(
     """
     plan = wanted_doses.plan
     marks = wanted_doses.marks
-    level = ladder.nearest(marks.doses(wanted_doses.far))
+    level = ladder.nearest(marks.doses(wanted_doses.background.far))
+    rows = np.column_stack([marks.figure, level, marks.boxes[:, [1, 3]]])
+    follows = marks.boxes[1:, 0] == marks.boxes[:-1, 2]  # in a row, of equal dose
+    is_first = np.r_[True, ~(follows & (rows[1:] == rows[:-1]).all(1))]
+    first = np.flatnonzero(is_first[: len(rows)])
+    last = np.r_[first[1:], len(rows)][: len(first)] - 1
+    joined = np.hstack([marks.boxes[first, :2], marks.boxes[last, 2:]])
+    level, figure_of_box = level[first], marks.figure[first]
     layer_numbers = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
-    layer_of_piece = np.array(
-        [
-            layer_numbers[figure_number][layer_index]
-            for figure_number, layer_index in marks.figure.tolist()
-        ],
-        np.int64,
-    )
+    layer_of_box = np.array([layer_numbers[f][k] for f, k in figure_of_box.tolist()])
     doses: dict[LayerNumber, float] = {}
     figures = list(plan.figures)
     for figure_number, figure in enumerate(plan.figures):
@@ -722,11 +550,11 @@ def _figures(
             continue
         shapes: dict[LayerNumber, tuple[Array, ...]] = {}
         for layer_index, layer in enumerate(figure.polygons):
-            in_layer = (marks.figure == (figure_number, layer_index)).all(1)
+            in_layer = (figure_of_box == (figure_number, layer_index)).all(1)
             for offset, dose_class in enumerate(
-                np.unique(level[layer_of_piece == layer[0]]).tolist()
+                np.unique(level[layer_of_box == layer[0]]).tolist()
             ):
-                boxes = marks.boxes[in_layer & (level == dose_class)]
+                boxes = joined[in_layer & (level == dose_class)]
                 if len(boxes):
                     dosed_layer = (layer[0], layer[1] + offset)
                     shapes[dosed_layer] = tuple(

@@ -111,10 +111,13 @@ class DrawnOutlines:
         Gaussian).
         """
         own_and_slope = np.zeros((2, len(self.contours)))
+        levels: dict[bytes, tuple[float, float]] = {}  # of equal contours once
         for entry in np.flatnonzero(used).tolist():
-            own_and_slope[:, entry] = _level(
-                self.contours[entry], float(self.area_um2[entry]), point
-            )
+            contours = self.contours[entry]
+            key = b"|".join(contour.tobytes() for contour in contours)
+            if key not in levels:
+                levels[key] = _level(contours, float(self.area_um2[entry]), point)
+            own_and_slope[:, entry] = levels[key]
         return own_and_slope[0], own_and_slope[1]
 
     def edge_points_um(self, entry: int) -> Array:

@@ -2,10 +2,12 @@
 and its transpose.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from layout.mask.plan import PillarArray
 from layout.pec.psf import PointExposure
 from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
@@ -83,6 +85,24 @@ class NodeGrid:
         _deposit(*self.x.at(x_um), *self.y.at(y_um), np.asarray(mass, float), out)
         return out
 
+    def gather(self, lattice: PillarArray, value: Array, sums: Array) -> None:
+        """Add what the pillars of a lattice carry to node sums (fields, y, x).
+
+        Args:
+            lattice: of class numbers.
+            value: (fields, classes + 1) amount that each pillar of a class carries.
+            sums: changed in place.
+        """
+        across = self.x.at(lattice.columns_um)
+        for first, block in lattice.blocks():
+            down = self.y.at(lattice.rows_um(first, len(block)))
+            _gather(block, value, *down, *across, sums)
+
+    def convolution(self, point: PointExposure) -> "RadialConvolution":
+        """Convolution of node sums with Gaussians."""
+        spacing = self.y.spacing_um, self.x.spacing_um
+        return gaussian_convolution(self.shape, spacing, point=point, hollow=False)
+
     def sample(self, field: Array, x_um: Array, y_um: Array) -> Array:
         """(n,) values of a node field at any places."""
         out = np.zeros(len(np.atleast_1d(x_um)))
@@ -133,7 +153,7 @@ def _sample(
 
 
 @compile_loop
-def gather_to_nodes(
+def _gather(
     block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
     """Add what the pillars of a block of rows carry to the nodes, by cubic weights.
@@ -164,8 +184,43 @@ def gather_to_nodes(
                     out[f, yn[row] + i, node] += yw[row, i] * line[f, node]
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Background:
+    """Exposure of a die by all that scatters far.
+
+    grid: nodes.
+    far: (y, x) exposure on the nodes.
+    near: (rows, columns) exposure on the sites of each lattice by middle ranges; empty
+        for none.
+    """
+
+    grid: NodeGrid
+    far: Array
+    near: Sequence[Array]
+
+    def at_sites(
+        self, lattice: PillarArray, number: int, first: int, count: int
+    ) -> Array:
+        """(count, columns) float32 exposure of rows of a lattice.
+
+        Args:
+            lattice: of pillars, in um.
+            number: of the lattice.
+            first: row.
+            count: of rows.
+        """
+        exposure = np.empty((count, lattice.columns), np.float32)
+        down = self.grid.y.at(lattice.rows_um(first, count))
+        _interpolate(self.far, *down, *self.grid.x.at(lattice.columns_um), exposure)
+        return (
+            exposure + self.near[number][first : first + count]
+            if self.near
+            else exposure
+        )
+
+
 @compile_loop
-def interpolate_from_nodes(
+def _interpolate(
     field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
     """Interpolate a node field at the sites of a block of rows, by cubic weights.

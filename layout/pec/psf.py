@@ -27,6 +27,11 @@ class PointExposure:
     weights: Array
     fit_error: float = 0.0
 
+    @property
+    def terms(self) -> list[tuple[float, float]]:
+        """[(1/e radius in um, weight)] of the Gaussians."""
+        return list(zip(self.widths_um.tolist(), self.weights.tolist(), strict=True))
+
     def density(self, radius_um: Array) -> Array:
         """(*shape) energy density per um^2 at ``radius_um``."""
         r2 = np.asarray(radius_um, float)[..., None] ** 2

@@ -8,14 +8,13 @@ import numpy as np
 
 from layout.formats.library import NOTHING, MaskLibrary, PolygonStack, flatten_stacks
 from layout.mask.plan import MaskPlan, PillarArray
-from layout.pec import bodies, correct, nodes, sampled
+from layout.pec import bodies, correct, nodes, polygon_edges
 from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
+from layout.pec.polygon_edges import ExposedPolygons
 from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
 from layout.process import isolation
 from layout.process.process import LayerNumber, Process
 from layout.shapes import polygon, region
-from layout.verify import polygon_edges
-from layout.verify.polygon_edges import ExposedPolygons
 from layout.verify.report import EdgeErrors, ExposureReport, VerificationTally
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -23,6 +22,8 @@ from metalens.core.units import nm
 
 _SAMPLES = 1000  # pillars whose exposure is summed exactly, on masks up to ...
 _PRODUCTS = 4e9  # ... so many products of samples and sites
+_NEIGHBOURS = 5  # sites on each side whose shapes are summed exactly
+_FAR = 6.0  # ranges between two shapes at which a Gaussian is below exp(-36)
 _SPOTS = 8  # along the narrowest Gaussian of the node field, of a polygon
 
 
@@ -114,11 +115,11 @@ def verify_exposure(
         pillars,
         tally,
         box,
-        _edges(scene, field, point),
+        _edges(scene, field),
         float(foot - top) / 2,
         process.exposure.tolerance,
         scene.undosed,
-        *_sampled(scene, field, point),
+        *_sampled(scene, field),
     )
 
 
@@ -224,19 +225,18 @@ def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Field:
-    """Background exposure: on nodes by wide Gaussians, on the sites by middle ones.
+    """Exposure of the drawn edges: a background, and what each pillar adds itself.
 
-    far: (y, x) on the nodes. near: (rows, columns) of each lattice; empty without
-    middle range. own, slope: (classes + 1,) exposure of a pillar's edge by itself at
-    unit dose, less what the node field counts for it, and its fall per um. close:
-    (range, weight) of the Gaussians that nodes do not hold. spots: points and masses
-    that represent other shapes.
+    ranges: Gaussians by reach.
+    background: on nodes by far ranges, on sites by middle ones.
+    own, slope: (classes + 1,) exposure of a pillar's edge by itself at unit dose, less
+        what the node field counts for it, and its fall per um.
+    close: (range, weight) of the Gaussians that nodes do not hold.
+    spots: points and masses that represent other shapes.
     """
 
     ranges: bodies.ScatterRanges
-    grid: nodes.NodeGrid
-    far: Array
-    near: Sequence[Array]
+    background: nodes.Background
     own: Array
     slope: Array
     close: Sequence[tuple[float, float]]
@@ -256,10 +256,10 @@ class _Field:
         counts = bodies.count_pillars(scene.bodies, len(scene.dose)) * (scene.dose > 0)
         densest = min(scene.bodies, key=lambda body: body.nearest_um)
         ranges = bodies.split_ranges(point, scene.kinds, counts, densest)
-        own, slope = _of_themselves(scene, counts > 0, point)
+        own, slope = scene.kinds.edge_exposure(counts > 0, point)
         far = ranges.far
         own = own - scene.kinds.area_um2 * float(far.density(np.array(0.0)))
-        narrowest_um = float(far.widths_um.min()) if len(far.widths_um) else 1e3
+        narrowest_um = float(far.widths_um.min(initial=1e3))
         grid = nodes.NodeGrid.over(
             _box(scene.bodies, scene.others.corners), narrowest_um
         )
@@ -269,14 +269,7 @@ class _Field:
         mass = grid.deposit(x, y, masses)[None]
         mass_of_class = scene.dose * scene.kinds.area_um2
         for body in scene.bodies:
-            across = grid.x.at(body.columns_um)
-            for first, block in body.blocks():
-                down = grid.y.at(body.rows_um(first, len(block)))
-                nodes.gather_to_nodes(block, mass_of_class[None], *down, *across, mass)
-        spacing = grid.y.spacing_um, grid.x.spacing_um
-        far_convolution = nodes.gaussian_convolution(
-            grid.shape, spacing, point=far, hollow=False
-        )
+            grid.gather(body, mass_of_class[None], mass)
         near = []
         if len(ranges.middle.widths_um):
             for body in scene.bodies:
@@ -285,27 +278,16 @@ class _Field:
                 )
                 middle = correct.middle_convolution(body, ranges)
                 near.append(middle(sites).astype(np.float32))
-        close = [
-            (float(width_um), float(weight))
-            for width_um, weight in zip(point.widths_um, point.weights, strict=True)
-            if width_um < bodies.COARSE * densest.nearest_um
-        ]
+        is_close = point.widths_um < bodies.COARSE * densest.nearest_um
+        close = PointExposure(point.widths_um[is_close], point.weights[is_close])
+        background = nodes.Background(grid, grid.convolution(far)(mass[0]), near)
         points = np.column_stack([x, y])
-        return cls(
-            ranges,
-            grid,
-            far_convolution(mass[0]),
-            near,
-            own,
-            slope,
-            close,
-            (points, masses),
-        )
+        return cls(ranges, background, own, slope, close.terms, (points, masses))
 
     def rows(self, scene: WrittenMask, number: int, first: int, block: Array) -> Array:
         """(rows, columns) exposure of the drawn edges of a block, float.
 
-        far field + middle field + dose * own.
+        Background + dose * own.
 
         Args:
             scene: what a written mask exposes.
@@ -313,48 +295,10 @@ class _Field:
             first: row of the block.
             block: (rows, columns) classes.
         """
-        body = scene.bodies[number]
-        exposure = np.empty(block.shape, np.float32)
-        nodes.interpolate_from_nodes(
-            self.far,
-            *self.grid.y.at(body.rows_um(first, len(block))),
-            *self.grid.x.at(body.columns_um),
-            exposure,
+        exposure = self.background.at_sites(
+            scene.bodies[number], number, first, len(block)
         )
-        if self.near:
-            exposure += self.near[number][first : first + len(block)]
         return np.asarray(exposure + (scene.dose * self.own)[block])
-
-
-def _of_themselves(
-    scene: WrittenMask, used: Array, point: PointExposure
-) -> tuple[Array, Array]:
-    """(classes + 1,) exposure of an edge by its own pillar at unit dose, and its slope.
-
-    Classes of equal contours and different doses are computed once.
-
-    Args:
-        scene: what a written mask exposes.
-        used: (classes + 1,) which classes occur.
-        point: exposure of a beam.
-
-    Returns:
-        Exposure, and its fall per um that the edges move out.
-    """
-    if isinstance(scene.kinds, DrawnDiscs):
-        return scene.kinds.edge_exposure(used, point)
-    contours = scene.kinds.contours if isinstance(scene.kinds, DrawnOutlines) else ()
-    first: dict[bytes, int] = {}
-    representative = np.arange(len(contours))
-    for number in np.flatnonzero(used).tolist():
-        key = b"|".join(
-            np.ascontiguousarray(contour).tobytes() for contour in contours[number]
-        )
-        representative[number] = first.setdefault(key, number)
-    is_representative = np.zeros(len(contours), bool)
-    is_representative[list(first.values())] = True
-    own, slope = scene.kinds.edge_exposure(is_representative, point)
-    return own[representative], slope[representative]
 
 
 def _box(
@@ -403,7 +347,7 @@ def _develop(
             yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
 
 
-def _edges(scene: WrittenMask, field: _Field, point: PointExposure) -> EdgeErrors:
+def _edges(scene: WrittenMask, field: _Field) -> EdgeErrors:
     """Exposure and position error at samples along the edges of marks and labels.
 
     The error is (exposure - THRESHOLD) / slope, in nm; the slope is a difference across
@@ -415,16 +359,18 @@ def _edges(scene: WrittenMask, field: _Field, point: PointExposure) -> EdgeError
     close = polygon_edges.exposure_at_edges(positions, scene.others, field.close)
     exposure, outside, inside = np.split(close, 3)
     x, y = points.at_um.T
-    exposure = exposure + field.grid.sample(field.far, x, y)
+    background = field.background
+    exposure = exposure + background.grid.sample(background.far, x, y)
     slope = np.maximum(inside - outside, 1e-12) / polygon_edges.ACROSS_UM
     return EdgeErrors(
         x, y, exposure / THRESHOLD, (exposure - THRESHOLD) / slope / nm, points.layer
     )
 
 
-def _sampled(
-    scene: WrittenMask, field: _Field, point: PointExposure
-) -> tuple[float, float]:
+# direct sums
+
+
+def _sampled(scene: WrittenMask, field: _Field) -> tuple[float, float]:
     """Compare the field with direct sums at sample pillars of the first lattice.
 
     Returns:
@@ -432,33 +378,113 @@ def _sampled(
         size, and the largest difference of the field from these sums.
     """
     sites = sum(body.rows * body.columns for body in scene.bodies)
-    samples = int(np.clip(_PRODUCTS / sites, 16, _SAMPLES))
-    lattices = sampled.ExposedLattices(
-        scene.bodies,
-        scene.kinds,
-        field.own
-        + scene.kinds.area_um2 * float(field.ranges.far.density(np.array(0.0))),
-        field.ranges,
-        point,
-        field.spots,
-        lambda number, first, block: scene.dose[block],
-    )
-    rows, columns, exact = sampled.exact_edges(lattices, samples)
-    worst_field = 0.0
-    judged = scene.dose[_entries(scene, rows, columns)] > 0
-    worst_exposure = float(np.abs(exact / THRESHOLD - 1)[judged].max(initial=0.0))
-    for row in np.unique(rows).tolist():
-        in_row = rows == row
+    samples = int(np.clip(_PRODUCTS / (sites + len(field.spots[0])), 16, _SAMPLES))
+    rows, columns = _some_pillars(scene, samples)
+    exact = _distant_exposure(scene, field, rows, columns)
+    by_field = np.empty(len(rows))
+    for n, (row, column) in enumerate(
+        zip(rows.tolist(), columns.tolist(), strict=True)
+    ):
+        exact[n] += _close_exposure(scene, field, row, column)
         block = np.ascontiguousarray(scene.bodies[0].source(row, row + 1))
-        by_field = field.rows(scene, 0, row, block)[0, columns[in_row]]
-        worst_field = max(
-            worst_field, float(np.abs(by_field - exact[in_row]).max()) / THRESHOLD
-        )
-    return worst_exposure, worst_field
+        by_field[n] = field.rows(scene, 0, row, block)[0, column]
+    worst_exposure = np.abs(exact / THRESHOLD - 1).max(initial=0.0)
+    worst_field = np.abs(by_field - exact).max(initial=0.0) / THRESHOLD
+    return float(worst_exposure), float(worst_field)
 
 
-def _entries(scene: WrittenMask, rows: Array, columns: Array) -> Array:
-    """(n,) classes of pillars of the first lattice."""
-    source = scene.bodies[0].source
-    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return np.array([source(row, row + 1)[0, column] for row, column in pairs])
+def _some_pillars(scene: WrittenMask, samples: int) -> tuple[Array, Array]:
+    """Rows and columns of at most ``samples`` dosed pillars, evenly over the first
+    lattice.
+    """
+    body = scene.bodies[0]
+    occupied = scene.dose > 0
+    total = int(body.counts(len(occupied) - 1)[occupied].sum())
+    wanted = np.unique(np.linspace(0, total - 1, samples).astype(int)) if total else []
+    chosen = [np.empty((0, 2), np.int64)]
+    passed = 0
+    for first, block in body.blocks():
+        sites = np.flatnonzero(occupied[block])
+        low, high = np.searchsorted(wanted, [passed, passed + len(sites)])
+        row, column = np.divmod(sites[wanted[low:high] - passed], body.columns)
+        chosen.append(np.column_stack([first + row, column]))
+        passed += len(sites)
+    rows, columns = np.concatenate(chosen).T
+    return rows, columns
+
+
+def _distant_exposure(
+    scene: WrittenMask, field: _Field, rows: Array, columns: Array
+) -> Array:
+    """(samples,) exposure by far and middle ranges, every shape as points.
+
+    sum of dose * area * weight / (pi w^2) * exp(-r^2 / w^2), with widths w that the
+    size of the mean pillar has widened.
+
+    Args:
+        scene: lattices with doses.
+        field: Gaussians by reach, and points of other shapes.
+        rows, columns: (samples,) of the samples on the first lattice.
+    """
+    lens = scene.bodies[0]
+    at_x = lens.columns_um[columns]
+    at_y = lens.rows_um(0, lens.rows)[rows]
+    mass_of_class = (scene.dose * scene.kinds.area_um2).astype(np.float32)
+    points, masses = field.spots
+    total = np.zeros(len(at_x))
+    for width, weight in [*field.ranges.far.terms, *field.ranges.middle.terms]:
+        sums = np.zeros(len(at_x))
+        for body in scene.bodies:
+            bell_x = _bell(body.columns_um, at_x, width)
+            for first, block in body.blocks():
+                bell_y = _bell(body.rows_um(first, len(block)), at_y, width)
+                sums += ((mass_of_class[block] @ bell_x) * bell_y).sum(0, dtype=float)
+        if (width, weight) in field.ranges.far.terms:
+            bell = _bell(points[:, 0], at_x, width)
+            sums += masses @ (bell * _bell(points[:, 1], at_y, width))
+        total += weight / (np.pi * width**2) * sums
+    return total
+
+
+def _bell(positions: Array, centres: Array, width: float) -> Array:
+    """(positions, centres) exp(-((position - centre) / width)^2), float32."""
+    return np.asarray(
+        np.exp(-(((positions[:, None] - centres) / width) ** 2)), np.float32
+    )
+
+
+def _close_exposure(scene: WrittenMask, field: _Field, row: int, column: int) -> float:
+    """Exposure of the edges of a pillar by itself and by the shapes within 5 sites.
+
+    Close Gaussians are summed over the exact shapes, in place of the middle ranges of
+    :func:`_distant_exposure`.
+
+    Args:
+        scene: lattices with doses.
+        field: Gaussians by reach.
+        row, column: site of the pillar on the first lattice.
+    """
+    body, kinds = scene.bodies[0], scene.kinds
+    top, left = max(row - _NEIGHBOURS, 0), max(column - _NEIGHBOURS, 0)
+    below = min(row + _NEIGHBOURS + 1, body.rows)
+    block = body.source(top, below)[:, left : column + _NEIGHBOURS + 1]
+    i, j = np.nonzero(scene.dose[block] > 0)
+    entry = block[i, j]
+    # rows run towards -y
+    offset = np.column_stack(
+        [(left + j - column) * body.pitch_um, (row - top - i) * body.down_um]
+    )
+    distance = np.hypot(*offset.T)
+    middle = field.ranges.middle.density(distance)
+    total = -float((scene.dose * kinds.area_um2)[entry] @ middle)
+    pillar = int(block[row - top, column - left])
+    total += float(scene.dose[pillar] * field.own[pillar])
+    edge = kinds.edge_points_um(pillar)
+    radius = float(np.hypot(*edge.T).max() + np.sqrt(kinds.wider_um2.max()))
+    for width, weight in field.close:
+        is_reached = (distance > 0) & (distance < radius + _FAR * width)
+        for kind in np.unique(entry[is_reached]).tolist():
+            places = edge[:, None] - offset[is_reached & (entry == kind)]
+            exposure = kinds.exposure_at(kind, places, width)
+            total += weight * float(scene.dose[kind] * exposure.sum(-1).mean())
+    return total

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process.jit import compile_loop
 from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
 
@@ -72,12 +71,26 @@ class VerificationTally:
         box_um: Box,
     ) -> None:
         """Add pillars at x, y; values: (n,) exposure, drawn, resist and made diameter."""
-        scale = (
-            _SIDE / max(box_um[2] - box_um[0], 1e-9),
-            _SIDE / max(box_um[3] - box_um[1], 1e-9),
+        x, y = (positions[judged] for positions in place)
+        exposure, drawn, resist, made = (each[judged] for each in values)
+        if not len(x):
+            return
+        difference = resist - drawn
+        errors = np.abs(exposure - 1).max(), np.abs(difference).max()
+        self.ends[:2] = np.maximum(self.ends[:2], errors)
+        self.ends[2:] = (min(self.ends[2], made.min()), max(self.ends[3], made.max()))
+        column, row = (
+            np.clip(
+                (positions - low) / max(high - low, 1e-9) * _SIDE, 0, _SIDE - 1
+            ).astype(np.int64)
+            for positions, low, high in zip((x, y), box_um[:2], box_um[2:], strict=True)
         )
-        sums = (self.ends, self.total, self.count, self.bins)
-        _tally(*place, judged, *values, box_um[0], box_um[1], *scale, _BIN_NM, *sums)
+        point = row * _SIDE + column
+        for sums, weights in ((self.total, difference), (self.count, None)):
+            sums += np.bincount(point, weights, _SIDE**2).reshape(_SIDE, _SIDE)
+        number = np.floor(difference / _BIN_NM).astype(np.int64) + len(self.bins) // 2
+        last = len(self.bins) - 1
+        self.bins += np.bincount(np.clip(number, 0, last), minlength=last + 1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -174,55 +187,3 @@ class ExposureReport:
         return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[
             first:end
         ]
-
-
-@compile_loop
-def _tally(
-    x: Array,
-    y: Array,
-    judged: Array,
-    exposure: Array,
-    drawn: Array,
-    resist: Array,
-    made: Array,
-    left: float,
-    bottom: float,
-    columns_per_um: float,
-    rows_per_um: float,
-    bin_nm: float,
-    ends: Array,
-    total: Array,
-    count: Array,
-    bins: Array,
-) -> None:
-    """Add judged pillars to the extremes, the map and the histogram, in place.
-
-    Args:
-        x, y: (n,) places, um.
-        judged: (n,) whether a pillar counts.
-        exposure: (n,) of the drawn edge, relative to dose to size.
-        drawn, resist, made: (n,) diameters, nm.
-        left, bottom: corner of the map, um.
-        columns_per_um, rows_per_um: of the map.
-        bin_nm: width of a bin of the histogram.
-        ends: (4,) largest |exposure - 1| and |resist - drawn|, least and largest made.
-        total, count: (rows, columns) sum of resist - drawn, and number of pillars.
-        bins: (bins,) pillars by resist - drawn, 0 in the middle.
-    """
-    rows = total.shape[0]
-    columns = total.shape[1]
-    last = bins.shape[0] - 1
-    for pillar in range(x.shape[0]):
-        if not judged[pillar]:
-            continue
-        difference = resist[pillar] - drawn[pillar]
-        ends[0] = max(ends[0], abs(exposure[pillar] - 1))
-        ends[1] = max(ends[1], abs(difference))
-        ends[2] = min(ends[2], made[pillar])
-        ends[3] = max(ends[3], made[pillar])
-        row = min(max(int((y[pillar] - bottom) * rows_per_um), 0), rows - 1)
-        column = min(max(int((x[pillar] - left) * columns_per_um), 0), columns - 1)
-        total[row, column] += difference
-        count[row, column] += 1
-        bin_number = int(np.floor(difference / bin_nm)) + bins.shape[0] // 2
-        bins[min(max(bin_number, 0), last)] += 1

@@ -108,8 +108,6 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     } <= names
     assert {
         "die.png",
-        "pillars.png",
-        "diameters.png",
         "process.toml",
         "layout.json",
     } <= names

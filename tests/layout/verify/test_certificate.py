@@ -14,10 +14,10 @@ import layout
 from layout.formats import handover
 from layout.pec import psf
 from layout.process.process import EtchProfile, ExposureSettings, Process
-from layout.verify import polygon_edges
+from layout.pec import polygon_edges
 from layout.verify.as_written import LensRows
 from layout.verify.exposure import verify_exposure
-from layout.verify.polygon_edges import ExposedPolygons
+from layout.pec.polygon_edges import ExposedPolygons
 from metalens.cell import Cell
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias

@@ -9,8 +9,8 @@ from matplotlib.path import Path as Outline
 import layout
 from layout.formats import handover
 from layout.process.process import DieSettings, ExposureSettings, Process
-from layout.verify import polygon_edges
-from layout.verify.polygon_edges import ExposedPolygons
+from layout.pec import polygon_edges
+from layout.pec.polygon_edges import ExposedPolygons
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
 from tests.referees.verified import verify

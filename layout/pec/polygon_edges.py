@@ -11,7 +11,6 @@ from layout.shapes import region
 from metalens.core.arrays import Array
 from metalens.core.units import nm
 
-_STEP_UM = 1.0  # between the samples along an edge
 _FAR = 5.0  # ranges at which a polygon no longer counts: exp(-25)
 ACROSS_UM = 4 * nm  # for the slope across an edge
 
@@ -38,14 +37,17 @@ class EdgeSamples:
     layer: Array
 
 
-def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
-    """Samples about every um along the outline of what each layer number draws.
+def sample_edges(
+    polygons: ExposedPolygons, range_um: float, step_um: float = 1.0
+) -> EdgeSamples:
+    """Samples along the outline of what each layer number draws.
 
     Samples keep two ranges from corners, which are round.
 
     Args:
         polygons: with their layers.
         range_um: of the core of the point exposure.
+        step_um: between samples, about.
     """
     positions = [np.empty((0, 2))]
     normals = [np.empty((0, 2))]
@@ -61,7 +63,7 @@ def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
                 straight = length - 4 * range_um  # corners round off within two ranges
                 if straight <= 0:
                     continue
-                count = max(1, int(straight / _STEP_UM))
+                count = max(1, int(straight / step_um))
                 fraction = (
                     2 * range_um + (np.arange(count) + 0.5) / count * straight
                 ) / length
@@ -238,12 +240,12 @@ def equivalent_spots(
 
 
 def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -> Array:
-    """(n, 2) points of a raster within a polygon, four or more along each axis.
+    """(n, 2) points of a raster within a polygon, two or more along each axis.
 
     A point is inside where a ray to the right crosses the outline an odd number of
     times.
     """
-    counts = np.maximum(np.ceil((high - low) / step_um).astype(int), 4)
+    counts = np.maximum(np.ceil((high - low) / step_um).astype(int), 2)
     x, y = (
         low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k]
         for k in (0, 1)
