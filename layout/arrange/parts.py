@@ -328,17 +328,3 @@ def box_around(boxes: Array) -> Array:
     if not len(boxes):
         return np.zeros(4)
     return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
-
-
-def box_distance(boxes: Array, box: Array) -> Array:
-    """Distance of boxes from one.
-
-    Args:
-        boxes: (n, 4) left, bottom, right, top.
-        box: (4,).
-
-    Returns:
-        (n,) distances; 0 where they meet.
-    """
-    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
-    return np.asarray(np.hypot(*across.T))

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.arrange.joined import PER_UM, PartPlacement
-from layout.arrange.parts import APERTURE, DieComponent, box_around, box_distance
+from layout.arrange.parts import APERTURE, DieComponent, box_around
 from layout.drc.report import Violation
 from layout.formats.library import CellReference, Orientation
 from layout.pec import psf
 from layout.process.process import Process
+from layout.shapes.rectilinear import box_distance
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -61,19 +62,15 @@ def reach_um(process: Process) -> float:
     if not process.exposure.corrected:
         return 0.0
     point = psf.point_exposure(process.exposure)
-    allowed = psf.THRESHOLD * process.exposure.tolerance
+    allowed = psf.THRESHOLD * min(process.exposure.tolerance, 0.999)
 
     def exposure_at(away_um: float) -> float:
-        pairs = zip(point.weights.tolist(), point.widths_um.tolist(), strict=True)
-        return float(
-            sum(weight / 2 * math.erfc(away_um / width) for weight, width in pairs)
-        )
+        return sum(w / 2 * math.erfc(away_um / width) for width, w in point.terms)
 
-    low, high = 0.0, 8 * float(point.widths_um.max())
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (middle, high) if exposure_at(middle) > allowed else (low, middle)
-    return high
+    farthest = 8 * float(point.widths_um.max())
+    from scipy.optimize import brentq
+
+    return float(brentq(lambda away: exposure_at(away) - allowed, 0, farthest))
 
 
 def check_separation(
@@ -171,26 +168,16 @@ def _between(
         boxes_1 = part_1.moved(part_1.part.boxes[exposure])
         boxes_2 = part_2.moved(part_2.part.boxes[exposure])
         limit_units = gap if exposure == APERTURE else max(gap, scattered)
-        boxes_1 = (
-            boxes_1[box_distance(boxes_1, box_around(boxes_2)) < limit_units]
-            if len(boxes_1) and len(boxes_2)
-            else boxes_1[:0]
-        )
-        boxes_2 = (
-            boxes_2[box_distance(boxes_2, box_around(boxes_1)) < limit_units]
-            if len(boxes_1)
-            else boxes_2[:0]
-        )
-        smallest = math.inf
-        box = np.zeros(4)
-        for other in boxes_2 if len(boxes_1) else ():
-            distance = box_distance(boxes_1, other)
-            n = int(distance.argmin())
-            if distance[n] < smallest:
-                smallest = float(distance[n])
-                box = box_around(np.stack([boxes_1[n], other]))
+        if not (len(boxes_1) and len(boxes_2)):
+            continue
+        boxes_1 = boxes_1[box_distance(boxes_1, box_around(boxes_2)) < limit_units]
+        boxes_2 = boxes_2[box_distance(boxes_2, box_around(boxes_1)) < limit_units]
+        distances = np.array([box_distance(boxes_2, box) for box in boxes_1])
+        smallest = float(distances.min(initial=math.inf))
         if smallest >= limit_units:
             continue
+        i, j = np.argwhere(distances == smallest)[0]
+        box = box_around(np.stack([boxes_1[i], boxes_2[j]]))
         left, bottom, right, top = (int(side) for side in box)
         distance_nm = smallest * 1e3 / PER_UM
         if smallest < gap:

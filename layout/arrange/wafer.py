@@ -2,15 +2,15 @@
 them.
 """
 
-import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.arrange.parts import box_distance
 from layout.arrange.record import MOST_DIES, WaferSettings
 from layout.formats.library import CellReference
+from layout.shapes import rectilinear
+from layout.shapes.rectilinear import box_distance
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -161,67 +161,18 @@ def step_and_repeat(
         dies: dies that the wafer holds.
         units_per_um: database units in a micrometre.
     """
-    spans: dict[int, list[tuple[int, int]]] = {}
-    order = np.lexsort((dies.index[:, 0], dies.index[:, 1]))
-    columns, rows = dies.index[order].T.tolist()
-    for row, members in itertools.groupby(
-        zip(rows, columns, strict=True), key=lambda pair: pair[0]
-    ):
-        row_columns = [column for _, column in members]
-        breaks = [
-            0,
-            *(
-                n
-                for n in range(1, len(row_columns))
-                if row_columns[n] != row_columns[n - 1] + 1
-            ),
-            len(row_columns),
-        ]
-        spans[row] = [
-            (row_columns[start], row_columns[stop - 1] + 1)
-            for start, stop in itertools.pairwise(breaks)
-        ]
-    die_number = {(int(i), int(j)): n for n, (i, j) in enumerate(dies.index.tolist())}
-    open_runs: dict[tuple[int, int], int] = {}
-    blocks: list[tuple[tuple[int, int], int, int]] = []
-    for row in range(min(spans), max(spans) + 2):
-        runs = set(spans.get(row, ()))
-        blocks += [
-            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - runs)
-        ]
-        open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
-    step = _steps(dies, units_per_um)
+    column, row = (dies.index - dies.index.min(0)).T
+    places = np.full((row.max() + 1, column.max() + 1, 2), np.nan)
+    places[row, column] = dies.place_um * units_per_um
+    steps = [
+        int(np.rint(np.nanmax(np.append(np.diff(places[..., axis], axis=1 - axis), 0))))
+        for axis in (0, 1)
+    ]
     copies = []
-    for (first, end), low, high in blocks:
-        x, y = (
-            round(v * units_per_um)
-            for v in dies.place_um[die_number[first, low]].tolist()
-        )
-        copies.append(
-            CellReference(
-                child,
-                x,
-                y,
-                columns=end - first,
-                rows=high - low,
-                across=(step[0], 0),
-                up=(0, step[1]),
-            )
-        )
+    runs = rectilinear.merge_runs(~np.isnan(places[..., 0]))
+    for left, low, right, high in runs.tolist():
+        x, y = np.rint(places[low, left]).astype(int).tolist()
+        size = {"columns": right - left, "rows": high - low}
+        across, up = (steps[0], 0), (0, steps[1])
+        copies.append(CellReference(child, x, y, **size, across=across, up=up))
     return tuple(copies)
-
-
-def _steps(dies: WaferDies, units_per_um: float) -> tuple[int, int]:
-    """From die to die in units, along x and y; 0 where there is one column or row."""
-    steps = []
-    for axis in (0, 1):
-        index = dies.index[:, axis]
-        place = dies.place_um[:, axis]
-        low, high = int(index.argmin()), int(index.argmax())
-        count = int(index[high] - index[low])
-        steps.append(
-            round(float(place[high] - place[low]) / count * units_per_um)
-            if count
-            else 0
-        )
-    return steps[0], steps[1]

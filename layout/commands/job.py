@@ -114,7 +114,6 @@ class LayoutJob:
     made_rows: the lens that comes out.
     answers_error: of --study, by how much the solver may miss how pillars answer to the
     process, relative.
-    undosed: {file name: layers with shapes that the dose table lacks}.
     """
 
     options: Options
@@ -128,7 +127,6 @@ class LayoutJob:
     stages: StageTimes
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, compare.ReadbackComparison] = field(default_factory=dict)
-    undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None
     answers_error: float = 0.0
@@ -144,11 +142,6 @@ class LayoutJob:
         the writer.
         """
         failures = [
-            f"{name}: no dose for layer {', '.join(f'{a}/{b}' for a, b in layers[:8])}"
-            for name, layers in self.undosed.items()
-            if layers
-        ]
-        failures += [
             f"{name} does not read back as planned"
             for name, outcome in self.compared.items()
             if not outcome.ok

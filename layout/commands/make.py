@@ -26,7 +26,6 @@ from layout.formats import (
 )
 from layout.formats.library import MaskLibrary
 from layout.mask import build, fields
-from layout.mask.field_figure import with_fields
 from layout.mask.plan import MaskPlan
 from layout.pec import correct
 from layout.pec.correct import DoseLadder
@@ -145,7 +144,7 @@ def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> Lay
         write_fields = fields.split_write_fields(
             source.diameters, process, pillar_classes=mask.cells
         )
-        plan = with_fields(plan, write_fields, process)
+        plan = fields.with_fields(plan, write_fields, process)
     with stages("check"):
         drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
     return LayoutJob(
@@ -198,11 +197,7 @@ def _write_masks(job: LayoutJob, target: Path) -> None:
     if options.dxf:
         path = target / "mask.dxf"
         with job.stages("write DXF"):
-            count = dxf.write_dxf(plan, path, window=options.window)
-        with job.stages("read back dxf"):
-            job.compared[path.name] = compare.ReadbackComparison(
-                count, dxf.dxf_differences(plan, path, window=options.window)
-            )
+            dxf.write_dxf(plan, path, window=options.window)
         job.written[path.name] = path.stat().st_size
     if options.stl or options.step:
         _write_solids(job, target)
@@ -237,9 +232,6 @@ def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> 
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
         table = handover.read_dose_table(path.with_name("doses.csv"))
-        job.undosed[path.name] = handover.layers_without_dose(
-            content, table, job.process
-        )
     if _is_verifiable(job) and job.compared[path.name].ok:
         with job.stages(f"verify exposure {path.suffix[1:]}"):
             job.verified[path.name] = _verified(job, content, table)

@@ -224,8 +224,7 @@ def _write_fields(job: LayoutJob) -> Section:
         "Write fields",
         f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
         f"by {split.size_um[1]:.1f} µm at most; no border cuts a pillar: they keep "
-        f"{split.clearance_um / nm:.0f} nm. A raster centred on the axis would have cut "
-        f"{split.cut_before:,} pillars. fields.csv lists them in the order of writing; "
+        f"{split.clearance_um / nm:.0f} nm. fields.csv lists them in the order of writing; "
         "job.txt is the sheet for the operator, with doses and charge.",
     )
 

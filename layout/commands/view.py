@@ -2,8 +2,8 @@
 rules.
 """
 
+import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -16,6 +16,11 @@ from layout.shapes import polygon
 from metalens.commands import MASKS
 from metalens.core.errors import MaskFileError
 from metalens.view import DrawingPanel, OutlinePanel, Panel, TablePanel
+
+_MARKER = re.compile(
+    r"<category>'([^<]*)'</category>.*?box: \(([^,;]+),([^,;]+);([^,;]+),([^,;]+)\)",
+    re.DOTALL,
+)
 
 
 def mask_of(folder: Path) -> Path | None:
@@ -120,30 +125,8 @@ def _marks(path: Path) -> list[tuple[float, float, str]]:
     """Centres and rules of a marker database of this toolchain; none where there is no
     such file.
     """
-    if not path.is_file():
-        return []
-    try:
-        items = list(ElementTree.parse(path).getroot().iter("item"))
-    except ElementTree.ParseError as error:
-        raise MaskFileError(f"{path}: no marker database ({error})") from None
-    marks = []
-    for item in items:
-        box = next(
-            (
-                value.text or ""
-                for value in item.iter("value")
-                if (value.text or "").startswith("box:")
-            ),
-            "",
-        )
-        try:
-            corners = [
-                float(number)
-                for number in box[4:].strip(" ()").replace(";", ",").split(",")
-            ]
-            x = (corners[0] + corners[2]) / 2
-            y = (corners[1] + corners[3]) / 2
-        except (ValueError, IndexError):
-            continue
-        marks.append((x, y, f"{item.findtext('category', '').strip(chr(39))}"))
-    return marks
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    return [
+        ((float(left) + float(right)) / 2, (float(bottom) + float(top)) / 2, rule)
+        for rule, left, bottom, right, top in _MARKER.findall(text)
+    ]

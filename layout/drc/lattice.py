@@ -4,7 +4,7 @@ its lattices.
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ from layout.mask.plan import (
 )
 from layout.process.jit import compile_loop
 from layout.process.process import DesignRules, KeepOutZone
-from layout.shapes import region
+from layout.shapes import rectilinear, region
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -182,20 +182,16 @@ class _LatticeCheck:
                     continue
                 for k in classes.tolist():
                     pillar = self.plan.classes[k - 1]
-                    boxes = (
-                        _moved_box(pillar.outline, x, y) for x, y in self._sites_of(k)
-                    )
-                    violations = (
-                        Violation(rule, box, value, limit, pillar.name) for box in boxes
-                    )
-                    count = int(self.counts[k])
-                    self.report.add(
+                    self.report.add_equal(
                         rule,
-                        count,
+                        value,
+                        (
+                            _moved_box(pillar.outline, x, y)
+                            for x, y in self._sites_of(k)
+                        ),
+                        count=int(self.counts[k]),
                         layer=pillar.layer[0],
                         cell=pillar.name,
-                        worst=value,
-                        examples=violations,
                     )
 
     def _measure_pairs(
@@ -310,28 +306,29 @@ class _LatticeCheck:
         """
         limit = self.rules.minimum_gap_nm
         for block, first_new_row, top in self._blocks(vectors):
-            located = np.empty((MAX_LISTED, 3), np.int64)
-            count = locate_pairs(
-                block, first_new_row, outline_of_class, vectors, marked, located
-            )
-            for row, column, vector in located[:count].tolist():
+            for vector in np.flatnonzero(marked.any((1, 2))).tolist():
                 right, up = vectors[vector].tolist()
-                first = int(block[row, column])
-                second = int(block[row - up, column + right])
-                shapes = self.plan.classes[first - 1], self.plan.classes[second - 1]
-                sites = (
-                    self._place(top + row, column),
-                    self._place(top + row - up, column + right),
-                )
-                moved = [
-                    shape.outline + site
-                    for shape, site in zip(shapes, sites, strict=True)
-                ]
-                text = f"{shapes[0].name} to {shapes[1].name} in {self.lattice.name}"
-                value = values[
-                    vector, int(outline_of_class[first]), int(outline_of_class[second])
-                ]
-                yield Violation(rule, contour_box(moved), value, limit, text)
+                low, left = max(first_new_row, up), max(0, -right)
+                below = block[low:, left : block.shape[1] - max(0, right)]
+                above = block[low - up : len(block) - up, left + right :]
+                above = above[:, : below.shape[1]]
+                hits = marked[vector][outline_of_class[below], outline_of_class[above]]
+                for row, column in np.argwhere(hits)[:MAX_LISTED].tolist():
+                    numbers = int(below[row, column]), int(above[row, column])
+                    x, y = self._place(top + low + row, left + column)
+                    shapes = [self.plan.classes[number - 1] for number in numbers]
+                    step = right * self.lattice.pitch, up * self.lattice.down
+                    moved = [shapes[0].outline + np.array([x, y])]
+                    moved.append(shapes[1].outline + np.add((x, y), step))
+                    names = " to ".join(shape.name for shape in shapes)
+                    first, second = outline_of_class[list(numbers)].tolist()
+                    yield Violation(
+                        rule,
+                        contour_box(moved),
+                        values[vector, first, second],
+                        limit,
+                        f"{names} in {self.lattice.name}",
+                    )
 
     def _foot_spaces(
         self, table: Array, steps: Array, foot_nm: Array
@@ -374,20 +371,14 @@ class _LatticeCheck:
         corners = np.array(
             [self._place(0, 0), self._place(lattice.rows, lattice.columns)]
         )
-        violation = Violation(
+        self.report.add_equal(
             "foot",
-            contour_box([corners]),
             smallest,
-            limit,
-            f"feet of etched pillars in {lattice.name}",
-        )
-        self.report.add(
-            "foot",
-            count,
+            [contour_box([corners])],
+            count=count,
             layer=layer,
             cell=lattice.name,
-            worst=smallest,
-            examples=[violation],
+            text=f"feet of etched pillars in {lattice.name}",
         )
 
     def _sites_of(self, class_number: int) -> Iterator[tuple[int, int]]:
@@ -509,36 +500,6 @@ def count_pairs(
                 table[
                     m, kind[block[row, column]], kind[block[row - up, column + right]]
                 ] += 1
-
-
-@compile_loop
-def locate_pairs(
-    block: Array, new: int, kind: Array, vectors: Array, marked: Array, found: Array
-) -> int:
-    """Number of marked pairs; row, column and vector of each go to ``found``.
-
-    Args:
-        block: (rows, columns) class numbers.
-        new: first row that counts.
-        kind: (classes + 1,) outline number of each class.
-        vectors: (m, 2) columns to the right and rows up of the second site.
-        marked: (m, outlines + 1, outlines + 1) kinds of pairs that are listed.
-        found: (n, 3) output; the search ends where it is full.
-    """
-    rows, columns = block.shape
-    count = 0
-    for m in range(len(vectors)):
-        right, up = vectors[m]
-        for row in range(max(new, up), rows):
-            for column in range(max(0, -right), min(columns, columns - right)):
-                if marked[
-                    m, kind[block[row, column]], kind[block[row - up, column + right]]
-                ]:
-                    if count == len(found):
-                        return count
-                    found[count] = row, column, m
-                    count += 1
-    return count
 
 
 # density
@@ -706,50 +667,30 @@ def _check_merged(
         if value >= limits_nm[measurement.rule] - 1e-9:
             continue
         rule = names.get(measurement.rule, measurement.rule)
-        violation = Violation(
-            rule, measurement.box, value, limits_nm[measurement.rule], cell
-        )
         report.measured(rule, value)
-        report.add(rule, 1, layer=layer, cell=cell, worst=value, examples=[violation])
+        report.add_equal(
+            rule, value, [measurement.box], count=1, layer=layer, cell=cell
+        )
 
 
 def _check_grid(plan: MaskPlan, report: DrcReport) -> None:
-    """Classes, lattices and figures with coordinates off the grid."""
-    grid = plan.grid
-    layer = plan.classes[0].layer[0] if plan.classes else -1
-    for pillar in plan.classes:
-        off = _off_grid(pillar.polygons, grid)
-        _report_off_grid(off, grid, pillar.layer[0], pillar.name, report)
-    for lattice in plan.lattices:
-        origin = np.array([[lattice.x0, lattice.y0]])
-        steps = np.array([[lattice.pitch, lattice.down]])
-        is_off = bool(_off_grid([origin, steps], grid))
-        _report_off_grid([origin] if is_off else [], grid, layer, lattice.name, report)
+    """Classes, lattices and figures with coordinates, or steps, off the grid."""
+    report.limits["off-grid"] = float(plan.grid)
+    drawn: list[tuple[int, str, Sequence[Array], tuple[int, ...]]] = [
+        (pillar.layer[0], pillar.name, pillar.polygons, ()) for pillar in plan.classes
+    ]
+    for one in plan.lattices:
+        first_site = np.array([[one.x0, one.y0]])
+        layer = plan.classes[0].layer[0]
+        drawn.append((layer, one.name, [first_site], (one.pitch, one.down)))
     for figure in plan.figures:
-        for number, polygons in figure.polygons.items():
-            off = _off_grid(polygons, grid)
-            _report_off_grid(off, grid, number[0], figure.name, report)
-
-
-def _off_grid(polygons: Iterable[Array], grid: int) -> list[Array]:
-    """Polygons with a coordinate off the grid."""
-    return [p for p in map(np.asarray, polygons) if (p % grid).any()]
-
-
-def _report_off_grid(
-    polygons: list[Array], grid: int, layer: int, cell: str, report: DrcReport
-) -> None:
-    """Report polygons off the grid, each with its box."""
-    boxes = (contour_box([points]) for points in polygons)
-    violations = (Violation("off-grid", box, 0.0, float(grid), cell) for box in boxes)
-    report.add(
-        "off-grid",
-        len(polygons),
-        layer=layer,
-        cell=cell,
-        worst=0.0,
-        examples=violations,
-    )
+        for number, shapes in figure.polygons.items():
+            drawn.append((number[0], figure.name, shapes, ()))
+    for layer, cell, polygons, steps in drawn:
+        is_off = any(step % plan.grid for step in steps)
+        off = [p for p in map(np.asarray, polygons) if is_off or (p % plan.grid).any()]
+        boxes = (contour_box([points]) for points in off)
+        report.add_equal("off-grid", 0.0, boxes, count=len(off), layer=layer, cell=cell)
 
 
 def _check_zone(
@@ -760,69 +701,31 @@ def _check_zone(
     Pillars whose box lies inside the zone count at once. Where the box only meets the
     zone, the area of the intersection decides.
     """
-    scale = 1e3 / plan.unit_nm
-    left, bottom = zone.x_um * scale, zone.y_um * scale
-    right = left + zone.width_um * scale
-    top = bottom + zone.height_um * scale
-    box = left, bottom, right, top
-    zone_corners = np.array(
-        [[left, bottom], [right, bottom], [right, top], [left, top]]
-    )
-    for number, sites in _sites_near(plan, lattice, box):
+    size = (0, 0, zone.width_um, zone.height_um)
+    box = np.add((zone.x_um, zone.y_um) * 2, size) * 1e3 / plan.unit_nm
+    corners = box[[[0, 1], [2, 1], [2, 3], [0, 3]]]
+    reach = 1 + max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
+    left, bottom, right, top = (box + np.array([-1, -1, 1, 1]) * reach).tolist()
+    numbers, x, y = lattice.sites_in((left, bottom, right, top))
+    for number in np.unique(numbers).tolist():
         pillar = plan.classes[number - 1]
+        sites = np.column_stack([x, y])[numbers == number]
         low = pillar.outline.min(0) + sites
         high = pillar.outline.max(0) + sites
         meets = ((low < box[2:]) & (high > box[:2])).all(1)
         inside = ((low >= box[:2]) & (high <= box[2:])).all(1)
         for n in np.flatnonzero(meets & ~inside).tolist():
             moved = [contour + sites[n] for contour in pillar.contours]
-            meets[n] = region.overlap_area(moved, [zone_corners]) > 1e-9
-        violating = sites[meets]
-        text = f"{pillar.name} in {zone.name}"
-        boxes = (_moved_box(pillar.outline, x, y) for x, y in violating.tolist())
-        violations = (
-            Violation("exclusion", pillar_box, 0.0, 0.0, text) for pillar_box in boxes
-        )
-        report.add(
+            meets[n] = region.overlap_area(moved, [corners]) > 1e-9
+        report.add_equal(
             "exclusion",
-            len(violating),
+            0.0,
+            (_moved_box(pillar.outline, *site) for site in sites[meets].tolist()),
+            count=int(meets.sum()),
             layer=pillar.layer[0],
             cell=pillar.name,
-            worst=0.0,
-            examples=violations,
+            text=f"{pillar.name} in {zone.name}",
         )
-
-
-def _sites_near(
-    plan: MaskPlan, lattice: PillarArray, box: tuple[float, float, float, float]
-) -> Iterator[tuple[int, Array]]:
-    """Pillars whose outline can reach into a box, class by class.
-
-    Args:
-        plan: outlines of the classes.
-        lattice: whose sites are searched.
-        box: left, bottom, right, top, database units.
-
-    Yields:
-        (class number, (n, 2) x and y of its sites).
-    """
-    reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
-    left = max(0, math.floor((box[0] - reach - lattice.x0) / lattice.pitch))
-    right = min(
-        lattice.columns, math.ceil((box[2] + reach - lattice.x0) / lattice.pitch) + 1
-    )
-    top = max(0, math.floor((lattice.y0 - box[3] - reach) / lattice.down))
-    bottom = min(
-        lattice.rows, math.ceil((lattice.y0 - box[1] + reach) / lattice.down) + 1
-    )
-    if left >= right or top >= bottom:
-        return
-    block = lattice.source(top, bottom)[:, left:right]
-    for number in np.unique(block[block > 0]).tolist():
-        row, column = np.nonzero(block == number)
-        x = lattice.x0 + (column + left) * lattice.pitch
-        y = lattice.y0 - (row + top) * lattice.down
-        yield number, np.column_stack([x, y])
 
 
 def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
@@ -831,54 +734,29 @@ def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> N
     The distance is Euclidean, box to box. Shapes of one figure are not compared with
     each other.
     """
-    reaches = (int(np.abs(pillar.outline).max()) for pillar in plan.classes)
-    reach = max(reaches, default=0)
-    names = []
-    boxes = []
-    for lattice in plan.lattices:
-        width = (lattice.columns - 1) * lattice.pitch
-        height = (lattice.rows - 1) * lattice.down
-        names.append(lattice.name)
-        boxes.append(
-            (
-                lattice.x0 - reach,
-                lattice.y0 - height - reach,
-                lattice.x0 + width + reach,
-                lattice.y0 + reach,
-            )
-        )
+    reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
+    names = [lattice.name for lattice in plan.lattices]
+    around = np.array([-reach, -reach, reach, reach])
+    boxes = [np.array(lattice.box) + around for lattice in plan.lattices]
     for figure in plan.figures:
         if figure.name in EXPOSED:
             for points in itertools.chain.from_iterable(figure.polygons.values()):
                 names.append(figure.name)
-                boxes.append(contour_box([np.asarray(points)]))
-    box = np.array(boxes).reshape(-1, 4)
-    layer = plan.classes[0].layer[0] if plan.classes else -1
+                boxes.append(np.array(contour_box([np.asarray(points)])))
+    box = np.array(boxes)
     limit = rules.minimum_gap_nm
     for first, second in find_close_boxes(box, limit / plan.unit_nm).tolist():
-        gaps = np.maximum(
-            np.maximum(
-                box[first, :2] - box[second, 2:], box[second, :2] - box[first, 2:]
-            ),
-            0,
-        )
-        distance_nm = float(np.hypot(*gaps)) * plan.unit_nm
+        distance = rectilinear.box_distance(box[[first]], box[second])[0]
+        distance_nm = float(distance) * plan.unit_nm
         if names[first] != names[second] and distance_nm < limit:
-            both = contour_box([box[[first, second]].reshape(-1, 2)])
-            violation = Violation(
+            report.add_equal(
                 "clearance",
-                both,
                 distance_nm,
-                limit,
-                f"{names[first]} to {names[second]}",
-            )
-            report.add(
-                "clearance",
-                1,
-                layer=layer,
+                [contour_box([box[[first, second]].reshape(-1, 2)])],
+                count=1,
+                layer=plan.classes[0].layer[0],
                 cell=names[first],
-                worst=distance_nm,
-                examples=[violation],
+                text=f"{names[first]} to {names[second]}",
             )
 
 

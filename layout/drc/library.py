@@ -521,17 +521,13 @@ class _LayerCheck:
                 tuple((box + np.array([x, y, x, y])).tolist())
                 for x, y in places.tolist()
             )
-            violations = (
-                Violation(measurement.rule, box, value, limit, element.cell)
-                for box in boxes
-            )
-            report.add(
+            report.add_equal(
                 measurement.rule,
-                len(places),
+                value,
+                boxes,
+                count=len(places),
                 layer=self.layer,
                 cell=element.cell,
-                worst=value,
-                examples=violations,
             )
 
     def _check_close(self, cell: str, placed: _Placements, report: DrcReport) -> None:
@@ -675,7 +671,6 @@ class _LayerCheck:
         """
         step, *phase = grid
         times, x, y = instances
-        limit = float(self.rules.grid_nm)
         for outline, places in self.polygons(cell):
             corners = np.column_stack(turn.apply(*outline.T)) + phase
             xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
@@ -688,16 +683,13 @@ class _LayerCheck:
                 tuple((box + (u + x, v + y) * 2).tolist())
                 for u, v in xy[is_off].tolist()
             )
-            violations = (
-                Violation("off-grid", at_box, 0.0, limit, cell) for at_box in boxes
-            )
-            report.add(
+            report.add_equal(
                 "off-grid",
-                times * int(is_off.sum()),
+                0.0,
+                boxes,
+                count=times * int(is_off.sum()),
                 layer=self.layer,
                 cell=cell,
-                worst=0.0,
-                examples=violations,
             )
 
 

@@ -200,6 +200,32 @@ class DrcReport:
         tally.worst = choose(tally.worst, worst)
         self.list_violations(rule, examples)
 
+    def add_equal(
+        self,
+        rule: str,
+        value: float,
+        boxes: Iterable[tuple[int, int, int, int]],
+        *,
+        count: int,
+        layer: int,
+        cell: str,
+        text: str = "",
+    ) -> None:
+        """Count violations of one value, and list the first of them.
+
+        Args:
+            rule: one of ``RULES``.
+            value: measured, in the unit of the rule.
+            boxes: around the violations; no more are generated than the list takes.
+            count: number of violations.
+            layer: layer number, -1 where it has none.
+            cell: cell that draws them.
+            text: the cells concerned, where these are more than ``cell``.
+        """
+        limit = self.limits[rule]
+        examples = (Violation(rule, box, value, limit, text or cell) for box in boxes)
+        self.add(rule, count, layer=layer, cell=cell, worst=value, examples=examples)
+
     def list_violations(self, rule: str, violations: Iterable[Violation]) -> None:
         """List violations of a rule as far as there is room, and generate no more.
 

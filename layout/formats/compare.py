@@ -80,7 +80,7 @@ def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
         ]
     for name, cell in library.cells.items():
         read = content.cells[name]
-        differences += shape_differences(cell, read)
+        differences += _shape_differences(cell, read)
         merged = read.sums is not None
         planned_sums = _sums(cell, merged=merged)
         read_sums = _sums(read, merged=merged)
@@ -112,7 +112,7 @@ def _difference(planned: Sum, read: Sum) -> str:
     return f"{count} copies, not all at their places"
 
 
-def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
+def _shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
     """Polygons of a cell that are missing, or that were not planned, by layer in words.
 
     Args:

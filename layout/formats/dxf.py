@@ -1,5 +1,5 @@
 """DXF of a window of the mask (ezdxf): closed polylines in micrometres, one DXF layer
-for each mask layer; read back.
+for each mask layer.
 """
 
 import io
@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from layout.formats.compare import shape_differences
 from layout.formats.library import MaskCell
-from layout.mask.plan import MaskPlan, PillarArray
+from layout.mask.plan import MaskPlan
 from layout.process.process import LayerNumber
 from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.errors import MaskFileError, ProcessError
-from metalens.core.units import nm
+from metalens.core.errors import ProcessError
 
 MOST_PILLARS = 200_000
 _UM = 13  # of $INSUNITS
@@ -59,12 +57,10 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
             installed.
         OSError: the target cannot be written.
     """
-    sites = [
-        site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
-    ]
-    if len(sites) > MOST_PILLARS:
+    count = sum(len(number) for number, *_ in _sites(plan, window))
+    if count > MOST_PILLARS:
         raise ProcessError(
-            f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
+            f"{count} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
             f"at most {MOST_PILLARS}, or OASIS for the whole mask"
         )
     names = _names(plan)
@@ -86,39 +82,7 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
         text = io.StringIO()
         drawing.write(text)
     store.write_text(path, text.getvalue())
-    return len(sites)
-
-
-def dxf_differences(
-    plan: MaskPlan, path: str | Path, *, window: DxfWindow
-) -> tuple[str, ...]:
-    """What a DXF file, read by ezdxf, holds that the window of the plan does not, and
-    the other way, in words.
-
-    Args:
-        plan: of a die.
-        path: of the file.
-        window: that was written.
-
-    Raises:
-        MaskFileError: the file cannot be read as DXF.
-    """
-    ezdxf = _ezdxf()
-    try:
-        drawing = ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError) as error:
-        raise MaskFileError(f"{path}: cannot be read as DXF ({error})") from None
-    layers = {name: layer for layer, name in _names(plan).items()}
-    read: dict[LayerNumber, list[Array]] = {}
-    for line in drawing.modelspace().query("LWPOLYLINE"):
-        points = np.array(line.get_points("xy")) / (plan.unit_nm * nm)
-        layer = layers.get(line.dxf.layer, (-1, -1))
-        read.setdefault(layer, []).append(np.rint(points).astype(np.int64))
-    unit = (
-        () if drawing.units == _UM else (f"unit {drawing.units}, planned {_UM} (um)",)
-    )
-    shapes = shape_differences(_drawn(plan, window), MaskCell("window", read))
-    return (*unit, *shapes)
+    return count
 
 
 def _ezdxf() -> Any:
@@ -147,45 +111,21 @@ def _fixed_stamps() -> Iterator[None]:
             options.write_fixed_meta_data_for_testing = before
 
 
-def sites_in(
-    plan: MaskPlan, lattice: PillarArray, window: DxfWindow
-) -> Iterator[tuple[int, int, int]]:
-    """(class, x, y) of the pillars whose site lies in a window, database units.
-
-    Args:
-        plan: of a die.
-        lattice: one of its lattices.
-        window: of the mask.
-    """
+def _sites(plan: MaskPlan, window: DxfWindow) -> Iterator[tuple[Array, Array, Array]]:
+    """Class, x and y of the pillars of each lattice in a window."""
     scale = 1e3 / plan.unit_nm
     half = window.size_um / 2
-    left = _ceil(
-        (window.x_um - half) * scale - lattice.x0, lattice.pitch, lattice.columns
-    )
-    right = _ceil(
-        (window.x_um + half) * scale - lattice.x0, lattice.pitch, lattice.columns
-    )
-    first = _ceil(lattice.y0 - (window.y_um + half) * scale, lattice.down, lattice.rows)
-    end = _ceil(lattice.y0 - (window.y_um - half) * scale, lattice.down, lattice.rows)
-    if left >= right or first >= end:
-        return
-    block = lattice.source(first, end)[:, left:right]
-    for row, column in np.argwhere(block > 0).tolist():
-        x = lattice.x0 + (left + column) * lattice.pitch
-        y = lattice.y0 - (first + row) * lattice.down
-        yield int(block[row, column]), x, y
-
-
-def _ceil(distance: float, pitch: int, count: int) -> int:
-    """Number of sites before a distance, from 0 to ``count``."""
-    return int(np.clip(np.ceil(distance / pitch), 0, count))
+    low_x, high_x = (window.x_um - half) * scale, (window.x_um + half) * scale
+    low_y, high_y = (window.y_um - half) * scale, (window.y_um + half) * scale
+    for lattice in plan.lattices:
+        yield lattice.sites_in((low_x, low_y, high_x, high_y))
 
 
 def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
     """Everything that is written: the pillars of the window and all figures."""
     shapes: dict[LayerNumber, list[Array]] = {}
-    for lattice in plan.lattices:
-        for number, x, y in sites_in(plan, lattice, window):
+    for sites in _sites(plan, window):
+        for number, x, y in zip(*(values.tolist() for values in sites), strict=True):
             pillar = plan.classes[number - 1]
             moved = [points + np.array([x, y]) for points in pillar.polygons]
             shapes.setdefault(pillar.layer, []).extend(moved)

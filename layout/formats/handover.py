@@ -304,18 +304,3 @@ def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
             )
         doses[layer] = dose
     return doses
-
-
-def layers_without_dose(
-    content: MaskLibrary, doses: Mapping[LayerNumber, float], process: Process
-) -> tuple[LayerNumber, ...]:
-    """Layers of a file that hold shapes to be exposed and have no dose; outline and
-    write fields are not exposed.
-
-    Args:
-        content: of the file.
-        doses: its dose table.
-        process: layers of outline and write fields.
-    """
-    layers = process.layers
-    return tuple(sorted(content.layers - {layers.outline, layers.fields} - set(doses)))

@@ -12,7 +12,7 @@ import numpy as np
 from layout.mask import font, marks
 from layout.mask.marks import CLEAR_UM, DatabaseUnits, MarkBox
 from layout.mask.plan import FigureCell, MaskPlan, PillarArray, PillarClass, Role
-from layout.process.process import Process
+from layout.process.process import LayerNumber, Process
 from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -27,6 +27,7 @@ _TESTED, _WITNESSED = (
     6,
     8,
 )  # diameters that are repeated in the dose array and in the witness cells
+_LETTERS = {"dose": "T", "witness": "W"}  # of the names of test classes
 _ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
 
 
@@ -140,8 +141,8 @@ def add_wafer_mark(
     layers = process.layers
     sizes = sorted(plan.classes, key=lambda pillar: pillar.diameter_units)
     witnesses = [
-        _variant(pillar, "witness", f"W{n}", layers.witness, 1.0)
-        for n, pillar in enumerate(_spread(sizes, _ON_WAFER))
+        _variant(pillar, "witness", layers.witness)
+        for pillar in _spread(sizes, _ON_WAFER)
     ]
     sites = _blocks(
         np.arange(len(witnesses))[None] + len(plan.classes) + 1,
@@ -220,22 +221,17 @@ def _tests(
     Raises:
         ProcessError: no room between aperture and edge of the die.
     """
+    layers = process.layers
     class_of_diameter = {pillar.diameter_units: pillar for pillar in plan.classes}
     diameters = [class_of_diameter[units] for units in sorted(class_of_diameter)]
     doses = [
-        _variant(
-            pillar,
-            "dose",
-            f"T{level}{pillar.name[1:4]}_{index}",
-            (process.layers.dose[0], process.layers.dose[1] + level),
-            dose,
-        )
+        _variant(pillar, "dose", (layers.dose[0], layers.dose[1] + level), dose)
         for level, dose in enumerate(DOSES)
-        for index, pillar in enumerate(_spread(diameters, _TESTED))
+        for pillar in _spread(diameters, _TESTED)
     ]
     witnesses = [
-        _variant(pillar, "witness", f"W{index}", process.layers.witness, 1.0)
-        for index, pillar in enumerate(_spread(diameters, _WITNESSED))
+        _variant(pillar, "witness", layers.witness)
+        for pillar in _spread(diameters, _WITNESSED)
     ]
     first_number = len(plan.classes) + 1
     lens_lattice = plan.lattices[0]
@@ -329,12 +325,10 @@ def _refuse_overlaps(
 
 
 def _variant(
-    pillar: PillarClass, role: Role, name: str, layer: tuple[int, int], dose: float
+    pillar: PillarClass, role: Role, layer: LayerNumber, dose: float = 1.0
 ) -> PillarClass:
     """A pillar class of the same shape in another role, layer and dose."""
-    return dataclasses.replace(
-        pillar, role=role, name=name, layer=layer, dose=dose, goal=dose
-    )
+    return dataclasses.replace(pillar, role=role, layer=layer, dose=dose, goal=dose)
 
 
 def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass]:
@@ -346,7 +340,7 @@ def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass
             f"{len(classes)} test classes, names of {length} characters; take fewer"
         )
     return [
-        dataclasses.replace(pillar, name=f"{pillar.name[0]}{number:0{digits}}")
+        dataclasses.replace(pillar, name=f"{_LETTERS[pillar.role]}{number:0{digits}}")
         for number, pillar in enumerate(classes)
     ]
 
@@ -416,10 +410,8 @@ def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
 
 def _extent(lattice: PillarArray) -> MarkBox:
     """Box around a lattice, half a lattice constant beyond its outer sites."""
-    right = (lattice.columns - 1) * lattice.pitch
-    bottom = (lattice.rows - 1) * lattice.down
-    box = MarkBox(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
-    return box.grown(max(lattice.constant, lattice.down) // 2)
+    reach = max(lattice.constant, lattice.down) // 2
+    return MarkBox(*lattice.box).grown(reach)
 
 
 def _label(

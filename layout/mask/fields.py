@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from layout.mask.cells import DrawnClasses, quantise_diameters
-from layout.mask.plan import BLOCK_SITES
+from layout.mask.plan import BLOCK_SITES, FigureCell, MaskPlan
 from layout.process.process import Process, WriteField
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -25,8 +25,6 @@ class FieldPlan:
     shape: (y, x) sites; pitch_um: from column to column; row_um: from row to row.
     mode: ``floating`` or ``shift``, see :class:`layout.process.process.WriteField`.
     pillars: (y fields, x fields) pillars in each.
-    cut_before: pillars that the same raster, left where the axis of the lens is a field
-    corner, would cut.
     clearance_um: least distance from a border to the edge of a pillar as it is drawn.
     """
 
@@ -36,7 +34,6 @@ class FieldPlan:
     pitch_um: float
     mode: Literal["shift", "floating"]
     pillars: Array
-    cut_before: int
     clearance_um: float
     row_um: float = 0.0
 
@@ -110,9 +107,13 @@ def split_write_fields(
         if pillar_classes is None
         else pillar_classes
     )
-    occupied = _Seen.of(diameters, classes, settings.size_um)
-    rows = _edges(settings, occupied.rows, field_rows)
-    columns = _edges(settings, occupied.columns, field_columns)
+    occupied_rows = np.zeros(classes.sites.shape[0], bool)
+    occupied_columns = np.zeros(classes.sites.shape[1], bool)
+    for first, block in classes.sites.blocks():
+        occupied_rows[first : first + len(block)] = block.any(1)
+        occupied_columns |= block.any(0)
+    rows = _edges(settings, occupied_rows, field_rows)
+    columns = _edges(settings, occupied_columns, field_columns)
     clearance = (
         min(pitch, row_pitch) - float(classes.diameters_nm[-1]) * nm
     ) / 2  # below 0 where borders cut pillars
@@ -124,55 +125,9 @@ def split_write_fields(
         pitch,
         settings.mode,
         counts,
-        occupied.cut,
         clearance,
         row_pitch,
     )
-
-
-@dataclass(eq=False, slots=True)
-class _Seen:
-    """rows, columns: which hold pillars; cut: pillars that a raster about the axis
-    cuts.
-    """
-
-    rows: Array
-    columns: Array
-    cut: int = 0
-
-    @classmethod
-    def of(
-        cls, diameters: DiameterMap, classes: DrawnClasses, size_um: float
-    ) -> "_Seen":
-        """Occupied rows and columns, and pillars that a raster about the axis cuts.
-
-        A border cuts a pillar whose radius exceeds the distance between them.
-
-        Args:
-            diameters: of the lens.
-            classes: its drawn pillars.
-            size_um: side of a field.
-        """
-        shape = classes.sites.shape
-        diameter_of_class = np.r_[0.0, classes.diameters_nm * nm]
-        occupied = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
-        distance_x = _near(diameters.x_um, size_um)
-        distance_y = _near(diameters.y_um, size_um)
-        columns = np.flatnonzero(distance_x < np.inf)
-        for first, block in classes.sites.blocks():
-            occupied.rows[first : first + len(block)] = block.any(1)
-            occupied.columns |= block.any(0)
-            rows = np.flatnonzero(distance_y[first : first + len(block)] < np.inf)
-            cut_by_x = diameter_of_class[block[:, columns]] > 2 * distance_x[columns]
-            cut_by_y = (
-                diameter_of_class[block[rows]] > 2 * distance_y[first + rows, None]
-            )
-            occupied.cut += int(
-                cut_by_x.sum()
-                + cut_by_y.sum()
-                - (cut_by_x[rows] & cut_by_y[:, columns]).sum()
-            )
-        return occupied
 
 
 def _counted(classes: DrawnClasses, rows: Array, columns: Array) -> Array:
@@ -216,11 +171,41 @@ def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
     )
 
 
-def _near(positions_um: Array, size_um: float) -> Array:
-    """(lines,) distance from each lattice line to the nearest border of a raster, um.
+def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
+    """The plan with one rectangle for each write field, clipped to the lens.
 
-    The raster has a corner on the axis; inf where the border is beyond half a pitch.
+    Args:
+        plan: with the lens as its first lattice.
+        split: write fields of the lens.
+        process: layers.
     """
-    distance = abs(positions_um - size_um * np.rint(positions_um / size_um))
-    pitch = positions_um[1] - positions_um[0] if len(positions_um) > 1 else np.inf
-    return np.asarray(np.where(distance < pitch / 2 + 1e-9, distance, np.inf))
+    lattice = plan.lattices[0]
+
+    def borders(sites: Array, last_site: int, step: int) -> list[int]:
+        return [
+            int(site) * step - step // 2
+            for site in np.unique(np.clip(sites, 0, last_site))
+        ]
+
+    xs = [
+        lattice.x0 + border
+        for border in borders(split.columns, lattice.columns, lattice.pitch)
+    ]
+    first_row = lattice.y0 - (lattice.rows - 1) * lattice.down
+    ys = [
+        first_row + border for border in borders(split.rows, lattice.rows, lattice.down)
+    ]
+    boxes = tuple(
+        np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        // plan.grid
+        * plan.grid
+        for (left, right), (bottom, top) in itertools.product(
+            itertools.pairwise(xs), itertools.pairwise(ys)
+        )
+    )
+    layer = process.layers.fields
+    figure = FigureCell("FIELDS", {layer: boxes})
+    return plan.replace(
+        figures=(*plan.figures, figure),
+        layer_names={**plan.layer_names, layer: "fields"},
+    )

@@ -2,9 +2,6 @@
 exactly.
 """
 
-import itertools
-from collections.abc import Iterator
-
 import numpy as np
 
 from layout.shapes import rectilinear
@@ -32,6 +29,8 @@ _GLYPHS = {
 def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
     """Rectangles of a line of text, small letters as capitals.
 
+    Where two squares meet at a corner alone, two half squares join them.
+
     Args:
         words: the line of text.
         x, y: lower left corner, database units.
@@ -40,7 +39,33 @@ def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, 
     Raises:
         ProcessError: a character that the font does not hold.
     """
-    return tuple(_rectangles(words, x, y, square))
+    letters = words.upper()
+    unknown = sorted(set(letters) - set(_GLYPHS))
+    if unknown:
+        others = " ".join(sorted(c for c in _GLYPHS if not c.isalnum() and c != " "))
+        raise ProcessError(
+            f"label {words!r}: no {unknown[0]!r} in the font; use letters, digits and "
+            f"{others}"
+        )
+    rows = np.array([list(bytes.fromhex(_GLYPHS[c])) for c in letters], np.uint8)
+    bits = np.unpackbits(rows.reshape(-1, 7, 1), axis=2)[..., 3:].astype(bool)
+    bits = np.pad(bits, ((0, 0), (0, 0), (0, 1))).transpose(1, 0, 2).reshape(7, -1)
+    upper_left, upper_right = bits[:-1, :-1], bits[:-1, 1:]
+    lower_left, lower_right = bits[1:, :-1], bits[1:, 1:]
+    rises = upper_right & lower_left & ~upper_left & ~lower_right
+    falls = upper_left & lower_right & ~upper_right & ~lower_left
+    halves = bits.repeat(2, axis=0).repeat(2, axis=1)
+    above, below = slice(1, -1, 2), slice(2, None, 2)
+    halves[above, above] |= rises
+    halves[below, below] |= rises
+    halves[above, below] |= falls
+    halves[below, above] |= falls
+    runs = rectilinear.merge_runs(halves) * (square // 2)
+    left, top, right, bottom = runs.T
+    boxes = np.column_stack([x + left, -bottom, x + right, -top])
+    return tuple(
+        rectilinear.box_corners(box + [0, y + 7 * square] * 2) for box in boxes
+    )
 
 
 def text_width(words: str, square: int) -> int:
@@ -51,82 +76,3 @@ def text_width(words: str, square: int) -> int:
         square: side of one square of the letters.
     """
     return max(len(words) * 6 - 1, 0) * square
-
-
-def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
-    """Rectangles of a line of text: runs of squares in each row of a letter.
-
-    Where two rows meet at a corner alone, two half squares join them.
-
-    Args:
-        words: the line of text.
-        x, y: lower left corner, database units.
-        square: side of one square, even.
-
-    Raises:
-        ProcessError: a character that the font does not hold.
-    """
-    for position, letter in enumerate(words.upper()):
-        if letter not in _GLYPHS:
-            raise ProcessError(
-                f"label {words!r}: no {letter!r} in the font; use letters, digits and {_others()}"
-            )
-        rows = bytes.fromhex(_GLYPHS[letter])
-        for row, bits in enumerate(rows):
-            bottom = y + (6 - row) * square
-            for first, end in _runs(bits):
-                yield _box(
-                    x + (position * 6 + first) * square,
-                    bottom,
-                    (end - first) * square,
-                    square,
-                )
-        for row, (above, below) in enumerate(itertools.pairwise(rows)):
-            for column, rises in _joints(above, below):
-                left = x + (position * 6 + column) * square
-                border = y + (6 - row) * square
-                half = square // 2
-                yield _box(left - half * rises, border, half, half)
-                yield _box(left - half * (not rises), border - half, half, half)
-
-
-def _box(left: int, bottom: int, width: int, height: int) -> Array:
-    """(4, 2) corners of a rectangle."""
-    return rectilinear.box_corners(
-        np.array([left, bottom, left + width, bottom + height])
-    )
-
-
-def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
-    """Columns at whose left end two rows meet at a corner alone, and whether the upper
-    square is the right one.
-    """
-    for column in range(1, 5):
-        left_bit, right_bit = 5 - column, 4 - column
-        upper, lower = (
-            (bits >> left_bit & 1, bits >> right_bit & 1) for bits in (above, below)
-        )
-        if {upper, lower} == {(0, 1), (1, 0)}:
-            yield column, upper == (0, 1)
-
-
-def _runs(bits: int) -> Iterator[tuple[int, int]]:
-    """(first column, column after the last) of the runs of set bits of a row."""
-    columns = [column for column in range(5) if bits >> (4 - column) & 1]
-    for column in columns:
-        if column - 1 not in columns:
-            end = column
-            while end in columns:
-                end += 1
-            yield column, end
-
-
-def _others() -> str:
-    """Characters of the font that are no letters, digits or space."""
-    return " ".join(
-        sorted(
-            character
-            for character in _GLYPHS
-            if not character.isalnum() and character != " "
-        )
-    )

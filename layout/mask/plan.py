@@ -3,6 +3,7 @@ checks need nothing else.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -222,12 +223,38 @@ class PillarArray:
         return (self.y0 - rows * self.down) * self.unit_um
 
     @property
+    def box(self) -> tuple[int, int, int, int]:
+        """Left, bottom, right, top of the sites, database units."""
+        right = self.x0 + (self.columns - 1) * self.pitch
+        return self.x0, self.y0 - (self.rows - 1) * self.down, right, self.y0
+
+    @property
     def box_um(self) -> tuple[float, float, float, float]:
         """Left, bottom, right, top of the sites."""
-        right = self.x0 + (self.columns - 1) * self.pitch
-        bottom = self.y0 - (self.rows - 1) * self.down
-        unit = self.unit_um
-        return self.x0 * unit, bottom * unit, right * unit, self.y0 * unit
+        left, bottom, right, top = (side * self.unit_um for side in self.box)
+        return left, bottom, right, top
+
+    def sites_in(
+        self, box: tuple[float, float, float, float]
+    ) -> tuple[Array, Array, Array]:
+        """Class, x and y (n,) of the pillars whose site lies in a box, database units.
+
+        Args:
+            box: left, bottom, right, top; sites on the upper sides are left out.
+        """
+        left, bottom, right, top = box
+        columns = (left - self.x0, right - self.x0), self.pitch, self.columns
+        rows = (self.y0 - top, self.y0 - bottom), self.down, self.rows
+        (left_column, end_column), (first, end) = (
+            [min(max(math.ceil(distance / step), 0), count) for distance in distances]
+            for distances, step, count in (columns, rows)
+        )
+        if first >= end or left_column >= end_column:
+            return (np.empty(0, np.int64),) * 3
+        block = self.source(first, end)[:, left_column:end_column]
+        row, column = np.nonzero(block)
+        x = self.x0 + (left_column + column) * self.pitch
+        return block[row, column], x, self.y0 - (first + row) * self.down
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -341,11 +368,8 @@ def pillar_classes(
     digits = max((len(str(int(diameter))) for diameter in diameters), default=1)
     classes = []
     for diameter in diameters:
-        outline = (
-            polygon.pillar_polygon(
-                int(diameter) / grid, vertices=vertices, shape=shape
-            ).points
-            * grid
+        points = polygon.pillar_polygon(
+            int(diameter) / grid, vertices=vertices, shape=shape
         )
         classes.append(
             PillarClass(
@@ -353,7 +377,7 @@ def pillar_classes(
                 float(diameter) * unit_nm,
                 int(diameter),
                 layer,
-                outline,
+                points * grid,
             )
         )
     return tuple(classes)

@@ -233,7 +233,7 @@ def _gridded(
             )
         return polygon.pillar_polygon(
             diameter_steps, vertices=process.rules.vertices, shape=process.rules.shape
-        ).points
+        )
     corners = (
         rotate_corners(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
     )

@@ -3,6 +3,7 @@ nothing else.
 """
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -64,13 +65,7 @@ def lattice_box(lattice: PillarArray, grid: int) -> Array:
         lattice: of pillars.
         grid: step of the coordinates.
     """
-    left, bottom, right, top = _square(lattice, grid)
-    across = (lattice.columns - 1) * lattice.pitch
-    down = (lattice.rows - 1) * lattice.down
-    x, y = lattice.x0, lattice.y0
-    return rectilinear.box_corners(
-        np.array([x + left, y - down + bottom, x + across + right, y + top])
-    )
+    return rectilinear.box_corners(np.add(lattice.box, _square(lattice, grid)))
 
 
 def _unexposed(process: Process) -> set[LayerNumber]:
@@ -127,30 +122,20 @@ def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
         left_of: left edge of a square about its site.
         top_of: top edge.
     """
-    rectangles: list[Array] = []
-    first_row_of_run: dict[tuple[int, int], int] = {}
 
-    def close(run: tuple[int, int], end: int) -> Array:
-        left, right = (lattice.x0 + column * lattice.pitch + left_of for column in run)
-        top, bottom = (
-            lattice.y0 - row * lattice.down + top_of
-            for row in (first_row_of_run.pop(run), end)
-        )
-        return rectilinear.box_corners(np.array([left, bottom, right, top]))
+    def free_rows() -> Iterator[Array]:
+        for _, block in lattice.blocks():
+            free = block == 0
+            if lattice.centred:
+                free = np.pad(free, ((0, 0), (0, 1)), constant_values=True)
+                free[:, 1:] &= block == 0
+            yield from free
 
-    site_columns = 2 if lattice.centred else 1
-    for first, block in lattice.blocks():
-        free = np.ones((len(block), lattice.columns + site_columns - 1), bool)
-        for offset in range(site_columns):
-            free[:, offset : offset + lattice.columns] &= block == 0
-        for row, empty in enumerate(free, first):
-            edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
-            runs = set(zip(edges[::2], edges[1::2], strict=True))
-            rectangles += [
-                close(run, row) for run in sorted(first_row_of_run.keys() - runs)
-            ]
-            first_row_of_run.update(dict.fromkeys(runs - first_row_of_run.keys(), row))
-    return rectangles + [close(run, lattice.rows) for run in sorted(first_row_of_run)]
+    runs = rectilinear.merge_runs(free_rows())
+    x = lattice.x0 + runs[:, [0, 2]] * lattice.pitch + left_of
+    y = lattice.y0 - runs[:, [3, 1]] * lattice.down + top_of
+    boxes = np.column_stack([x[:, 0], y[:, 0], x[:, 1], y[:, 1]])
+    return [rectilinear.box_corners(box) for box in boxes]
 
 
 def _surroundings(

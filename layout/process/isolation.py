@@ -1,7 +1,5 @@
 """How alone a pillar stands: what is missing of the neighbours that change its bias."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from metalens.core.arrays import Array
@@ -10,6 +8,8 @@ from metalens.core.errors import ProcessError
 _LEAST = (
     4e-4  # weight of all neighbours together: float32 sums have it to a few percent
 )
+
+_ROUNDING = 1e-5  # of float32 sums over all neighbours
 
 
 def isolation_map(
@@ -23,7 +23,7 @@ def isolation_map(
 
     isolation = 1 - sum of exp(-r^2 / range^2) over the pillars, over the same sum with
     all sites filled. Neighbours count within 3 ranges along each axis, the site itself
-    does not. Tiles that are empty, or full with all their surroundings, are skipped.
+    does not.
 
     Args:
         present: (y, x) true where a pillar stands.
@@ -38,10 +38,9 @@ def isolation_map(
     """
     from scipy.ndimage import correlate1d
 
-    halo_x, halo_y = (isolation_halo(step, range_um) for step in steps_um)
     along_x, along_y = (
         np.exp(-((np.arange(-n, n + 1) * step / range_um) ** 2)).astype(np.float32)
-        for n, step in zip((halo_x, halo_y), steps_um, strict=True)
+        for n, step in ((isolation_halo(step, range_um), step) for step in steps_um)
     )
     total = _full(along_x, along_y, centred)
     if total < _LEAST:
@@ -49,23 +48,11 @@ def isolation_map(
             f"bias.range_um = {range_um:g}: neighbours on steps of {steps_um[0]:.4g} and {steps_um[1]:.4g} um do not "
             "count at that distance; need a third of the pitch or more, or isolated_nm = 0"
         )
-    padded = np.pad(np.asarray(present, bool), ((halo_y, halo_y), (halo_x, halo_x)))
-    isolation = np.zeros(present.shape, np.float32)
-    for rows, columns in _tiles(present.shape):
-        extended = padded[
-            rows.start : rows.stop + 2 * halo_y,
-            columns.start : columns.stop + 2 * halo_x,
-        ]
-        own = np.asarray(present[rows, columns], np.float32)
-        places = extended[:, 1:] | extended[:, :-1] if centred else extended
-        if places.all() or not own.any():
-            continue
-        weight = correlate1d(extended.astype(np.float32), along_y, axis=0)[
-            halo_y:-halo_y
-        ]
-        weight = correlate1d(weight, along_x, axis=1)[:, halo_x:-halo_x]
-        isolation[rows, columns] = np.clip(1 - (weight - own) / total, 0, 1)
-    return isolation
+    own = np.asarray(present, np.float32)
+    weight = correlate1d(own, along_y, axis=0, mode="constant")
+    weight = correlate1d(weight, along_x, axis=1, mode="constant")
+    isolation = np.clip(1 - (weight - own) / total, 0, 1)
+    return np.where(isolation > _ROUNDING, isolation, np.float32(0))
 
 
 def isolation_halo(step_um: float, range_um: float) -> int:
@@ -97,13 +84,3 @@ def _full(along_x: Array, along_y: Array, centred: bool) -> float:
         for w in (along_x, along_y)
     )
     return float((all_places + x * y) / 2 - 1)
-
-
-def _tiles(shape: tuple[int, ...], side: int = 96) -> Iterator[tuple[slice, slice]]:
-    """(rows, columns) of square tiles of an array, ``side`` sites each way."""
-    for row in range(0, shape[0], side):
-        for column in range(0, shape[1], side):
-            yield (
-                slice(row, min(row + side, shape[0])),
-                slice(column, min(column + side, shape[1])),
-            )

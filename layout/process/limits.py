@@ -49,7 +49,7 @@ def printable_limits(
     shapes = [
         polygon.pillar_polygon(
             float(diameter) / rules.grid_nm, vertices=rules.vertices, shape=rules.shape
-        ).points
+        )
         for diameter in drawn_nm
     ]
     half_width_nm = np.array([points[:, 0].max() for points in shapes]) * rules.grid_nm

@@ -25,8 +25,8 @@ class KeepOutZone:
     report.
     """
 
-    x_um: float
-    y_um: float
+    x_um: float = field(metadata={"signed": True})
+    y_um: float = field(metadata={"signed": True})
     width_um: float
     height_um: float
     name: str = "zone"

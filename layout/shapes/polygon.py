@@ -4,7 +4,6 @@ under the square.
 
 import functools
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,52 +16,12 @@ _EITHER = 0.24  # of a grid step: both half widths are tried within this of a ha
 _REGULAR = math.sqrt(math.pi / (8 * (math.sqrt(2) - 1)))  # half width of an octagon
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class PillarShape:
-    """The drawn outline of one pillar class.
-
-    points: (n, 2) integer (x, y) about the site in grid steps, counter-clockwise,
-    convex, not closed.
-    diameter: of the circle it stands for, in grid steps.
-    """
-
-    points: Array
-    diameter: float
-
-    @property
-    def area(self) -> float:
-        """In squared grid steps, by the shoelace formula (exact: twice the area is an
-        integer).
-        """
-        return twice_area(self.points) / 2
-
-    @property
-    def area_error(self) -> float:
-        """Relative difference from the area of the circle."""
-        return self.area / (math.pi * self.diameter**2 / 4) - 1
-
-    @property
-    def width(self) -> int:
-        """Along x and along y, in grid steps."""
-        return int(np.ptp(self.points[:, 0]))
-
-    @property
-    def edge_error(self) -> float:
-        """Largest distance between outline and circle, in grid steps."""
-        return edge_error(self.points, self.diameter / 2)
-
-    @property
-    def shots(self) -> int:
-        """Trapezoids with horizontal parallel sides that a shaped-beam writer needs:
-        levels of y less one.
-        """
-        return len(np.unique(self.points[:, 1])) - 1
-
-
 def pillar_polygon(
     diameter: float, *, vertices: int = 32, shape: str = "round"
-) -> PillarShape:
-    """Polygon of the area of a circle.
+) -> Array:
+    """(n, 2) polygon of the area of a circle, in whole grid steps about its site.
+
+    Counter-clockwise, convex, symmetric under the square, not closed.
 
     For diameters that differ by a grid step or more, widths along both axes and areas
     do not fall as the diameter rises.
@@ -87,7 +46,7 @@ def pillar_polygon(
 
 
 @functools.lru_cache(maxsize=70000)
-def _pillar(diameter: float, vertices: int) -> PillarShape:
+def _pillar(diameter: float, vertices: int) -> Array:
     """Polygon of the most vertices whose area fits, else of the smallest area error.
 
     Args:
@@ -111,7 +70,7 @@ def _pillar(diameter: float, vertices: int) -> PillarShape:
         raise ProcessError(f"no polygon for {diameter} grid steps; take a finer grid")
     points = eightfold_images(best[1])
     points.setflags(write=False)
-    return PillarShape(points, diameter)
+    return points
 
 
 def _eighth(
@@ -274,22 +233,3 @@ def twice_area(points: Array) -> int:
     )
     x, y = p[:, 0], p[:, 1]
     return int((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() + x[-1] * y[0] - x[0] * y[-1])
-
-
-def edge_error(points: Array, radius: float) -> float:
-    """Largest distance between a polygon around the origin and a circle: at a vertex or
-    at the foot of an edge.
-
-    Args:
-        points: (n, 2) corners.
-        radius: of the circle.
-    """
-    p = points.astype(float)
-    q = np.roll(points, -1, axis=0).astype(float)
-    edge = q - p
-    fraction = np.clip(-(p * edge).sum(1) / (edge**2).sum(1), 0, 1)
-    foot_distance = np.hypot(*(p + fraction[:, None] * edge).T)
-    vertex_distance = np.hypot(*p.T)
-    return float(
-        max(vertex_distance.max() - radius, radius - foot_distance.min())
-    )  # feet lie nearer to the origin than vertices

@@ -1,6 +1,8 @@
 """Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
 
+import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -83,6 +85,25 @@ def covering_rectangles(shape: Array) -> Array:
     return np.array(boxes, np.int64)
 
 
+def merge_runs(rows: Iterable[Array]) -> Array:
+    """(n, 4) first column, first row, end column, end row of rectangles of set cells.
+
+    Runs of set cells in a row are rectangles; equal runs of consecutive rows are one.
+
+    Args:
+        rows: (columns,) booleans each, from the first row on.
+    """
+    first_row: dict[tuple[int, int], int] = {}
+    rectangles = []
+    for row, cells in enumerate(itertools.chain(rows, [np.empty(0, bool)])):
+        edges = np.flatnonzero(np.diff(np.r_[False, cells, False])).tolist()
+        runs = set(zip(edges[::2], edges[1::2], strict=True))
+        for left, right in sorted(first_row.keys() - runs):
+            rectangles.append((left, first_row.pop((left, right)), right, row))
+        first_row.update(dict.fromkeys(runs - first_row.keys(), row))
+    return np.array(rectangles, np.int64).reshape(-1, 4)
+
+
 def box_corners(box: Array) -> Array:
     """(4, 2) corners of left, bottom, right, top, counter-clockwise.
 
@@ -91,3 +112,17 @@ def box_corners(box: Array) -> Array:
     """
     left, bottom, right, top = np.asarray(box).tolist()
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+
+
+def box_distance(boxes: Array, box: Array) -> Array:
+    """Distance of boxes from one.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top.
+        box: (4,).
+
+    Returns:
+        (n,) distances; 0 where they meet.
+    """
+    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
+    return np.asarray(np.hypot(*across.T))

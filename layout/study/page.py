@@ -11,11 +11,7 @@ from layout.mask.fields import FieldPlan
 from layout.process.process import Process
 from layout.study import stitching, tolerance
 from layout.study.sensitivity import LogSensitivities, compute_sensitivities
-from layout.study.stitching import StitchReport
-from layout.study.tolerance import ToleranceReport
-from metalens.core import report
-from metalens.core.arrays import Array
-from metalens.core.report import Figure, Section, Table
+from metalens.core.report import Section, Table
 from metalens.core.units import deg
 from metalens.fabrication import PairSensitivities, pair_sensitivities
 from metalens.lens import Lens
@@ -97,46 +93,7 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
         f"Each of {study.fields} fields misplaced by up to ±{study.stitching_nm:g} nm along x and y, evenly spread, "
         f"{len(study.strehl)} draws; the common shift, which only moves the image, is taken out."
     )
-    items: list[Figure | Table] = [
-        Figure(
-            _stitched(study),
-            "The focus, and what the worst draw changes in it.",
-            wide=True,
-        ),
-        Table(("", "mean", "worst"), rows, digits=5),
-    ]
-    return Section("Stitching", text, items)
-
-
-def _stitched(study: StitchReport) -> bytes:
-    """PNG of the focus in dB, and of its change in the worst draw."""
-    from scipy.signal import resample
-
-    perfect, worst = (
-        resample(
-            resample(image, 6 * image.shape[0], axis=0), 6 * image.shape[1], axis=1
-        )
-        for image in (study.psf, study.worst_psf)
-    )
-    figure, axes = report.make_figure(1, 2, size=(7.8, 3.2))
-    edge = float(study.window.x_um[-1])
-    extent = (-edge, edge, edge, -edge)
-    level = 10 * np.log10(np.maximum(perfect / perfect.max(), 1e-5))
-    change = 100 * (worst - perfect) / perfect.max()
-    largest = float(abs(change).max())
-    pictures = [
-        axes[0].imshow(level, extent=extent, vmin=-40, vmax=0),
-        axes[1].imshow(
-            change, extent=extent, vmin=-largest, vmax=largest, cmap="RdBu_r"
-        ),
-    ]
-    for ax, picture, title, unit in zip(
-        axes, pictures, ("perfect fields", "change"), ("dB", "% of peak"), strict=True
-    ):
-        ax.set(title=title, xlabel="x / µm", ylabel="y / µm")
-        ax.grid(visible=False)
-        figure.colorbar(picture, ax=ax, label=unit)
-    return report.figure_png(figure)
+    return Section("Stitching", text, [Table(("", "mean", "worst"), rows, digits=5)])
 
 
 def tolerance_section(
@@ -176,13 +133,23 @@ def tolerance_section(
         "PSF / %",
         "I(z) / %",
     )
+    draws, nominal = study.draws, study.nominal
     bands = [
-        [
-            name,
-            *(float(value) for value in study.band(name)),
-            float(getattr(study.nominal, name)[0]),
-        ]
-        for name in ("strehl", "efficiency", "psf_change")
+        [name, *np.percentile(values, (5, 50, 95)).tolist(), float(designed[0])]
+        for name, values, designed in (
+            ("peak", draws.strehl, nominal.strehl),
+            ("efficiency", draws.efficiency, nominal.efficiency),
+            ("change of the PSF", draws.psf_change, nominal.psf_change),
+            *(
+                (f"I(z) at {depth_um / 1e3:.4g} mm / µm⁻²", values, designed)
+                for depth_um, values, designed in zip(
+                    study.depths_um,
+                    draws.information.T,
+                    nominal.information.T,
+                    strict=True,
+                )
+            ),
+        )
     ]
     route = (
         "the diameter through the proxy"
@@ -195,21 +162,12 @@ def tolerance_section(
         f"derivatives of the solver (known to {100 * answers.error:.0f} %), {route}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     ) + _beside(lens, process)
-    items: list[Figure | Table] = [
-        Table(
-            head,
-            rows,
-            "Effect of each cause. I(z): axial information (Eq. 11), summed over the depths.",
-            digits=3,
-        ),
-        Figure(
-            _bands(study),
-            "5 to 95 % of the draws (shade, bars), median, and the designed lens (dashes).",
-            wide=True,
-        ),
-        Table(("", "5 %", "50 %", "95 %", "as designed"), bands),
-    ]
-    return Section("Tolerance", text, items)
+    about = (
+        "Effect of each cause. I(z): axial information (Eq. 11), summed over depths."
+    )
+    quantiles = ("", "5 %", "50 %", "95 %", "as designed")
+    tables = [Table(head, rows, about, digits=3), Table(quantiles, bands, digits=4)]
+    return Section("Tolerance", text, tables)
 
 
 def _beside(lens: Lens, process: Process) -> str:
@@ -233,33 +191,3 @@ def _beside(lens: Lens, process: Process) -> str:
             "in [cell]."
         )
     return text
-
-
-def _bands(study: ToleranceReport) -> bytes:
-    """PNG of the bands of the PSF along x and of the information over depth."""
-    from scipy.signal import resample
-
-    figure, axes = report.make_figure(1, 2, size=(7.8, 3.0))
-    x = study.window.x_um
-    fine = np.arange(8 * len(x)) * (x[1] - x[0]) / 8 + x[0]
-    low, middle, high = (
-        _finer(curve, resample(curve, len(fine))) for curve in study.band("psf")
-    )
-    axes[0].fill_between(fine, low, high, alpha=0.3)
-    axes[0].plot(fine, middle)
-    axes[0].plot(fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8)
-    reach = 8 * float(x[1] - x[0])
-    axes[0].set(
-        xlabel="x / µm", ylabel="intensity / designed peak", xlim=(-reach, reach)
-    )
-    low, middle, high = study.band("information")
-    depth = study.depths_um / 1e3
-    axes[1].errorbar(depth, middle, [middle - low, high - middle], fmt="o", capsize=4)
-    axes[1].plot(depth, study.nominal.information[0], "k_", ms=14)
-    axes[1].set(xlabel="depth / mm", ylabel="I(z) / µm⁻²", yscale="log")
-    return report.figure_png(figure)
-
-
-def _finer(samples: Array, interpolated: Array) -> Array:
-    """Intensity between samples; interpolation may dip below zero by its ripple."""
-    return np.asarray(np.clip(interpolated, 0, 1.05 * samples.max()))

@@ -21,20 +21,14 @@ class StitchReport:
 
     strehl: (draws,) peak intensity relative to perfect fields. change: (draws,)
     relative L2 change of the PSF on the window. moved_nm: (draws,) move of its
-    centroid. psf, worst_psf: (y, x) intensity of perfect fields, and of the draw that
-    changes most. window: positions of both. fields: number that hold pillars. seed: of
-    the draws.
+    centroid. fields: number that hold pillars.
     """
 
     stitching_nm: float
     strehl: Array
     change: Array
     moved_nm: Array
-    psf: Array
-    worst_psf: Array
-    window: FocusWindow
     fields: int
-    seed: int
 
 
 def simulate_stitching(
@@ -82,19 +76,8 @@ def simulate_stitching(
         )
         * 1e3
     )
-    worst = int(change.argmax())
     strehl = np.array([find_peak(image)[2] for image in psf]) / find_peak(perfect)[2]
-    return StitchReport(
-        process.write_field.stitching_nm,
-        strehl,
-        change,
-        moved,
-        perfect,
-        psf[worst],
-        focus.window,
-        fields,
-        seed,
-    )
+    return StitchReport(process.write_field.stitching_nm, strehl, change, moved, fields)
 
 
 def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, Array]:

@@ -38,7 +38,7 @@ class EdgeErrors:
     layer: Array
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(eq=False, slots=True)
 class VerificationTally:
     """Sums over judged pillars (the dose test is not judged) of a part of the mask.
 

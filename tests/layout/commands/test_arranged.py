@@ -176,7 +176,8 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
     assert sizes[1] < len(dies) * lone[1] / 4
     page = (tmp_path / "m" / "report.html").read_text()
     assert (
-        "NOT CHECKED: the design rules of PADS (checked = false). 2 lenses with" in page
+        "NOT CHECKED: the design rules of PADS (checked = false). 2 lenses on a die"
+        in page
     )
     assert all(
         text in page for text in ("mirrored", "pads.gds", f"{len(dies)} whole dies")

@@ -248,7 +248,7 @@ def test_structures_that_meet_are_found(make_plan):
 
 
 def test_width_of_a_regular_polygon_and_of_a_triangle():
-    octagon = polygon.pillar_polygon(1000, vertices=8).points
+    octagon = polygon.pillar_polygon(1000, vertices=8)
     assert convex.least_width(octagon) == pytest.approx(
         min(2 * octagon[:, 0].max(), abs(octagon @ (1, 1)).max() * math.sqrt(2))
     )

@@ -94,15 +94,6 @@ def test_a_fixed_raster_is_shifted_to_the_gaps_and_keeps_its_period():
     assert plan.y_um[-1] >= 50
 
 
-def test_what_an_unshifted_raster_would_cut_is_counted_pillar_by_pillar():
-    lens = hyperbolic(121)
-    plan = fields.split_write_fields(lens.diameters, process(7.0))
-    d, x = lens.diameters.diameter_um, lens.diameters.x_um
-    away = abs(x - 7.0 * np.rint(x / 7.0))
-    want = ((d > 0) & ((away < d / 2) | (away[:, None] < d / 2))).sum()
-    assert plan.cut_before == want > 0
-
-
 def test_a_field_below_the_pitch_is_refused():
     with pytest.raises(ProcessError, match="smaller than the pitch"):
         fields.split_write_fields(hyperbolic(21).diameters, process(0.3))

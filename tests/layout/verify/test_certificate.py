@@ -12,12 +12,11 @@ from scipy.special import erf
 
 import layout
 from layout.formats import handover
-from layout.pec import psf
+from layout.pec import polygon_edges, psf
+from layout.pec.polygon_edges import ExposedPolygons
 from layout.process.process import EtchProfile, ExposureSettings, Process
-from layout.pec import polygon_edges
 from layout.verify.as_written import LensRows
 from layout.verify.exposure import verify_exposure
-from layout.pec.polygon_edges import ExposedPolygons
 from metalens.cell import Cell
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias

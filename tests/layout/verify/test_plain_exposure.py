@@ -8,9 +8,9 @@ from matplotlib.path import Path as Outline
 
 import layout
 from layout.formats import handover
-from layout.process.process import DieSettings, ExposureSettings, Process
 from layout.pec import polygon_edges
 from layout.pec.polygon_edges import ExposedPolygons
+from layout.process.process import DieSettings, ExposureSettings, Process
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
 from tests.referees.verified import verify
