@@ -121,9 +121,7 @@ plt.show()
 small = process.Process(write_field=process.WriteField(size_um=100.0))
 split = fields.split_write_fields(lens.diameters, small)
 stitched = stitching.simulate_stitching(lens, split, small)
-print(
-    f"{split.used} fields of {split.size_um[0]:.1f} µm; no border cuts a pillar"
-)
+print(f"{split.used} fields of {split.size_um[0]:.1f} µm; no border cuts a pillar")
 print(
     f"peak of the PSF: {stitched.strehl.mean():.5f} on average, {stitched.strehl.min():.5f} at worst"
 )
