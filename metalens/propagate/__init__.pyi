@@ -26,7 +26,6 @@ from .paths import rayleigh_sommerfeld_kernel as rayleigh_sommerfeld_kernel
 from .sincos import sincos_turns32 as sincos_turns32
 from .wide import light_wide as light_wide
 from .wide import plan_wide as plan_wide
-from .window import MovingGeometry as MovingGeometry
 from .window import field_windowed as field_windowed
 from .window import light_windowed as light_windowed
 from .window import plan_window as plan_window

@@ -40,11 +40,7 @@ class MethodChoice:
 
 @functools.lru_cache(maxsize=1024)
 def choose_method(
-    case: PropagationCase,
-    tolerance: float,
-    *,
-    differentiable: bool = False,
-    moving: bool = False,
+    case: PropagationCase, tolerance: float, *, differentiable: bool = False
 ) -> MethodChoice:
     """Exact sum for little work, Fourier transforms for wide windows, else windowed.
 
@@ -53,7 +49,6 @@ def choose_method(
     Args:
         case, tolerance: geometry, and relative error of the field.
         differentiable: leave out the exact sum, which has no derivatives.
-        moving: leave out the transforms too, which have none in the geometry.
 
     Returns:
         The method, its reason and its tiles.
@@ -65,7 +60,7 @@ def choose_method(
         reason = f"exact sum: {pillars:,} pillars at {points} points"
         return MethodChoice("exact", reason, ((case,),))
     is_large = pillars * points > WIDE_WORK
-    if not moving and is_large and is_wide(case, tolerance):
+    if is_large and is_wide(case, tolerance):
         return MethodChoice("wide", "wide window by Fourier transforms", ((case,),))
     with one_blas_thread():
         tiles = _windows(case, tolerance)

@@ -420,12 +420,12 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
 
 
 def chief_ray_offset(
-    behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int
-) -> Any:
+    behind: Media | None,
+    sensor_distance_um: float,
+    tangents: tuple[float, float],
+    axis: int,
+) -> float:
     """Lateral position of the chief ray on the sensor, along x (axis 0) or y (1), um.
-
-    Operands may be torch tensors. Behind films a change of the distance changes the
-    thickness of the medium at the sensor gap, so that its gradient is kept.
 
     Args:
         behind: media from lens to sensor; None: air.
@@ -434,21 +434,9 @@ def chief_ray_offset(
     """
     if behind is None:
         return sensor_distance_um * tangents[axis]
-    secant_squared = 1 + tangents[0] * tangents[0] + tangents[1] * tangents[1]
-    detached = (
-        sensor_distance_um.detach()
-        if hasattr(sensor_distance_um, "detach")
-        else sensor_distance_um
-    )
-    layers = [
-        (n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0
-    ]
-    with_gap = [*layers, (behind.index[0], sensor_distance_um - detached)]
-    return (
-        media.reach_per_direction(with_gap, 1 - 1 / secant_squared)
-        * tangents[axis]
-        / secant_squared**0.5
-    )
+    secant_squared = 1 + tangents[0] ** 2 + tangents[1] ** 2
+    reach_per_p = media.reach_per_direction(behind.layers, 1 - 1 / secant_squared)
+    return float(reach_per_p * tangents[axis] / math.sqrt(secant_squared))
 
 
 def to_angle_pair(angle_rad: Any) -> tuple[float, float]:

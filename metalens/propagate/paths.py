@@ -98,38 +98,13 @@ def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> 
         behind: media from lens to sensor. wavenumber: in vacuum, rad/um.
         w: squared p of the rays. reach_um: largest lateral distance of any ray.
     """
-    magnitude, in_phase, quadrature = ray_amplitude_parts(
-        behind, wavenumber, behind.layers, w, reach_um
-    )
-    return -1j * magnitude * (in_phase + 1j * quadrature)
-
-
-def ray_amplitude_parts(
-    behind: Media, wavenumber: float, pairs: media.Pairs, w: Any, reach_um: float
-) -> tuple[Any, Any, Any]:
-    """Magnitude k/(2π) √(passed / spread) of the ray of w = p², and the real and
-    imaginary part of its factor 1 + iC/(kL).
-
-    Complex steps in w and in thicknesses are allowed; C counts as independent of them.
-
-    Args:
-        behind: media from lens to sensor.
-        wavenumber: in vacuum, rad/um.
-        pairs: (index, thickness) of the media.
-        w: squared p of the rays.
-        reach_um: largest lateral distance of any ray, um.
-    """
-    passed = media.passed_at(behind.order, w) / media.area_spreading_of_square(pairs, w)
-    magnitude = wavenumber / (2 * np.pi) * passed**0.5
-    inverse_phase = 1 / (wavenumber * media.whole_path(pairs, w))
-    correction_real, correction_imaginary = saddle_correction(
-        behind, wavenumber, reach_um
-    ).at(w)
-    return (
-        magnitude,
-        1 - inverse_phase * correction_imaginary,
-        inverse_phase * correction_real,
-    )
+    layers = behind.layers
+    passed = media.passed_at(behind.order, w)
+    spread = media.area_spreading_of_square(layers, w)
+    real, imaginary = saddle_correction(behind, wavenumber, reach_um).at(w)
+    correction = (real + 1j * imaginary) / (wavenumber * media.whole_path(layers, w))
+    magnitude = wavenumber / (2 * np.pi) * (passed / spread) ** 0.5
+    return -1j * magnitude * (1 + 1j * correction)
 
 
 def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]:
@@ -235,75 +210,14 @@ def residual_path(
         Y: offset along y from the window centre, um.
     """
     row_offset = e - case.centre_um[1]
-    w0, reach_per_p, change = _from_ray(case, p, row_offset, X, Y)
-    w, difference = media.path_difference(
-        case.media.layers, w0, (p * reach_per_p) ** 2 + row_offset * row_offset, change
-    )
+    layers = case.media.layers
+    w0 = media.solve_direction_square(layers, row_offset * row_offset, p * p)
+    reach_per_p = media.reach_per_direction(layers, w0)
+    reach2 = (p * reach_per_p) ** 2 + row_offset * row_offset
+    change = X * X + Y * Y - 2 * (reach_per_p * p * X + row_offset * Y)
+    w, difference = media.path_difference(layers, w0, reach2, change)
     level = ray_amplitude(case.media, case.wavenumber, w, case.reach_um)
     return level, difference + p * X + row_offset / reach_per_p * Y
-
-
-def _from_ray(
-    case: PropagationCase, p: Any, row_offset: Any, X: Any, Y: Any
-) -> tuple[Any, Any, Any]:
-    """(w, reach / p, change of reach²) for the ray with p along x from a lens row.
-
-    The change is from the window centre to the offset (X, Y).
-
-    Args:
-        case: geometry of the propagation.
-        p: n sin θ along x.
-        row_offset: lens row less window centre, um.
-        X, Y: offset from the window centre, um.
-    """
-    pairs = case.media.layers
-    w0 = media.solve_direction_square(pairs, row_offset * row_offset, p * p)
-    reach_per_p = media.reach_per_direction(pairs, w0)
-    return w0, reach_per_p, X * X + Y * Y - 2 * (reach_per_p * p * X + row_offset * Y)
-
-
-def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
-    """(3, …) logarithmic derivatives of the kernel in sensor distance and in window
-    centre x and y, at a fixed pillar.
-
-    By complex steps. A change of the distance changes the thickness of the medium
-    behind the pillars.
-
-    Args:
-        case: geometry of the propagation.
-        p: n sin θ of the ray.
-        e: row of the lens, um.
-        X: offset along x from the window centre, um.
-        Y: offset along y from the window centre, um.
-    """
-    tiny, behind, row_offset = 1e-30, case.media, e - case.centre_um[1]
-    _, g, change = _from_ray(case, p, row_offset, X, Y)
-    reach2 = (p * g) ** 2 + row_offset * row_offset + change
-    x_offset, y_offset = X - g * p, Y - row_offset
-    derivatives = []
-    for step in (0, 1, 2):
-        pairs: media.Pairs = behind.layers
-        stepped_reach2 = reach2 + 0j
-        if step == 0:
-            pairs = [
-                (n, t + (1j * tiny if n == behind.index[0] else 0))
-                for n, t in behind.layers
-            ]
-            if not any(n == behind.index[0] for n, _ in pairs):
-                pairs = [*pairs, (behind.index[0], 1j * tiny)]
-        else:
-            stepped_reach2 = stepped_reach2 + 2j * tiny * (x_offset, y_offset)[step - 1]
-        w = media.solve_direction_square(pairs, stepped_reach2)
-        level, in_phase, quadrature = ray_amplitude_parts(
-            behind, case.wavenumber, pairs, w, case.reach_um
-        )
-        rate = level.imag / level.real + (in_phase.imag + 1j * quadrature.imag) / (
-            in_phase.real + 1j * quadrature.real
-        )
-        derivatives.append(
-            (rate + 1j * case.wavenumber * media.whole_path(pairs, w).imag) / tiny
-        )
-    return np.stack(np.broadcast_arrays(*derivatives))
 
 
 def probe_positions() -> Array:

@@ -2,7 +2,6 @@
 the lens.
 """
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -29,7 +28,6 @@ from metalens.propagate.paths import (
     cosine_y,
     direction_range,
     from_source,
-    kernel_derivatives,
     over_blocks,
     plane_wave_residual,
     probe_positions,
@@ -358,23 +356,17 @@ def depth_factors(
 
 
 def depth_basis(
-    case: PropagationCase,
-    nodes_um: tuple[Array, Array],
-    tolerance: float,
-    *,
-    moving: bool = False,
+    case: PropagationCase, nodes_um: tuple[Array, Array], tolerance: float
 ) -> DepthBasis:
     """Orthonormal basis of the lens fields exp(i k (s_z - s_ref)) of all depths, by a
     truncated SVD.
 
-    Orthonormal under the quadrature of the nodes. With ``moving`` the basis also spans
-    the derivatives in inverse depth and tangents.
+    Orthonormal under the quadrature of the nodes.
 
     Args:
         case: geometry of the propagation.
         nodes_um: (e,) and (x,) positions on the lens.
         tolerance: relative root mean square error of the truncation.
-        moving: whether derivatives are included.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(
@@ -395,9 +387,6 @@ def depth_basis(
             samples = np.clip(samples, 0, None)
         samples = samples[:, None, None]
         fields = np.exp(1j * depth_factors(case, e, x, case.tangents, samples)) * weight
-        if moving:
-            derivatives = _depth_derivatives(case, e, x, samples, fields)
-            fields = np.concatenate([fields, *derivatives])
         _, singular, right = np.linalg.svd(
             fields.reshape(len(fields), -1), full_matrices=False
         )
@@ -421,38 +410,6 @@ def depth_basis(
     )
 
 
-def _depth_derivatives(
-    case: PropagationCase, e: Array, x: Array, inverse: Array, fields: Array
-) -> list[Array]:
-    """Derivatives of the depth fields in inverse depth and both tangents, by the
-    complex step.
-
-    Each is scaled to the norm of the fields; those that vanish are left out.
-
-    Args:
-        case: geometry of the propagation.
-        e, x: (e, 1) and (x,) positions on the lens, um.
-        inverse: (depth, 1, 1) inverse depths, 1/um.
-        fields: (depth, e, x).
-    """
-    derivatives = []
-    tiny = 1e-30
-    for step in ((0, 0, 1j * tiny), (1j * tiny, 0, 0), (0, 1j * tiny, 0)):
-        tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
-        slope = (
-            case.wavenumber
-            * from_source(case, x, e, tangents, inverse + step[2]).imag
-            / tiny
-        )
-        slope = np.broadcast_to(slope, fields.shape)
-        scale = np.sqrt(
-            (np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum()
-        )
-        if scale > 0:
-            derivatives.append(1j * slope / scale * fields)
-    return derivatives
-
-
 def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
     """(2, n) pairs (correction term, depth field) with a significant product of
     strengths.
@@ -472,22 +429,14 @@ def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
 
 
 def build_operators(
-    case: PropagationCase,
-    chosen: NodeCounts,
-    tolerance: float,
-    *,
-    slope: int | None = None,
+    case: PropagationCase, chosen: NodeCounts, tolerance: float
 ) -> TileOperators:
     """Operators of a tile: lens nodes to directions, and directions to the window.
-
-    With ``slope`` 0, 1, 2 they give the derivative in sensor distance, window centre x,
-    y.
 
     Args:
         case: geometry of the tile.
         chosen: counts of nodes and directions.
         tolerance: relative error of the field.
-        slope: derivative to compute; None: the field.
     """
     ny, nx = chosen.nodes
     directions = chosen.directions
@@ -502,7 +451,7 @@ def build_operators(
     k = case.wavenumber
     q = cosine_y(case, p[:, None], e[None, :])
     lens_terms, window_terms, strength = _low_rank(
-        case, chosen, tolerance / 2, (low, high), slope
+        case, chosen, tolerance / 2, (low, high)
     )
     return TileOperators(
         to_directions=legendre.interpolation_matrix(
@@ -521,7 +470,6 @@ def _low_rank(
     chosen: NodeCounts,
     tolerance: float,
     span: tuple[float, float],
-    derivative: int | None,
 ) -> tuple[Array, Array, Array]:
     """Low-rank factors of the correction times the pillar area: Σ_r lens_terms[p, e, r]
     window_terms[X, Y, r].
@@ -533,7 +481,6 @@ def _low_rank(
         chosen: counts of the grids.
         tolerance: relative error in the Frobenius norm.
         span: lowest and highest direction cosine p.
-        derivative: 0, 1, 2 for that in sensor distance, window centre x, y; or None.
 
     Returns:
         lens_terms (p, e, r), window_terms (X, Y, r) and strengths (r,).
@@ -548,8 +495,6 @@ def _low_rank(
     p = legendre.mapped_nodes(mp, *span)
     positions = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
     table = plane_wave_residual(case, *positions)
-    if derivative is not None:
-        table = table * kernel_derivatives(case, *positions)[derivative]
     left, right = _randomized_svd(
         table.reshape(my * mx, mp * me) * case.area_um2, tolerance
     )
@@ -625,7 +570,6 @@ class WindowPlan:
     depths: DepthBasis
     moments: PillarMoments
     tensors: dict[str, torch.Tensor]
-    slopes: dict[int, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
 
     @property
     def nodes_um(self) -> tuple[Array, Array]:
@@ -646,35 +590,15 @@ class WindowPlan:
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MovingGeometry:
-    """Geometry that carries gradients, float64 tensors.
-
-    tangents: (2,). inverse_depths: (depth,), 1/um. distance: (), um. centre: (2,) of
-    the window, um. Values must equal those of the plan's case.
-    """
-
-    tangents: torch.Tensor
-    inverse_depths: torch.Tensor
-    distance: torch.Tensor
-    centre: torch.Tensor
-
-
 @functools.lru_cache(maxsize=64)
 def plan_window(
-    case: PropagationCase,
-    tolerance: float,
-    dtype: torch.dtype,
-    moving: bool = False,
-    *,
-    smooth: bool = False,
+    case: PropagationCase, tolerance: float, dtype: torch.dtype, *, smooth: bool = False
 ) -> WindowPlan:
     """Plan of a windowed propagation; the last 64 are cached.
 
     Args:
         case, tolerance: geometry, and relative error of the field.
         dtype: of the maps; sums over blocks of pillars are in float64.
-        moving: for use with :class:`MovingGeometry`.
         smooth: with factors (``Pupils``) on the light of the nodes.
 
     Raises:
@@ -688,7 +612,7 @@ def plan_window(
             )
         lens, inside = SMOOTH if smooth else (0, 0)
         ny, nx = (n + lens for n in layout.nodes)
-        layout = dataclasses.replace(layout, nodes=(ny, nx))
+        layout = replace(layout, nodes=(ny, nx))
         reference = reference_depth(case)
         pillars = plan_moments(
             case,
@@ -699,9 +623,7 @@ def plan_window(
             dtype=dtype,
             more=inside,
         )
-        depths = depth_basis(
-            case, _nodes_um(case, layout.sizes.nodes), tolerance / 2, moving=moving
-        )
+        depths = depth_basis(case, _nodes_um(case, layout.sizes.nodes), tolerance / 2)
         tensors = _window_tensors(case, layout, depths) | _tile_tensors(
             case, layout, depths, tolerance
         )
@@ -759,11 +681,7 @@ def _window_tensors(
 
 
 def _tile_tensors(
-    case: PropagationCase,
-    layout: WindowLayout,
-    depths: DepthBasis,
-    tolerance: float,
-    slope: int | None = None,
+    case: PropagationCase, layout: WindowLayout, depths: DepthBasis, tolerance: float
 ) -> dict[str, torch.Tensor]:
     """Operators of all tiles, stacked (tile, …), for all significant pairs.
 
@@ -775,12 +693,9 @@ def _tile_tensors(
         layout: tiles and counts.
         depths: basis of the depth fields.
         tolerance: relative error of the field.
-        slope: as for :func:`build_operators`.
     """
     tiles = [tile for row in window_tiles(case, layout.parts)[1] for tile in row]
-    operators = [
-        build_operators(tile, layout.sizes, tolerance, slope=slope) for tile in tiles
-    ]
+    operators = [build_operators(tile, layout.sizes, tolerance) for tile in tiles]
     terms = max(len(operator.strength) for operator in operators)
     strength = np.max(
         [_padded(operator.strength, terms) for operator in operators], axis=0
@@ -811,17 +726,6 @@ def _padded(array: Array, count: int) -> Array:
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
-def _derivative_tensors(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
-    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2);
-    cached in the plan.
-    """
-    if axis not in plan.slopes:
-        plan.slopes[axis] = _tile_tensors(
-            plan.case, plan.layout, plan.depths, plan.tolerance, axis
-        )
-    return plan.slopes[axis]
-
-
 def field_windowed(
     phase_rad: torch.Tensor, transmission: torch.Tensor, plan: WindowPlan
 ) -> torch.Tensor:
@@ -831,21 +735,17 @@ def field_windowed(
         phase_rad, transmission: (y, x) maps. plan: of :func:`plan_window`.
     """
     moments, _ = reduce_to_moments(phase_rad, transmission, plan.moments)
-    return _from_nodes(_on_nodes(moments, plan), plan, None)
+    return _from_nodes(_on_nodes(moments, plan), plan)
 
 
 def light_windowed(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    plan: WindowPlan,
-    moving: MovingGeometry | None,
-    pupils: Pupils | None,
+    maps: tuple[torch.Tensor, torch.Tensor], plan: WindowPlan, pupils: Pupils | None
 ) -> tuple[torch.Tensor, Array, list[float]]:
     """Irradiance on the window, Σ_c sign_c |field_c|², differentiable once.
 
     Args:
         maps: (map, y, x) phase in rad, and transmission.
         plan: of :func:`plan_window`.
-        moving: geometry with gradients, or None.
         pupils: factors on the light of the maps, for a ``smooth`` plan; None for the
             |U|² of one map.
 
@@ -862,7 +762,7 @@ def light_windowed(
     parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
     total: Any = 0
     for sign, light in parts:
-        field = _from_nodes(light, plan, moving)
+        field = _from_nodes(light, plan)
         total = total + sign * (field.real**2 + field.imag**2)
     m, n = moments.shape[-2:]
     with one_blas_thread():
@@ -880,15 +780,12 @@ def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     )
 
 
-def _from_nodes(
-    light: torch.Tensor, plan: WindowPlan, moving: MovingGeometry | None
-) -> torch.Tensor:
+def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     """(depth, y, x) field on the window from the light on the window's lens nodes.
 
     Args:
         light: (e, x) complex.
         plan: of :func:`plan_window`.
-        moving: geometry with gradients, or None.
     """
     tensors = plan.tensors
     tile_light = (
@@ -896,26 +793,9 @@ def _from_nodes(
         @ (light * tensors["turn"])
         @ tensors["columns_to_tile"]
     )
-    coefficients = (
-        tensors["coefficients"] if moving is None else _depth_coefficients(plan, moving)
-    )
-    fields = tile_light[:, None] * tensors["basis"]
-    field = _at_depths(zoom_to_tiles(fields, tensors), coefficients)
-    if moving is not None:
-        values = (moving.distance, moving.centre[0], moving.centre[1])
-        for axis, value in enumerate(values):
-            if value.requires_grad:
-                rate = _at_depths(
-                    zoom_to_tiles(fields, _derivative_tensors(plan, axis)), coefficients
-                )
-                # adds nothing but the derivative
-                field = field + (value - value.detach()) * rate
-    return _join_tiles(field, plan)
-
-
-def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """(tile, depth, Y, X) from fields of the depth basis (tile, X, Y, b)."""
-    return (fields @ coefficients.T).permute(0, 3, 2, 1)
+    fields = zoom_to_tiles(tile_light[:, None] * tensors["basis"], tensors)
+    at_depths = fields @ tensors["coefficients"].T  # (tile, X, Y, depth)
+    return _join_tiles(at_depths.permute(0, 3, 2, 1), plan)
 
 
 def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
@@ -935,27 +815,6 @@ def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
         for i, height in enumerate(heights)
     ]
     return torch.cat(bands, -2)
-
-
-def _depth_coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
-    """(depth, b) coefficients of the depth basis, differentiable in the source's
-    position.
-
-    Projections of exp(i depth factors) on the basis, under the quadrature of the nodes.
-    """
-    e, x = (torch.tensor(v) for v in plan.nodes_um)
-    ny, nx = plan.layout.sizes.nodes
-    inverse = moving.inverse_depths[:, None, None]
-    angle = depth_factors(
-        plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse
-    )
-    weight = torch.tensor(
-        np.outer(
-            legendre.gauss_legendre_nodes(ny)[1], legendre.gauss_legendre_nodes(nx)[1]
-        )
-    )
-    basis = torch.tensor(plan.depths.basis)
-    return (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
 
 
 def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:

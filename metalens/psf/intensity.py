@@ -16,7 +16,6 @@ from metalens.optics import Layers, media
 from metalens.propagate import (
     SHARE,
     MethodChoice,
-    MovingGeometry,
     NodeLight,
     PropagationCase,
     Pupils,
@@ -51,7 +50,6 @@ ROUNDING = {torch.float32: (8e-7, 1e-6), torch.float64: (1e-11, 5e-15)}
 EXACT = 4e-12  # rounding of exact sums in float64
 FEW = 64  # samples whose rounding has no mean: their pillars are added in float64
 TIGHTEST = 1e-12  # setting below which float64 has nothing left to give
-MOVING = 1000  # tighter setting: parts of a derivative in the geometry nearly cancel
 HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once
 SAMPLE_BYTES = 18  # for each sample and depth, per byte of a number of the maps
 CELLS = 0.5  # of the tolerance, for the integration over cells; else for the sums
@@ -70,7 +68,6 @@ class IntensityRequest:
     mixing: of both polarisations; None for |U|² of one scalar.
     layers: whose stop lays its shadow on the maps.
     integrate, source: as in :func:`metalens.psf.psf_stack`.
-    moving: geometry with gradients, or None.
     """
 
     maps: Maps
@@ -81,12 +78,11 @@ class IntensityRequest:
     layers: Layers | None = None
     integrate: bool = True
     source: Extent | None = None
-    moving: MovingGeometry | None = None
 
     @property
     def differentiable(self) -> bool:
-        """Whether the maps or the geometry require a gradient."""
-        return self.moving is not None or any(m.requires_grad for m in self.maps)
+        """Whether the maps require a gradient."""
+        return any(m.requires_grad for m in self.maps)
 
     @property
     def map_count(self) -> int:
@@ -328,7 +324,6 @@ def _of_point(request: IntensityRequest) -> IntensityResult:
     phase = request.maps[0]
     case = request.cases[0]
     tolerance = request.tolerance
-    moving = request.moving is not None
     model_error = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
 
     def finish(result: IntensityResult) -> IntensityResult:
@@ -344,12 +339,10 @@ def _of_point(request: IntensityRequest) -> IntensityResult:
         if all(choice.method == "exact" for choice in choices):
             return finish(_exact(request, choices[0].reason))
     first = phase.dtype if tolerance > 1e-6 else torch.float64
-    if math.prod(case.samples) < FEW or moving:
+    if math.prod(case.samples) < FEW:
         first = torch.float64
     start = tolerance / 2
-    if moving:
-        start = tolerance / MOVING
-    elif request.differentiable:  # gradients hold the kernel's error pillar by pillar
+    if request.differentiable:  # gradients hold the kernel's error pillar by pillar
         start = max(tolerance / 32, min(tolerance / 8, 1e-6))
     tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
     for setting, dtype in tries:
@@ -460,10 +453,7 @@ def _windowed(
     Raises:
         PropagationError: no light in the window.
     """
-    moving = request.moving
-    choice = choose_method(
-        request.cases[0], tolerance, differentiable=True, moving=moving is not None
-    )
+    choice = choose_method(request.cases[0], tolerance, differentiable=True)
     is_wide = choice.method == "wide"
     checked: list[list[NodeLight]] = [[] for row in choice.tiles for _ in row]
     parts: list[Any] = [0] * len(checked)
@@ -476,11 +466,8 @@ def _windowed(
                 light, nodes, powers = light_wide(maps, plan, pupils)
             else:
                 smooth = pupils is not None
-                plan = plan_window(
-                    window, tolerance, dtype, moving is not None, smooth=smooth
-                )
-                shifted = _shifted(moving, case, window)
-                light, nodes, powers = light_windowed(maps, plan, shifted, pupils)
+                plan = plan_window(window, tolerance, dtype, smooth=smooth)
+                light, nodes, powers = light_windowed(maps, plan, pupils)
             _check(maps, case, sum(powers), nodes)
             at_um = plan.judged_um
             mixing_at_nodes = None if pupils is None else pupils(*at_um)
@@ -545,7 +532,7 @@ def _windows(
     """
     if choice.method == "wide":
         return [case]
-    tiles = choose_method(case, tolerance, differentiable=True, moving=True).tiles
+    tiles = choose_method(case, tolerance, differentiable=True).tiles
     if [len(row) for row in tiles] != [len(row) for row in choice.tiles]:
         tiles = choice.tiles
     return [
@@ -571,16 +558,6 @@ def _check(maps: Maps, case: PropagationCase, power: float, nodes: Array) -> Non
         raise PropagationError(
             "phase or transmission is too large for its dtype; use float64, or wrap the phase"
         )
-
-
-def _shifted(
-    moving: MovingGeometry | None, case: PropagationCase, tile: PropagationCase
-) -> MovingGeometry | None:
-    """Moving geometry with its centre at that of a tile of the window."""
-    if moving is None or tile.centre_um == case.centre_um:
-        return moving
-    shift = np.subtract(tile.centre_um, case.centre_um)
-    return replace(moving, centre=moving.centre + torch.from_numpy(shift))
 
 
 def _incoherent(power: float, case: PropagationCase) -> float:

@@ -12,7 +12,7 @@ from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
 from metalens.lens import NeighbourRows
 from metalens.optics import Layers
-from metalens.propagate import MovingGeometry, PropagationCase
+from metalens.propagate import PropagationCase
 from metalens.psf import among
 from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import Polarisation
@@ -92,9 +92,7 @@ def psf_stack(
         row_um: distance of neighbouring rows where it is not the pitch, else 0.
         site_um2: area of a lattice cell where it is not pitch times row, else 0.
 
-    Sensor distance, depths, angle and offset may be torch tensors that carry gradients;
-    the window then moves with the chief ray. Behind a stop each depth is computed
-    separately, without derivatives in the geometry.
+    Behind a stop each depth is computed separately.
 
     Returns:
         PsfStack: ``intensity`` (…, [angle,] depth, y, x), each PSF of sum 1, of the
@@ -153,10 +151,6 @@ def psf_stack(
         ]
         cases.append(by_wave[int(weight.argmax())])  # all wavelengths share its window
         by_wave = [replace(case, centre_um=cases[-1].centre_um) for case in by_wave]
-        moving = _geometry_with_gradients(
-            angle, depths_um, sensor_distance_um, offset_um, cases[-1]
-        )
-        _check_moving(moving, source, layers)
         results.append(
             [
                 compute_intensity(
@@ -169,7 +163,6 @@ def psf_stack(
                         layers,
                         integrate,
                         source,
-                        moving,
                     )
                 )
                 for phase, level in zip(*lenses, strict=True)
@@ -215,22 +208,6 @@ def _polarised(
     if neighbours is not None:
         maps = apart_maps(maps, neighbours)
     return maps, PolarizationMixing(polarisation == "flux", neighbours is not None)
-
-
-def _check_moving(
-    moving: MovingGeometry | None, source: Extent | None, layers: Layers | None
-) -> None:
-    """Raise where gradients in the geometry meet a finite source or a stop."""
-    if moving is None:
-        return
-    if source is not None:
-        raise PropagationError(
-            "a source of finite size has no derivatives in the geometry: give numbers, or a point"
-        )
-    if layers is not None and layers.stop is not None:
-        raise PropagationError(
-            "a stop has no derivatives in the geometry: give numbers"
-        )
 
 
 def _directions(angle_rad: Any) -> tuple[bool, Any]:
@@ -344,53 +321,21 @@ def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
 
 
 def _value(argument: Any) -> Any:
-    """An argument without its graph; sequences of tensors become arrays."""
+    """An argument as numbers; sequences of tensors become arrays.
+
+    Raises:
+        PropagationError: a tensor that requires a gradient.
+    """
     if isinstance(argument, torch.Tensor):
-        return argument.detach().cpu().numpy()
+        if argument.requires_grad:
+            raise PropagationError(
+                "the geometry carries a gradient, but PSFs are differentiable in the maps alone: detach it, and take "
+                "differences of two stacks"
+            )
+        return argument.cpu().numpy()
     if isinstance(argument, list | tuple):
         return np.array([_value(a) for a in argument])
     return argument
-
-
-def _geometry_with_gradients(
-    angle: Any, depths: Any, distance: Any, offset: Any, case: PropagationCase
-) -> MovingGeometry | None:
-    """Geometry as float64 tensors; None where nothing in it carries a gradient.
-
-    The window's centre is where the chief ray meets the sensor, plus the offset.
-
-    Args:
-        angle: field angle along x, or a pair (x, y), rad.
-        depths: source depths, um.
-        distance: lens to sensor, um.
-        offset: (x, y) from the chief ray to the window's centre, um.
-        case: with the media behind the lens.
-    """
-    offsets = offset if isinstance(offset, list | tuple) else [offset]
-    arguments = [angle, depths, distance, *offsets]
-    if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in arguments):
-        return None
-    pair = _double(angle).reshape(-1)
-    tangents = torch.tan(
-        pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)])
-    )
-    distance_um = _double(distance).reshape(())
-    offset_um = torch.stack([_double(o).reshape(()) for o in offset])
-    chief = torch.stack(
-        [
-            propagate.chief_ray_offset(case.behind, distance_um, tangents, i)
-            for i in (0, 1)
-        ]
-    )
-    return MovingGeometry(
-        tangents, 1 / _double(depths).reshape(-1), distance_um, chief + offset_um
-    )
-
-
-def _double(argument: Any) -> torch.Tensor:
-    if isinstance(argument, torch.Tensor):
-        return argument.double()
-    return torch.as_tensor(np.asarray(argument, float))
 
 
 def _maps(

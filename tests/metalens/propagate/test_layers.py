@@ -22,9 +22,6 @@ from metalens.propagate import PropagationCase
 from metalens.propagate.paths import (
     chief_path,
     from_source,
-    kernel_derivatives,
-    ray_amplitude,
-    ray_cosines,
     to_sensor,
 )
 from tests.referees import films as referee
@@ -263,74 +260,6 @@ def test_a_source_at_infinity_is_the_limit_of_far_ones():
         (x * case.tangents[0] + y * case.tangents[1])
         / np.sqrt(1 + np.hypot(*case.tangents) ** 2)
     )
-
-
-@pytest.mark.parametrize("step", [0, 1, 2])
-def test_derivatives_in_distance_and_window_centre(step):
-    """Against central differences of the kernel at a fixed pillar; their own error is
-    1e-8.
-    """
-    case = propagate.make_case((9, 9), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
-    x, y, X, Y = 6.0, -9.0, 3.1, -4.7
-
-    def log_kernel(change):
-        thickness = list(case.behind.thickness_um)
-        centre = list(case.centre_um)
-        if step == 0:
-            thickness[0] += change
-        else:
-            centre[step - 1] += change
-        behind = Media(case.behind.index, tuple(thickness))
-        moved = dataclasses.replace(case, behind=behind, centre_um=tuple(centre))
-        reach2 = (centre[0] + X - x) ** 2 + (centre[1] + Y - y) ** 2
-        w = media.solve_direction_square(behind.layers, reach2)
-        level = ray_amplitude(behind, moved.wavenumber, w, moved.reach_um)
-        return np.log(level) + 1j * case.wavenumber * media.whole_path(behind.layers, w)
-
-    across = ray_cosines(case, x - case.centre_um[0], y - case.centre_um[1])
-    got = kernel_derivatives(case, across, y, X, Y)[step]
-    assert got == pytest.approx((log_kernel(1e-4) - log_kernel(-1e-4)) / 2e-4, rel=1e-7)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_stack():
-    """Against central differences of the engine itself at 1e-9: their own error is
-    1e-6.
-    """
-    base = dict(
-        sensor_distance_um=DISTANCE, depths_um=1340.0, angle_x=0.3, angle_y=-0.2
-    )
-    phase, level = (
-        torch.tensor(m)
-        for m in lens(
-            propagate.make_case((92, 96), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
-        )
-    )
-    rising = torch.linspace(0.3, 1, 20, dtype=torch.float64)
-    weight = rising[:, None] * rising**2
-
-    def value(**change):
-        given = {
-            n: torch.tensor(v + change.get(n, 0.0), dtype=torch.float64)
-            for n, v in base.items()
-        }
-        leaves = [v.requires_grad_() for v in given.values()]
-        angle = torch.stack([given.pop("angle_x"), given.pop("angle_y")])
-        given["depths_um"] = given["depths_um"].reshape(1)
-        stack = psf.psf_stack(
-            phase, level, tolerance=1e-9, **GEOMETRY | given | dict(angle_rad=angle)
-        )
-        return leaves, (stack.intensity * weight).sum()
-
-    leaves, total = value()
-    slopes_found = torch.autograd.grad(total, leaves)
-    for slope, name, step in zip(
-        slopes_found, base, (1e-2, 0.3, 1e-5, 1e-5), strict=True
-    ):
-        difference = (value(**{name: step})[1] - value(**{name: -step})[1]).item() / (
-            2 * step
-        )
-        assert slope.item() == pytest.approx(difference, rel=2e-4), name
 
 
 def test_films_that_do_not_fit_are_refused_by_name():

@@ -593,7 +593,7 @@ def test_stops_that_cannot_be_are_refused_by_name() -> None:
     with pytest.raises(PropagationError, match=r"put Layers\.stop_share onto"):
         propagate.make_case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
     moving = torch.tensor(400.0, requires_grad=True)
-    with pytest.raises(PropagationError, match="no derivatives in the geometry"):
+    with pytest.raises(PropagationError, match="differentiable in the maps alone"):
         psf_stack(
             PHASE,
             LEVEL,
