@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -341,7 +341,6 @@ def path_difference(
     )
 
 
-Light = Literal["s", "p", "mean"]
 # nodes along u and along v; each ray takes the number that differs least from fewer
 WAVES = (6, 8, 12, 16, 20, 24, 28)
 DEGREES = 24  # of the series in s, before terms below rounding are cut off
@@ -385,7 +384,7 @@ class SaddleCorrection:
 
 
 def saddle_correction(
-    behind: Media, wavenumber: float, reach_um: float, light: Light = "mean"
+    behind: Media, wavenumber: float, reach_um: float
 ) -> SaddleCorrection:
     """Correction C of the stationary-phase amplitude, for all rays up to this reach.
 
@@ -396,7 +395,6 @@ def saddle_correction(
         behind: media from lens to sensor.
         wavenumber: in vacuum, rad/um.
         reach_um: largest lateral distance, um.
-        light: polarisation whose power passes the faces: s, p or the mean of both.
     """
     layers = behind.layers
     rarest = layers[0][0]
@@ -406,13 +404,11 @@ def saddle_correction(
     tan2 = 2.0 ** (math.ceil(4 * math.log2(tan2)) / 4)
     grazing = (STEEPEST * min(behind.order)) ** 2
     largest_w = min(rarest * rarest * tan2 / (1 + tan2), grazing)
-    return _saddle(behind, wavenumber, largest_w, light)
+    return _saddle(behind, wavenumber, largest_w)
 
 
 @functools.lru_cache(maxsize=64)
-def _saddle(
-    behind: Media, wavenumber: float, most: float, light: Light
-) -> SaddleCorrection:
+def _saddle(behind: Media, wavenumber: float, most: float) -> SaddleCorrection:
     """Power series of C in the normal component s, for rays of w = p² up to ``most``.
 
     A Chebyshev fit to (mean - 1) k L / i at ``2 DEGREES`` nodes of s = √(n² - w), its
@@ -422,7 +418,6 @@ def _saddle(
         behind: media from lens to sensor.
         wavenumber: in vacuum, rad/um.
         most: largest p² of the rays.
-        light: s, p or their mean.
     """
     rarest = behind.layers[0][0]
     ends = math.sqrt(rarest * rarest - most), rarest
@@ -437,7 +432,7 @@ def _saddle(
     u = np.cos(np.pi * (np.arange(2 * DEGREES) + 0.5) / (2 * DEGREES))
     w = rarest * rarest - (middle + half * u) ** 2
     path_rad = wavenumber * np.asarray(whole_path(behind.layers, w))
-    mean, difference = _best_corrections(behind, wavenumber, w, light)
+    mean, difference = _best_corrections(behind, wavenumber, w)
     samples = (mean - 1) * path_rad / 1j
     # the weights keep uncertain grazing rays from bending the series; full=True
     # silences the warning about its rank
@@ -460,7 +455,7 @@ def _saddle(
 
 
 def _best_corrections(
-    behind: Media, wavenumber: float, w: Array, light: Light
+    behind: Media, wavenumber: float, w: Array
 ) -> tuple[Array, Array]:
     """(n,) corrections 1 + iC/(kL) of each ray, and (n,) estimates of their error.
 
@@ -472,10 +467,9 @@ def _best_corrections(
         behind: media from lens to sensor.
         wavenumber: in vacuum, rad/um.
         w: (n,) p² of the rays.
-        light: s, p or their mean.
     """
     corrections = np.stack(
-        [plane_wave_correction(behind, wavenumber, w, count, light) for count in WAVES]
+        [plane_wave_correction(behind, wavenumber, w, count) for count in WAVES]
     )
     differences = np.abs(np.diff(corrections, axis=0))
     best = np.argmin(differences, axis=0)
@@ -484,11 +478,7 @@ def _best_corrections(
 
 
 def plane_wave_correction(
-    behind: Media,
-    wavenumber: float,
-    w: Array,
-    count: int = WAVES[-1],
-    light: Light = "mean",
+    behind: Media, wavenumber: float, w: Array, count: int = WAVES[-1]
 ) -> Array:
     """(n,) amplitude factor 1 + iC/(kL) of rays by Gauss-Hermite quadrature.
 
@@ -501,7 +491,6 @@ def plane_wave_correction(
         wavenumber: k in vacuum, rad/um.
         w: (n,) p² of the rays, p = n sin θ.
         count: plane waves along each of two axes.
-        light: s, p or their mean.
     """
     layers = behind.layers
     k = wavenumber
@@ -520,16 +509,9 @@ def plane_wave_correction(
         for n, t in layers
     )
     level = np.sqrt(
-        _passed_of(behind.order, w + w_change, light)
-        / _passed_of(behind.order, w, light)
+        sum(passed_on(behind.order, w + w_change)) / sum(passed_on(behind.order, w))
     )
     wave = level * np.exp(1j * k * (path + (reach_slope * u * u + g * v * v) / 2))
     return np.asarray(
         np.einsum("nij,ij->n", wave, np.outer(node_weight, node_weight) / (2 * math.pi))
     )
-
-
-def _passed_of(order: tuple[float, ...], w: Any, light: Light) -> Any:
-    """Share of the power of this polarisation that passes the faces, of w = p²."""
-    s_power, p_power = passed_on(order, w)
-    return {"s": s_power, "p": p_power, "mean": (s_power + p_power) / 2}[light]

@@ -20,7 +20,6 @@ from .moments import SHARE as SHARE
 from .moments import Pupils as Pupils
 from .moments import mix_components as mix_components
 from .paths import chief_path as chief_path
-from .paths import polarized_amplitudes as polarized_amplitudes
 from .paths import ray_cosines as ray_cosines
 from .paths import rayleigh_sommerfeld_kernel as rayleigh_sommerfeld_kernel
 from .sincos import sincos_turns32 as sincos_turns32

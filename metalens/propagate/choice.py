@@ -9,15 +9,9 @@ import torch
 from metalens.core.arrays import to_tensor
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
-from metalens.propagate.geometry import PropagationCase, make_case, split_window
-from metalens.propagate.wide import is_wide
-from metalens.propagate.window import (
-    MOST_NODES,
-    WindowLayout,
-    field_windowed,
-    plan_layout,
-    plan_window,
-)
+from metalens.propagate.geometry import PropagationCase, make_case
+from metalens.propagate.wide import is_wide, wide_axes
+from metalens.propagate.window import field_windowed, plan_layout, plan_window
 
 EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
 
@@ -29,13 +23,11 @@ WIDE_WORK = 1e9  # pillars x samples from which transforms are
 class MethodChoice:
     """How the field on a window is computed.
 
-    method: ``exact``, ``windowed``, ``tiled`` or ``wide``. reason: in words.
-    tiles: (row, column) windows that are computed separately.
+    method: ``exact``, ``windowed`` or ``wide``. reason: in words.
     """
 
     method: str
     reason: str
-    tiles: tuple[tuple[PropagationCase, ...], ...]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -50,60 +42,27 @@ def choose_method(
         case, tolerance: geometry, and relative error of the field.
         differentiable: leave out the exact sum, which has no derivatives.
 
-    Returns:
-        The method, its reason and its tiles.
+    Raises:
+        PropagationError: rays are too steep for transforms, and the window is too large
+            for the windowed method.
     """
     pillars = case.shape[0] * case.shape[1]
     points = case.samples[0] * case.samples[1]
     depths = len(case.inverse_depths_per_um)
     if not differentiable and pillars * points * (depths + 2) / 3 < EXACT_WORK:
-        reason = f"exact sum: {pillars:,} pillars at {points} points"
-        return MethodChoice("exact", reason, ((case,),))
-    is_large = pillars * points > WIDE_WORK
-    if is_large and is_wide(case, tolerance):
-        return MethodChoice("wide", "wide window by Fourier transforms", ((case,),))
+        return MethodChoice(
+            "exact", f"exact sum: {pillars:,} pillars at {points} points"
+        )
+    if pillars * points > WIDE_WORK and is_wide(case, tolerance):
+        return MethodChoice("wide", "wide window by Fourier transforms")
     with one_blas_thread():
-        tiles = _windows(case, tolerance)
-        layout = _layout(tiles[0][0], tolerance)
-    count = sum(map(len, tiles))
-    if count > 1 or layout is None:
-        why = f"the whole window would need over {MOST_NODES} nodes or a large table"
-        return MethodChoice("tiled", f"windowed in {count} tiles: {why}", tiles)
-    rows, columns = layout.nodes
-    return MethodChoice("windowed", f"windowed: {rows} x {columns} nodes", tiles)
-
-
-def _windows(
-    case: PropagationCase, tolerance: float
-) -> tuple[tuple[PropagationCase, ...], ...]:
-    """The window, cut into equal parts until two opposite corners can be planned.
-
-    Args:
-        case: geometry of the propagation.
-        tolerance: relative error of the field.
-
-    Raises:
-        PropagationError: not even single samples can be planned.
-    """
-    parts = 1
-    while True:
-        rows = split_window(case, parts)
-        corners = rows[0][0], rows[-1][-1]
-        if all(_layout(window, tolerance) is not None for window in corners):
-            return rows
-        if parts >= max(case.samples):
-            raise PropagationError(
-                "the windowed method cannot reach this geometry even sample by sample; use propagate.exact"
-            )
-        parts *= 2
-
-
-def _layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """Layout of a window; None if it needs too many nodes or too large tables."""
-    try:
-        return plan_layout(case, tolerance)
-    except PropagationError:
-        return None
+        try:
+            rows, columns = plan_layout(case, tolerance).nodes
+        except PropagationError:
+            if wide_axes(case, tolerance) is None:
+                raise
+            return MethodChoice("wide", "window by Fourier transforms")
+    return MethodChoice("windowed", f"windowed: {rows} x {columns} nodes")
 
 
 def windowed(

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.propagate.direct import add_point_waves, point_wave
 from metalens.propagate.geometry import PropagationCase
 from metalens.propagate.moments import Pupils
-from metalens.propagate.paths import rayleigh_sommerfeld_kernel, to_sensor
+from metalens.propagate.paths import to_sensor
 from metalens.propagate.window import depth_factors
 
 # least number of points, and pixels to a point in a large window
@@ -27,7 +26,6 @@ SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
 NEAR = 9  # pixels along a side of the neighbourhood of a pixel
 RAYS = 12  # points at which a polarisation mixing of their own is formed
-FACTORS = 12  # nodes along an axis of the lens on which it is formed
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,73 +48,61 @@ class NodeLight:
     parts: int = 1
     pupils: tuple[Array, Array] | None = None
 
-    @property
-    def components(self) -> tuple[Array, Array]:
-        """(component,) signs and (component, e, x) light."""
-        if self.pupils is None:
-            return np.ones(1), self.light
-        signs, factors = self.pupils
-        return signs, np.einsum("cmyx,myx->cyx", factors, self.light)
 
-
-def relative_error(windows: list[list[NodeLight]], intensity: list[Array]) -> float:
+def relative_error(waves: list[NodeLight], intensity: Array) -> float:
     """Estimate of the relative L2 error of PSFs of sum 1, all depths together.
 
     Args:
-        windows: parts of one window that were computed separately; each a list of
-            wavelengths.
-        intensity: (depth, y, x) of each part, wavelengths added.
+        waves: light of every wavelength on the nodes.
+        intensity: (depth, y, x), wavelengths added.
 
     Accuracy: 1 to 3 times the true error. An error confined to pixels that hold less
     than 1 / 128 of the light and of its root can be missed.
     """
-    nodes = max(part[0].light[0].size for part in windows)
-    pixels = sum(math.prod(part[0].case.samples) for part in windows)
+    nodes = max(wave.light[0].size for wave in waves)
+    pixels = intensity[0].size
     count = min(max(POINTS, pixels // EVERY), max(FEWEST, int(WORK / nodes)))
     is_limited = count * nodes > WORK / 2
     light, energy, depths, points, chance = _sample(
-        windows, intensity, count, DEPTHS // 2 if is_limited else DEPTHS
+        waves[0], intensity, count, DEPTHS // 2 if is_limited else DEPTHS
     )
-    direct = np.zeros((len(depths), len(points)))
-    for part, in_part, (row, column) in _by_part(windows, points):
-        for wavelength_light in part:
-            signs, components = wavelength_light.components
-            field = _direct_fields(wavelength_light, components, depths, row, column)
-            direct[:, in_part] += wavelength_light.weight * np.einsum(
-                "c,czp->zp", signs, np.abs(field) ** 2
-            )
+    direct = sum(_direct_intensity(wave, wave.pupils, depths, points) for wave in waves)
     difference = direct / energy[:, None] - light[:, points]
     noise = sum(
-        2 * abs(first.weight) * first.noise**2 * (1 / energy).sum()
-        for first in windows[0]
+        2 * abs(wave.weight) * wave.noise**2 * (1 / energy).sum() for wave in waves
     )
     total = sampled_square_error(light[:, points], chance, difference) + float(noise)
     return _relative_root(total, light, len(points))
 
 
 def pupil_error(
-    windows: list[list[NodeLight]],
-    intensity: list[Array],
+    waves: list[NodeLight],
+    intensity: Array,
     pupils: Callable[[PropagationCase], Pupils],
 ) -> float:
     """Estimate of the relative L2 error of using one polarisation mixing, that of the
     window's middle, for all points.
 
     Args:
-        windows, intensity: as :func:`relative_error`; light without ``pupils`` counts
+        waves, intensity: as :func:`relative_error`; light without ``pupils`` counts
             as |U|².
         pupils: mixing for the middle of a case's window.
 
     Accuracy: 1 to 2 times the true difference.
     """
-    light, energy, depths, points, chance = _sample(windows, intensity, RAYS, 2)
+    light, energy, depths, points, chance = _sample(waves[0], intensity, RAYS, 2)
     changed = np.zeros((len(depths), len(points)))
-    for part, in_part, pixels in _by_part(windows, points):
-        for i, row, column in zip(np.flatnonzero(in_part), *pixels, strict=True):
-            for wavelength_light in part:
-                changed[:, i] += wavelength_light.weight * _own_mixing(
-                    wavelength_light, depths, (row, column), pupils
-                )
+    for wave in waves:
+        y, x = wave.case.window_um
+        for i, (row, column) in enumerate(zip(*np.divmod(points, len(x)), strict=True)):
+            centre = wave.case.centre_um + np.array([x[column], y[row]])
+            here = replace(wave.case, centre_um=tuple(centre.tolist()))
+            at_point = points[i : i + 1], pupils(here)(*wave.nodes_um)
+            own, applied = (
+                _direct_intensity(wave, factors, depths, at_point[0])
+                for factors in (at_point[1], wave.pupils)
+            )
+            changed[:, i] += (own - applied)[:, 0]
     total = sampled_square_error(light[:, points], chance, changed / energy[:, None])
     return _relative_root(total, light, len(points))
 
@@ -162,7 +148,7 @@ def draw_pixels(
 
 
 def _sample(
-    windows: list[list[NodeLight]], intensity: list[Array], count: int, most_depths: int
+    wave: NodeLight, intensity: Array, count: int, most_depths: int
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Sample of depths and pixels at which the PSFs are computed directly.
 
@@ -170,35 +156,25 @@ def _sample(
     smoothed light.
 
     Args:
-        windows, intensity: as :func:`relative_error`.
+        wave: with the tiles of the window.
+        intensity: (depth, y, x).
         count: of pixels. most_depths: largest number of depths.
 
     Returns:
         (depth, pixel) light of sum 1, (depth,) sums, indices of depths, and sampled
         pixels with their chances.
     """
-    depth_count = len(intensity[0])
-    depths = (
-        np.linspace(0, depth_count - 1, min(depth_count, most_depths))
-        .round()
-        .astype(int)
-    )
-    parts = [part.reshape(depth_count, -1)[depths] for part in intensity]
-    light = np.concatenate(parts, axis=1, dtype=float)
-    energy = light.sum(1)
-    light /= energy[:, None]
+    last = len(intensity) - 1
+    depths = np.linspace(0, last, min(last + 1, most_depths)).round().astype(int)
+    light = intensity[depths].astype(float)
+    energy = light.sum((1, 2))
+    light /= energy[:, None, None]
     mean = np.maximum(light.mean(0), 0.0)  # a flux may run back where it is dark
-    edges, smoothed, first = [], [], 0
-    for part in windows:
-        rows, columns = part[0].case.samples
-        part_mean = mean[first : first + rows * columns].reshape(rows, columns)
-        smoothed.append(uniform_filter(part_mean, NEAR).ravel())
-        y, x = (_tile_position(n, part[0].parts) for n in part_mean.shape)
-        edges.append((1 + 9 * np.maximum(np.abs(x), np.abs(y)[:, None]) ** 8).ravel())
-        first += rows * columns
-    others = np.sqrt(mean) * np.concatenate(edges), np.concatenate(smoothed)
-    points, chance = draw_pixels(mean, count, others)
-    return light, energy, depths, points, chance
+    y, x = (np.abs(_tile_position(n, wave.parts)) for n in mean.shape)
+    edges = 1 + 9 * np.maximum(x, y[:, None]) ** 8
+    others = np.sqrt(mean) * edges, uniform_filter(mean, NEAR)
+    points, chance = draw_pixels(mean.ravel(), count, [o.ravel() for o in others])
+    return light.reshape(len(depths), -1), energy, depths, points, chance
 
 
 def _tile_position(count: int, parts: int) -> Array:
@@ -210,95 +186,34 @@ def _tile_position(count: int, parts: int) -> Array:
     return np.asarray(2 * (place % 1) - 1)
 
 
-def _by_part(
-    windows: list[list[NodeLight]], points: Array
-) -> list[tuple[list[NodeLight], Array, tuple[Array, Array]]]:
-    """For each part: its light, a mask of the points in it, and their (row, column).
-
-    Args:
-        windows: parts, each a list of wavelengths.
-        points: (point,) pixel numbers, counted through all parts.
-    """
-    parts, first = [], 0
-    for part in windows:
-        rows, columns = part[0].case.samples
-        in_part = (points >= first) & (points < first + rows * columns)
-        row, column = np.divmod(points[in_part] - first, columns)
-        parts.append((part, in_part, (row, column)))
-        first += rows * columns
-    return parts
-
-
-def _direct_fields(
-    node_light: NodeLight, components: Array, depths: Array, row: Array, column: Array
+def _direct_intensity(
+    wave: NodeLight, pupils: tuple[Array, Array] | None, depths: Array, points: Array
 ) -> Array:
-    """(component, depth, point) fields at window pixels, summed over lens nodes.
+    """(depth, point) weighted intensity of pixels, Σ sign |U|² by sums over lens nodes.
 
     Args:
-        node_light: light of one wavelength on the nodes, with its geometry.
-        components: (component, e, x) complex light.
-        depths: indices. row, column: (point,) pixels of the window.
+        wave: light of one wavelength on the nodes, with its geometry.
+        pupils: (component,) signs and (component, map, e, x) factors; None for |U|².
+        depths: indices. points: (point,) pixel numbers of the window.
     """
-    case = node_light.case
-    e, x = node_light.nodes_um
+    case = wave.case
+    e, x = wave.nodes_um
+    signs, components = np.ones(1), wave.light
+    if pupils is not None:
+        signs, components = pupils[0], np.einsum("cmyx,myx->cyx", pupils[1], wave.light)
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
     phase_rad = depth_factors(case, e[:, None], x, case.tangents, inverse)
     phase_rad = phase_rad - case.wavenumber * np.asarray(to_sensor(case, x, e[:, None]))
     light = components[:, None] * np.exp(1j * phase_rad)
     wy, wx = case.window_um
-    points = np.stack([wx[column], wy[row]], -1) + np.array(case.centre_um)
-    fields = np.zeros((len(components) * len(depths), len(points)), complex)
-    wave = point_wave(case, points)
-    add_point_waves(light.reshape(-1, len(e), len(x)), (e, x), points, wave, fields)
-    return (fields * case.area_um2).reshape(len(components), len(depths), -1)
-
-
-def _own_mixing(
-    node_light: NodeLight,
-    depths: Array,
-    pixel: tuple[int, int],
-    pupils: Callable[[PropagationCase], Pupils],
-) -> Array:
-    """(depth,) intensity of a pixel with its own polarisation mixing, less that with
-    the window's.
-
-    The mixing is smooth over the lens. It is formed on few nodes, to which the waves of
-    the fine nodes are interpolated.
-
-    Args:
-        node_light: light of one wavelength on the nodes.
-        depths: indices. pixel: (row, column) of the window.
-        pupils: mixing for the middle of a case's window.
-    """
-    case = node_light.case
-    e, x = node_light.nodes_um
-    Y, X = (
-        float(positions[index])
-        for positions, index in zip(case.window_um, pixel, strict=True)
+    row, column = np.divmod(points, len(wx))
+    places = np.stack([wx[column], wy[row]], -1) + np.array(case.centre_um)
+    fields = np.zeros((len(light) * len(depths), len(places)), complex)
+    point_waves = point_wave(case, places)
+    add_point_waves(
+        light.reshape(-1, len(e), len(x)), (e, x), places, point_waves, fields
     )
-    inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
-    kernel = rayleigh_sommerfeld_kernel(case, x, e[:, None], X, Y, inverse)
-    few_e, weights_e = _fewer_nodes(e)
-    few_x, weights_x = _fewer_nodes(x)
-    waves = weights_e @ (node_light.light[:, None] * kernel) @ weights_x.T
-
-    def intensity(centre: PropagationCase) -> Array:
-        signs, factors = pupils(centre)(few_e, few_x)
-        return np.asarray(
-            signs @ np.abs(np.einsum("cmyx,mzyx->cz", factors, waves)) ** 2
-        )
-
-    centred = replace(case, centre_um=(case.centre_um[0] + X, case.centre_um[1] + Y))
-    scalar = node_light.pupils is None
-    applied = np.abs(waves[0].sum((-1, -2))) ** 2 if scalar else intensity(case)
-    return (intensity(centred) - applied) * case.area_um2**2
-
-
-def _fewer_nodes(places_um: Array) -> tuple[Array, Array]:
-    """(n,) few nodes over places of the lens, and (n, place) interpolation weights."""
-    low, high = float(places_um.min()), float(places_um.max())
-    if len(places_um) <= FACTORS or not high > low:
-        return places_um, np.eye(len(places_um))
-    relative = (2 * places_um - low - high) / (high - low)
-    nodes = legendre.mapped_nodes(FACTORS, low, high)
-    return np.asarray(nodes), legendre.interpolation_matrix(FACTORS, relative).T
+    power = np.abs(fields * case.area_um2) ** 2
+    return np.asarray(
+        wave.weight * np.tensordot(signs, power.reshape(len(light), len(depths), -1), 1)
+    )

@@ -2,7 +2,6 @@
 on the sensor.
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -157,24 +156,6 @@ def axis_positions(count: int, step: float) -> Array:
     return (np.arange(count) - (count - 1) / 2) * step
 
 
-def split_window(
-    case: PropagationCase, parts: int
-) -> tuple[tuple[PropagationCase, ...], ...]:
-    """The window cut into rows of parts, at most ``parts`` along each axis, equal to
-    within one sample.
-
-    Args:
-        case: geometry of the propagation.
-    """
-    row_spans, column_spans = (
-        _even_spans(count, min(parts, count)) for count in case.samples
-    )
-    return tuple(
-        tuple(_part(case, row_span, column_span) for column_span in column_spans)
-        for row_span in row_spans
-    )
-
-
 def window_tiles(
     case: PropagationCase, parts: int
 ) -> tuple[tuple[list[int], list[int]], tuple[tuple[PropagationCase, ...], ...]]:
@@ -191,41 +172,22 @@ def window_tiles(
         firsts.append(
             [i * (count - sizes[-1]) // max(tiles - 1, 1) for i in range(tiles)]
         )
-    row_spans, column_spans = (
-        [(start, start + size) for start in axis_firsts]
-        for axis_firsts, size in zip(firsts, sizes, strict=True)
+    (my, mx), (rows, columns), (x, y) = case.samples, sizes, case.centre_um
+    tiles_of_rows = tuple(
+        tuple(
+            replace(
+                case,
+                centre_um=(
+                    x + (first_x + (columns - mx) / 2) * case.step_um,
+                    y + (first_y + (rows - my) / 2) * case.step_um,
+                ),
+                samples=(rows, columns),
+            )
+            for first_x in firsts[1]
+        )
+        for first_y in firsts[0]
     )
-    return (firsts[0], firsts[1]), tuple(
-        tuple(_part(case, row_span, column_span) for column_span in column_spans)
-        for row_span in row_spans
-    )
-
-
-def _part(
-    case: PropagationCase, row_span: tuple[int, int], column_span: tuple[int, int]
-) -> PropagationCase:
-    """Case of a part of the window, with its own centre.
-
-    Args:
-        case: geometry of the whole window.
-        row_span, column_span: first sample, and one past the last.
-    """
-    my, mx = case.samples
-    x, y = case.centre_um
-    centre = (
-        x + (sum(column_span) - mx) / 2 * case.step_um,
-        y + (sum(row_span) - my) / 2 * case.step_um,
-    )
-    return replace(
-        case,
-        centre_um=centre,
-        samples=(row_span[1] - row_span[0], column_span[1] - column_span[0]),
-    )
-
-
-def _even_spans(count: int, parts: int) -> list[tuple[int, int]]:
-    """(start, stop) of ``parts`` spans of nearly equal size."""
-    return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
+    return (firsts[0], firsts[1]), tiles_of_rows
 
 
 def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> None:

@@ -107,37 +107,6 @@ def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> 
     return -1j * magnitude * (1 + 1j * correction)
 
 
-def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]:
-    """Complex amplitudes of s and p light behind films, relative to
-    :func:`ray_amplitude`.
-
-    Each is the ratio of its saddle-point factor to the mean one, times the root of
-    twice its share of the transmitted power. Both are 1 in one medium.
-
-    Args:
-        case: geometry of the propagation.
-        w: squared p of the rays.
-    """
-    behind, k = case.behind, case.wavenumber
-    if behind is None:
-        return np.ones_like(w), np.ones_like(w)
-    powers = media.passed_apart(behind.order, w)
-    inverse_phase = 1 / (k * media.whole_path(behind.layers, w))
-    mean_real, mean_imaginary = saddle_correction(behind, k, case.reach_um).at(w)
-    amplitudes = []
-    saddles = (
-        saddle_correction(behind, k, case.reach_um, "s"),
-        saddle_correction(behind, k, case.reach_um, "p"),
-    )
-    for saddle, power in zip(saddles, powers, strict=True):
-        own_real, own_imaginary = saddle.at(w)
-        waves = (1 - inverse_phase * own_imaginary + 1j * inverse_phase * own_real) / (
-            1 - inverse_phase * mean_imaginary + 1j * inverse_phase * mean_real
-        )
-        amplitudes.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
-    return amplitudes[0], amplitudes[1]
-
-
 def films_error(case: PropagationCase, level: Array) -> float:
     """Relative L2 error of PSFs by the kernel through films; 0 in one medium.
 

@@ -84,8 +84,8 @@ class WindowLayout:
 
 
 @functools.lru_cache(maxsize=1024)
-def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """Nodes over the lens and tiles of the window; None if tables exceed 100 MB.
+def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout:
+    """Nodes over the lens and tiles of the window.
 
     With more tiles along an axis the work on the window falls, and that of passing
     light to the tiles rises. Their sum is least for about √nodes / 4 tiles.
@@ -95,24 +95,29 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
         tolerance: relative error of the field.
 
     Raises:
-        PropagationError: more than 400 nodes would be needed; the window is too large
-            for this method.
+        PropagationError: more than 400 nodes, or tables of over 100 MB, would be
+            needed: the window is too large for this method.
     """
     nodes = lens_nodes(case, tolerance / 4)
     parts = max(1, round(math.sqrt(max(nodes)) / 4))
-    most_tiles = max(case.samples)
+    most_parts = min(MOST_PARTS, max(case.samples))
     while True:
-        parts = min(parts, most_tiles)
+        parts = min(parts, most_parts)
         rows = window_tiles(case, parts)[1]
         corners = {
             _mirrored(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
         }
-        sizes = _largest_counts([node_counts(tile, tolerance) for tile in corners])
-        if sizes.table <= MOST_TABLE:
-            return WindowLayout(nodes, parts, sizes)
-        if parts in (most_tiles, MOST_PARTS):
-            return None
-        parts = min(2 * parts, MOST_PARTS)
+        try:
+            sizes = _largest_counts([node_counts(tile, tolerance) for tile in corners])
+        except PropagationError:
+            if parts == most_parts:
+                raise
+        else:
+            if sizes.table <= MOST_TABLE:
+                return WindowLayout(nodes, parts, sizes)
+            if parts == most_parts:
+                raise _too_large("a table of over 100 MB")
+        parts *= 2
 
 
 def _mirrored(tile: PropagationCase) -> PropagationCase:
@@ -225,9 +230,12 @@ def _needed_nodes(lines: Callable[[Array], Array], tolerance: float, what: str) 
         if needed <= min(count, MOST_NODES):
             return max(needed, 2)
         count *= 2
-    raise PropagationError(
-        f"windowed propagation needs more than {MOST_NODES} nodes ({what}); "
-        "make the window smaller, or use propagate.exact"
+    raise _too_large(f"more than {MOST_NODES} nodes ({what})")
+
+
+def _too_large(need: str) -> PropagationError:
+    return PropagationError(
+        f"windowed propagation needs {need}; make the window smaller, or use propagate.exact"
     )
 
 
@@ -606,10 +614,6 @@ def plan_window(
     """
     with one_blas_thread():
         layout = plan_layout(case, tolerance)
-        if layout is None:
-            raise PropagationError(
-                "the window is too large for one plan; see propagate.choose, or make it smaller"
-            )
         lens, inside = SMOOTH if smooth else (0, 0)
         ny, nx = (n + lens for n in layout.nodes)
         layout = replace(layout, nodes=(ny, nx))

@@ -15,7 +15,6 @@ from metalens.core.errors import PropagationError
 from metalens.optics import Layers, media
 from metalens.propagate import (
     SHARE,
-    MethodChoice,
     NodeLight,
     PropagationCase,
     Pupils,
@@ -381,7 +380,7 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
     error = math.hypot(EXACT, _noise_error(total, noise))
-    budget = _with_rays(error, request, [checked], [total])
+    budget = Budget(error, polarisation=_mixing_error(request, checked, total))
     return IntensityResult(
         torch.as_tensor(total), budget, reason, np.full(len(total), power)
     )
@@ -416,25 +415,13 @@ def _pillar_light(
     return NodeLight(case, weight, light, (y, x), 0.0, pupils=at)
 
 
-def _with_rays(
-    error: float,
-    request: IntensityRequest,
-    checked: list[list[NodeLight]],
-    light: list[Any],
-) -> Budget:
-    """Budget of the sums' error, and of one polarisation mixing for the whole window.
-
-    Args:
-        error: relative L2 error of the sums.
-        request: with the mixing by the rays to a single point, if any.
-        checked: light of the nodes, by part of the window.
-        light: irradiance of each part.
-    """
-    point_mixing = request.own_mixing
-    mixing_error = (
-        math.nan if point_mixing is None else pupil_error(checked, light, point_mixing)
-    )
-    return Budget(error, polarisation=mixing_error)
+def _mixing_error(
+    request: IntensityRequest, waves: list[NodeLight], light: Array
+) -> float:
+    """Relative L2 error of one polarisation mixing for the window; nan without one."""
+    if request.own_mixing is None:
+        return math.nan
+    return pupil_error(waves, light, request.own_mixing)
 
 
 def _windowed(
@@ -442,8 +429,7 @@ def _windowed(
 ) -> IntensityResult:
     """Irradiance by the windowed or wide method at one setting, with measured error.
 
-    Every wavelength is summed over every part of the window. The error is measured
-    against exact sums at points of the window.
+    The error is measured against exact sums at points of the window.
 
     Args:
         request: maps, cases and weights of the wavelengths.
@@ -455,56 +441,40 @@ def _windowed(
     """
     choice = choose_method(request.cases[0], tolerance, differentiable=True)
     is_wide = choice.method == "wide"
-    checked: list[list[NodeLight]] = [[] for row in choice.tiles for _ in row]
-    parts: list[Any] = [0] * len(checked)
+    checked: list[NodeLight] = []
+    total: Any = 0
     power = 0.0
     for maps, case, weight, pupils in request.each():
-        for i, window in enumerate(_windows(case, choice, tolerance)):
-            plan: Any
-            if is_wide:
-                plan = plan_wide(window, tolerance, dtype)
-                light, nodes, powers = light_wide(maps, plan, pupils)
-            else:
-                smooth = pupils is not None
-                plan = plan_window(window, tolerance, dtype, smooth=smooth)
-                light, nodes, powers = light_windowed(maps, plan, pupils)
-            _check(maps, case, sum(powers), nodes)
-            at_um = plan.judged_um
-            mixing_at_nodes = None if pupils is None else pupils(*at_um)
-            rounding = plan.moments.carrier.rounding_rad
-            noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
-            noise *= _incoherent(_noisy_power(powers, mixing_at_nodes), case)
-            node_parts = 1 if is_wide else plan.layout.parts
-            checked[i].append(
-                NodeLight(
-                    window, weight, nodes, at_um, noise, node_parts, mixing_at_nodes
-                )
-            )
-            if weight != 1:
-                light = weight * light
-            parts[i] = light if isinstance(parts[i], int) else parts[i] + light
+        plan: Any
+        if is_wide:
+            plan = plan_wide(case, tolerance, dtype)
+            light, nodes, powers = light_wide(maps, plan, pupils)
+        else:
+            plan = plan_window(case, tolerance, dtype, smooth=pupils is not None)
+            light, nodes, powers = light_windowed(maps, plan, pupils)
+        _check(maps, case, sum(powers), nodes)
+        at_um = plan.judged_um
+        mixing_at_nodes = None if pupils is None else pupils(*at_um)
+        rounding = plan.moments.carrier.rounding_rad
+        noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
+        noise *= _incoherent(_noisy_power(powers, mixing_at_nodes), case)
+        parts = 1 if is_wide else plan.layout.parts
+        checked.append(
+            NodeLight(case, weight, nodes, at_um, noise, parts, mixing_at_nodes)
+        )
+        light = light if weight == 1 else weight * light
+        total = light if isinstance(total, int) else total + light
         power += weight * request.power(case, powers, maps[1])
-    light_of_parts = [part.detach().numpy() for part in parts]
-    rows = []
-    first = 0
-    for row in choice.tiles:
-        rows.append(_joined(parts[first : first + len(row)], -1))
-        first += len(row)
-    total = _joined(rows, -2)
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
         raise PropagationError(
             "no light reaches the window at some depth; move or widen the window"
         )
-    error = relative_error(checked, light_of_parts)
+    values = total.detach().numpy()
+    error = relative_error(checked, values)
     if is_wide:
         error = math.hypot(error, ROUNDING[dtype][1])
-    budget = _with_rays(error, request, checked, light_of_parts)
+    budget = Budget(error, polarisation=_mixing_error(request, checked, values))
     return IntensityResult(total, budget, choice.reason, np.full(len(total), power))
-
-
-def _joined(parts: list[torch.Tensor], axis: int) -> torch.Tensor:
-    """Parts concatenated along an axis; a single part is not copied."""
-    return parts[0] if len(parts) == 1 else torch.cat(parts, axis)
 
 
 def _noisy_power(powers: list[float], mixing: tuple[Array, Array] | None) -> float:
@@ -518,28 +488,6 @@ def _noisy_power(powers: list[float], mixing: tuple[Array, Array] | None) -> flo
     if mixing is None:
         return powers[0]
     return float((np.abs(mixing[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
-
-
-def _windows(
-    case: PropagationCase, choice: MethodChoice, tolerance: float
-) -> list[PropagationCase]:
-    """Parts of the window for one wavelength, as many as at the first wavelength.
-
-    Args:
-        case: of this wavelength.
-        choice: method and parts at the first wavelength.
-        tolerance: setting of the method.
-    """
-    if choice.method == "wide":
-        return [case]
-    tiles = choose_method(case, tolerance, differentiable=True).tiles
-    if [len(row) for row in tiles] != [len(row) for row in choice.tiles]:
-        tiles = choice.tiles
-    return [
-        replace(case, centre_um=part.centre_um, samples=part.samples)
-        for row in tiles
-        for part in row
-    ]
 
 
 def _check(maps: Maps, case: PropagationCase, power: float, nodes: Array) -> None:

@@ -12,12 +12,7 @@ from torch import Tensor
 
 from metalens.core.arrays import Array
 from metalens.optics import media
-from metalens.propagate import (
-    PropagationCase,
-    Pupils,
-    polarized_amplitudes,
-    ray_cosines,
-)
+from metalens.propagate import PropagationCase, Pupils, ray_cosines
 from metalens.psf.among import NeighbourJonesFactors
 
 # blocks of pillars along an axis, each with one cosine of its rays
@@ -176,9 +171,9 @@ def s_and_p(case: PropagationCase) -> Pupils:
     """
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
-        p = rays_to(case, (y_um, x_um), 1.0).numpy()  # n sin θ
-        both = np.stack(polarized_amplitudes(case, p[0] ** 2 + p[1] ** 2))
-        return np.ones(2), both[:, None] * math.sqrt(0.5)
+        p, q, _ = rays_to(case, (y_um, x_um), 1.0).numpy()  # n sin θ
+        powers = np.stack(media.passed_apart(case.media.order, p * p + q * q))
+        return np.ones(2), np.sqrt(powers / powers.sum(0))[:, None]
 
     return components
 
