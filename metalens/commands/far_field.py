@@ -147,7 +147,6 @@ def save_far_fields(
         "beams": np.array(beams, float).reshape(-1, 4),
         "beyond": np.array([field.beyond for field in fields]),
         "transmitted": np.array([field.transmitted for field in fields]),
-        "error": np.array([field.error for field in fields]),
     }
     about = {
         "wavelength_um": 1e-3 * request.wavelength_nm,
@@ -195,7 +194,6 @@ def far_field_values(
                 | {"angle_deg": beam.angle_deg, "azimuth_deg": beam.azimuth_deg}
                 for beam in field.beams
             ],
-            "error": field.error,
         }
         for (x, y), field in zip(request.angles_deg, far_fields, strict=True)
     ]

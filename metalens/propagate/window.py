@@ -154,13 +154,21 @@ def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
         case: geometry of the propagation.
         tolerance: relative error of the field.
     """
+    extremes = min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)
+    lines = functools.partial(
+        _needed_nodes,
+        functools.partial(rayleigh_sommerfeld_kernel, case),
+        {
+            "x": 0.9 * _around(0.0, case.half_size_um[1]),
+            "y": 0.9 * _around(0.0, case.half_size_um[0]),
+            "X": _around(0.0, case.half_window_um[1]),
+            "Y": _around(0.0, case.half_window_um[0]),
+            "inverse": np.array(extremes),
+        },
+        tolerance=tolerance,
+    )
     high_y, high_x = case.half_size_um
-    rows = _needed_nodes(
-        lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows"
-    )
-    return rows, _needed_nodes(
-        lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns"
-    )
+    return lines("y", (0.0, high_y)), lines("x", (0.0, high_x))
 
 
 def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
@@ -178,145 +186,79 @@ def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
     nodes = lens_nodes(case, quarter)
     row_nodes = legendre.mapped_nodes(nodes[0], -high_y, high_y)
     low, high = direction_range(case, row_nodes)
-    middle, half_range = (low + high) / 2, (high - low) / 2
-    directions = _needed_nodes(
-        lambda t: _over_directions(case, middle + half_range * t), quarter, "directions"
+    spans = {
+        "X": (0.0, case.half_window_um[1]),
+        "Y": (0.0, case.half_window_um[0]),
+        "p": ((low + high) / 2, (high - low) / 2),
+        "e": (0.0, high_y),
+    }
+    probes = {name: _around(*span) for name, span in spans.items()}
+
+    def kernel(p: Any, e: Any, X: Any, Y: Any) -> Array:
+        """From a lens row to a window point, along the direction cosine p."""
+        residual = plane_wave_residual(case, p, e, X, Y)
+        q = cosine_y(case, p, e)
+        return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
+
+    rows = probes | {"e": 0.9 * probes["e"]}
+    directions = _needed_nodes(kernel, rows, "p", spans["p"], tolerance=quarter)
+    # rounding leaves no smaller tails than 1e-13
+    edge_tolerance = max(quarter / EDGE, min(quarter, 1e-13))
+    residual = functools.partial(plane_wave_residual, case)
+    sizes = {
+        name: _needed_nodes(residual, probes, name, span, tolerance=edge_tolerance)
+        for name, span in spans.items()
+    }
+    return NodeCounts(
+        nodes, directions, (sizes["Y"], sizes["X"]), (sizes["e"], sizes["p"])
     )
-    wy, wx = case.half_window_um
-    edge_tolerance = max(
-        quarter / EDGE, min(quarter, 1e-13)
-    )  # rounding leaves no smaller tails
-    window_x = _needed_nodes(
-        lambda t: _over_window(case, (low, high), X=t * wx),
-        edge_tolerance,
-        "window columns",
-    )
-    window_y = _needed_nodes(
-        lambda t: _over_window(case, (low, high), Y=t * wy),
-        edge_tolerance,
-        "window rows",
-    )
-    lens_p = _needed_nodes(
-        lambda t: _over_window(case, (low, high), p=middle + half_range * t),
-        edge_tolerance,
-        "correction directions",
-    )
-    lens_e = _needed_nodes(
-        lambda t: _over_window(case, (low, high), e=t * high_y),
-        edge_tolerance,
-        "correction rows",
-    )
-    return NodeCounts(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
-def _needed_nodes(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
-    """Legendre nodes that interpolate a function on [-1, 1] to a relative tolerance.
+def _around(middle: float, half: float) -> Array:
+    """Positions along an axis at which a smooth function is sampled."""
+    return middle + half * probe_positions()
 
-    The number of trial nodes is doubled until it suffices.
+
+def _needed_nodes(
+    function: Callable[..., Array],
+    probes: dict[str, Array],
+    along: str,
+    span: tuple[float, float],
+    *,
+    tolerance: float,
+) -> int:
+    """Legendre nodes that interpolate a function along one variable.
+
+    The number of trial nodes is doubled until it suffices on every line through the
+    probes of the other variables.
 
     Args:
-        lines: (node,) positions to values (line, node).
+        function: of the named variables, which broadcast.
+        probes: values of every variable.
+        along: name of the variable.
+        span: its middle and half range.
         tolerance: relative error of the interpolation.
-        what: name of the axis, for the error.
 
     Raises:
         PropagationError: more than 400 nodes.
     """
+    others = [name for name in probes if name != along]
+    grid = np.meshgrid(*(probes[name] for name in others), indexing="ij")
+    at = {name: g.reshape(-1, 1) for name, g in zip(others, grid, strict=True)}
     count = 32
     while count <= 1.5 * MOST_NODES:
-        needed = legendre.needed_node_count(
-            lines(legendre.gauss_legendre_nodes(count)[0]), tolerance
-        )
+        line = span[0] + span[1] * legendre.gauss_legendre_nodes(count)[0]
+        values = function(**at, **{along: line})
+        needed = legendre.needed_node_count(values, tolerance)
         if needed <= min(count, MOST_NODES):
             return max(needed, 2)
         count *= 2
-    raise _too_large(f"more than {MOST_NODES} nodes ({what})")
+    raise _too_large(f"more than {MOST_NODES} nodes along {along}")
 
 
 def _too_large(need: str) -> PropagationError:
     return PropagationError(
         f"windowed propagation needs {need}; make the window smaller, or use propagate.exact"
-    )
-
-
-def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array:
-    """(line, node) kernel along lens columns (``x`` set) or lens rows (``y`` set).
-
-    The lines cover three positions across, window probes, and the two extreme depths.
-
-    Args:
-        case: geometry of the propagation.
-        x, y: (node,) positions on the lens, um; one of them None.
-    """
-    hy, hx = case.half_size_um
-    wy, wx = case.half_window_um
-    inverse = np.array(
-        [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
-    )
-    cross_probes = np.array([-0.9, 0.0, 0.9])
-    grid = np.meshgrid(
-        cross_probes,
-        probe_positions() * wx,
-        probe_positions() * wy,
-        inverse,
-        indexing="ij",
-    )
-    cross, X, Y, v = (g.reshape(-1, 1) for g in grid)
-    if x is None:
-        x = cross * hx
-    if y is None:
-        y = cross * hy
-    return rayleigh_sommerfeld_kernel(case, x, y, X, Y, v)
-
-
-def _over_directions(case: PropagationCase, p: Array) -> Array:
-    """(line, direction) kernel from a lens row to a window point, along the direction
-    cosine p.
-
-    The lines cover three lens rows and the window probes.
-    """
-    hy, _ = case.half_size_um
-    wy, wx = case.half_window_um
-    grid = np.meshgrid(
-        np.array([-0.9, 0.0, 0.9]) * hy,
-        probe_positions() * wx,
-        probe_positions() * wy,
-        indexing="ij",
-    )
-    e, X, Y = (g.reshape(-1, 1) for g in grid)
-    residual = plane_wave_residual(case, p, e, X, Y)
-    q = cosine_y(case, p, e)
-    return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
-
-
-def _over_window(
-    case: PropagationCase, span: tuple[float, float], **line: Array
-) -> Array:
-    """(line, node) residual of the plane waves along one of X, Y (window), p
-    (direction), e (lens row).
-
-    Args:
-        case: geometry of the propagation.
-        span: lowest and highest p.
-        line: (node,) values of the one variable; the others take a few probe values.
-    """
-    hy, _ = case.half_size_um
-    wy, wx = case.half_window_um
-    low, high = span
-    middle, half_range = (low + high) / 2, (high - low) / 2
-    probes = {
-        "X": probe_positions() * wx,
-        "Y": probe_positions() * wy,
-        "p": middle + half_range * probe_positions(),
-        "e": probe_positions() * hy,
-    }
-    names = [n for n in probes if n not in line]
-    grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
-    positions: dict[str, Any] = {
-        n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)
-    } | line
-    return plane_wave_residual(
-        case, positions["p"], positions["e"], positions["X"], positions["Y"]
     )
 
 
