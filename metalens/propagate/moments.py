@@ -738,38 +738,31 @@ def whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
     return reduced * number(PER_RAD)
 
 
-def reference_phase_at(table: Any, u: Any, j: Any, like: Any) -> Any:
-    """Carrier of column j at row position u of a block; compiled loops choose while
-    compiled.
-    """
-    return (_short if like.dtype == np.float32 else _long)(table, u, j, like)  # type: ignore[no-untyped-call]
+def _carrier_of_order(order: int) -> Callable[..., Any]:
+    """Carrier of column j at row position u of a block; the loop is unrolled."""
+
+    def carrier_at(table, u, j, like):  # type: ignore[no-untyped-def]
+        total = table[order - 1, j]
+        for n in range(order - 2, -1, -1):
+            total = table[n, j] + u * total
+        return total
+
+    return carrier_at
 
 
-def _short(table, u, j, like):  # type: ignore[no-untyped-def]
-    return table[0, j] + u * (
-        table[1, j] + u * (table[2, j] + u * (table[3, j] + u * table[4, j]))
-    )
+carrier_at: Any = _carrier_of_order(ORDER[8])
 
 
-def _long(table, u, j, like):  # type: ignore[no-untyped-def]
-    t = table[4, j] + u * (
-        table[5, j] + u * (table[6, j] + u * (table[7, j] + u * table[8, j]))
-    )
-    return table[0, j] + u * (
-        table[1, j] + u * (table[2, j] + u * (table[3, j] + u * t))
-    )
-
-
-@overload(reference_phase_at, inline="always")
-def _reference_phase_at(table, u, j, like):  # type: ignore[no-untyped-def]
-    return _short if like.dtype == numba.float32 else _long
+@overload(carrier_at, inline="always")
+def _carrier_at(table, u, j, like):  # type: ignore[no-untyped-def]
+    return _carrier_of_order(ORDER[like.dtype.bitwidth // 8])
 
 
 @numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)
 def _phasors(phase, table, u, re, im):  # type: ignore[no-untyped-def]
     """Cosine and sine of phase plus carrier along a row."""
     for j in range(phase.size):
-        t = whole_turns_off(phase[j], re) + reference_phase_at(table, u, j, re)
+        t = whole_turns_off(phase[j], re) + carrier_at(table, u, j, re)
         re[j], im[j] = sincos_turns(t - np.rint(t), re)
 
 
@@ -777,7 +770,7 @@ def _phasors(phase, table, u, re, im):  # type: ignore[no-untyped-def]
 def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
     """Transmission times the phasors exp(i (phase + carrier)) along a row."""
     for j in range(phase.size):
-        t = whole_turns_off(phase[j], re) + reference_phase_at(table, u, j, re)
+        t = whole_turns_off(phase[j], re) + carrier_at(table, u, j, re)
         c, s = sincos_turns(t - np.rint(t), re)
         re[j], im[j] = level[j] * c, level[j] * s
 
