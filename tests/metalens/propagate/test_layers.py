@@ -19,11 +19,7 @@ from metalens.cell import Film, Index
 from metalens.core.errors import PropagationError
 from metalens.optics import Layers, Media, media
 from metalens.propagate import PropagationCase
-from metalens.propagate.paths import (
-    chief_path,
-    from_source,
-    to_sensor,
-)
+from metalens.propagate.paths import chief_path, from_source, to_sensor
 from tests.referees import films as referee
 
 WAVELENGTH, PITCH, DISTANCE = 0.85, 0.35, 150.0
