@@ -1,24 +1,27 @@
-"""Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope
-and certified bounds, for NumPy arrays and torch tensors.
+"""Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope,
+inverse and certified bounds, for NumPy arrays and torch tensors.
 """
 
 import functools
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
+from metalens.core.executor import usable_cores
 
+Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
+Intervals = tuple[tuple[float, float], ...]
 CHUNK = 65536  # pillars per pass: its work arrays stay in the cache
 EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
-Monomials = tuple[float, ...]  # Python floats never raise the dtype of an array
+TABLE = 4096  # entries of the table from which Newton's steps start
+TURN = 2 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,7 @@ class ChebyshevCurve:
         ceiling: the exact polynomial stays below it; rounding above it is removed.
     """
 
-    monomials: Monomials
+    monomials: tuple[float, ...]
     low: float
     high: float
     power: int = 1
@@ -50,6 +53,12 @@ class ChebyshevCurve:
     def shift(self) -> float:
         """x at D = 0."""
         return -1 - self.scale * self.low**self.power
+
+    @property
+    def derivative(self) -> "ChebyshevCurve":
+        """dp / d(D^power), on the same domain."""
+        terms = (k * self.scale * c for k, c in enumerate(self.monomials))
+        return replace(self, monomials=(*terms, 0.0)[1:], ceiling=math.inf)
 
 
 def chebyshev_curve(
@@ -66,146 +75,62 @@ def chebyshev_curve(
         power: of the diameter, see :class:`ChebyshevCurve`.
         ceiling: upper limit of the values.
     """
-    monomials = _to_monomials(tuple(coefficients.tolist()))
+    monomials = tuple(chebyshev.cheb2poly(coefficients).tolist())
     return ChebyshevCurve(monomials, *domain, power, ceiling)
 
 
-@functools.lru_cache(maxsize=256)
-def _to_monomials(coefficients: tuple[float, ...]) -> Monomials:
-    """Coefficients of 1, x, x², … of a Chebyshev sum."""
-    return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
+def is_tensor(values: object) -> bool:
+    """Whether ``values`` is a torch tensor; torch is not loaded."""
+    return type(values).__module__.partition(".")[0] == "torch"
 
 
-def _derivative(p: ChebyshevCurve, monomials: Monomials) -> Monomials:
-    """Monomials in x of (dq/dD) / D^(power - 1), by dx/dD = scale power D^(power - 1).
-
-    Args:
-        p: curve that maps D to x.
-        monomials: of q.
-    """
-    inner = p.scale * p.power
-    return tuple(k * inner * c for k, c in enumerate(monomials))[1:] or (0.0,)
+def _to_floats(values: Any) -> Array:
+    """Values as an array of floats; single precision is kept."""
+    array = np.asarray(values)
+    return array if array.dtype.kind == "f" else array.astype(float)
 
 
-def evaluate_curve(p: ChebyshevCurve, diameter: Any) -> Any:
+def evaluate_curve(p: ChebyshevCurve, diameter: Values) -> Values:
     """p(D) by Horner's rule, in the shape, dtype and on the device of ``diameter``.
 
     Args:
         p: the curve.
-        diameter: NumPy array or torch tensor, um; tensors carry derivatives of every
-            order by backward, forward and vmap, and keep only x for them.
+        diameter: number, NumPy array or torch tensor, um; tensors carry derivatives of
+            every order by backward, forward and vmap, and are all that is kept for
+            them.
 
     Accuracy: a few roundings of the dtype times the sum of |monomials|.
 
     Raises:
         DomainError: a diameter lies outside the domain, or is not a number.
     """
-    value = _evaluate_term(p, p.monomials, 0, diameter)
-    return value.clip(max=p.ceiling) if math.isfinite(p.ceiling) else value
+    if is_tensor(diameter):
+        return cast(Values, _torch_curve()(diameter, p))
+    d = _to_floats(diameter)
+    check_domain(p, d)
+    return cast(Values, _over_chunks(functools.partial(_sum_powers, p), d)[()])
 
 
 def evaluate_slope(p: ChebyshevCurve, diameter: Any) -> Any:
     """dp/dD at ``diameter`` (um); otherwise as :func:`evaluate_curve` of ``p``."""
-    slope = _derivative(p, p.monomials)
-    return _evaluate_term(p, slope, p.power - 1, diameter)
+    by_power = evaluate_curve(p.derivative, diameter)
+    return by_power * p.power * diameter ** (p.power - 1)
 
 
-def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
-    """dp/dD at ``diameter`` (um), without a check of the domain of ``p``."""
-    slope = _derivative(p, p.monomials)
-    return np.asarray(_term(p, slope, p.power - 1, diameter))
-
-
-def to_unit_interval(p: ChebyshevCurve, diameter: Any) -> Any:
-    """x of ``diameter`` (um) on the curve ``p``: scale diameter^power + shift."""
-    x = diameter * p.scale
+def _sum_powers(p: ChebyshevCurve, d: Any) -> Any:
+    """p(D) in the dtype of ``d``, NumPy or torch, without a check of the domain."""
+    x = d * p.scale
     for _ in range(p.power - 1):
-        x *= diameter
+        x *= d
     x += p.shift
-    return x
-
-
-def evaluate_horner(monomials: Monomials, x: Any) -> Any:
-    """Sum of monomials[k] x^k in the dtype of ``x``, NumPy or torch."""
-    total = x * 0 + monomials[-1]
-    for c in monomials[-2::-1]:
+    total = x * 0 + p.monomials[-1]
+    for c in p.monomials[-2::-1]:
         total *= x
         total += c
-    return total
+    return total.clip(max=p.ceiling) if math.isfinite(p.ceiling) else total
 
 
-def _term(p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any) -> Any:
-    """D^exponent q(x(D)), NumPy or torch.
-
-    Args:
-        p: curve that maps D to x.
-        monomials: of q.
-        exponent: of D.
-        diameter: D, um.
-    """
-    total = evaluate_horner(monomials, to_unit_interval(p, diameter))
-    for _ in range(exponent):
-        total *= diameter
-    return total
-
-
-def _evaluate_term(
-    p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any
-) -> Any:
-    """:func:`_term` inside the domain, differentiable where ``diameter`` is a tensor."""
-    if not isinstance(diameter, np.ndarray):
-        return _torch_term()(diameter, p, monomials, exponent)
-    check_domain(p, diameter)
-    return over_chunks(functools.partial(_term, p, monomials, exponent), diameter)
-
-
-@functools.cache
-def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
-    """:func:`_term` as a torch function that saves only its input for derivatives.
-
-    Terms are closed under differentiation: with a = dx/d(D^m) and m = power, d/dD [D^k
-    q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
-    """
-    import torch
-
-    class Term(torch.autograd.Function):
-        @staticmethod
-        def forward(diameter: Any, p: Any, monomials: Any, exponent: Any) -> Any:
-            if diameter.device.type == "cpu":
-                values = diameter.detach().numpy()
-                value = _evaluate_term(p, monomials, exponent, values)
-                return torch.from_numpy(value)
-            check_domain(p, diameter)
-            return _term(p, monomials, exponent, diameter)
-
-        @staticmethod
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            diameter, *ctx.term = inputs
-            ctx.save_for_backward(diameter)
-            ctx.save_for_forward(diameter)
-
-        @staticmethod
-        def backward(ctx: Any, *gradients: Any) -> Any:
-            return gradients[0] * term_slope(ctx), None, None, None
-
-        @staticmethod
-        def jvp(ctx: Any, *tangents: Any) -> Any:
-            return tangents[0] * term_slope(ctx)
-
-        @staticmethod
-        def vmap(info: Any, dims: Any, diameter: Any, *term: Any) -> Any:
-            return apply(diameter, *term), dims[0]
-
-    def term_slope(ctx: Any) -> Any:
-        (diameter,), (p, q, k) = ctx.saved_tensors, ctx.term
-        value = apply(diameter, p, _derivative(p, q), k + p.power - 1)
-        return value + k * apply(diameter, p, q, k - 1) if k else value
-
-    apply: Callable[..., Any] = Term.apply
-    return apply
-
-
-def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
+def _over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
     """Elementwise ``work`` on an array, in cache-sized chunks on all cores that the
     process may use.
 
@@ -221,11 +146,47 @@ def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
     def fill(start: int) -> None:
         out[start : start + CHUNK] = work(flat[start : start + CHUNK])
 
-    with ThreadPoolExecutor(
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    ) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         list(pool.map(fill, range(0, flat.size, CHUNK)))
     return out.reshape(values.shape)
+
+
+@functools.cache
+def _torch_curve() -> Callable[[Any, ChebyshevCurve], Any]:
+    """:func:`evaluate_curve` as a torch function that saves only its input for
+    derivatives.
+    """
+    import torch
+
+    class Curve(torch.autograd.Function):
+        @staticmethod
+        def forward(diameter: Any, p: ChebyshevCurve) -> Any:
+            if diameter.device.type == "cpu":
+                value = np.asarray(evaluate_curve(p, diameter.detach().numpy()))
+                return torch.from_numpy(value)
+            check_domain(p, diameter)
+            return _sum_powers(p, diameter)
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            diameter, ctx.curve = inputs
+            ctx.save_for_backward(diameter)
+            ctx.save_for_forward(diameter)
+
+        @staticmethod
+        def backward(ctx: Any, *gradients: Any) -> Any:
+            return gradients[0] * evaluate_slope(ctx.curve, *ctx.saved_tensors), None
+
+        @staticmethod
+        def jvp(ctx: Any, *tangents: Any) -> Any:
+            return tangents[0] * evaluate_slope(ctx.curve, *ctx.saved_tensors)
+
+        @staticmethod
+        def vmap(info: Any, dims: Any, diameter: Any, p: ChebyshevCurve) -> Any:
+            return Curve.apply(diameter, p), dims[0]
+
+    apply: Callable[[Any, ChebyshevCurve], Any] = Curve.apply
+    return apply
 
 
 def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
@@ -252,15 +213,15 @@ def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
     """Whether ``p`` rises or falls throughout ``within`` (um): its slope has no root
     inside, by the roots of the polynomial, not by sampling.
     """
-    low, high = to_unit_interval(p, np.array(within, float))
-    slope = _derivative(p, p.monomials)
-    roots = np.polynomial.Polynomial(slope).roots() if len(slope) > 1 else np.empty(0)
+    low, high = p.scale * np.array(within, float) ** p.power + p.shift
+    slope = np.polynomial.Polynomial(p.derivative.monomials)
+    roots = slope.trim().roots()
     inside = (
         (np.abs(roots.imag) < 1e-9)
         & (roots.real > low + 1e-9)
         & (roots.real < high - 1e-9)
     )
-    return bool(np.any(slope) and not inside.any())
+    return bool(np.any(slope.coef) and not inside.any())
 
 
 def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, float]:
@@ -289,3 +250,121 @@ def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, f
     middle = (values.max() + values.min()) / 2
     half = (values.max() - values.min()) / 2
     return float(middle - half * slack), float(middle + half * slack)
+
+
+def invert_phase(
+    p: ChebyshevCurve,
+    phase_rad: Values,
+    *,
+    within_um: tuple[float, float] | None,
+    gap: str,
+    excluded_um: Intervals = (),
+) -> Values:
+    """Diameters in um whose phase on a curve is ``phase_rad`` modulo 2 pi; see
+    :meth:`metalens.library.Proxy.diameter_um`.
+
+    A tensor takes one more Newton step on the detached answer, whose derivative is
+    exactly 1 / (dphase/dD).
+
+    Args:
+        p: phase over the diameter.
+        phase_rad: (*shape) phases, rad.
+        within_um: (least, largest) diameter that is considered, um; the whole domain
+            without it.
+        gap: refuse or nearest, for phases that no pillar has.
+        excluded_um: (least, largest) of intervals of diameters; one inside is moved to
+            the closer end.
+
+    Raises:
+        DomainError: the phase is not monotone there, or no pillar has a phase.
+    """
+    if is_tensor(phase_rad):
+        import torch
+
+        phase: Any = phase_rad
+        diameter = invert_phase(
+            p,
+            phase.detach().cpu().numpy(),
+            within_um=within_um,
+            gap=gap,
+            excluded_um=excluded_um,
+        )
+        slope = torch.from_numpy(evaluate_slope(p, diameter)).to(phase.device)
+        step = (phase - phase.detach()) / slope
+        return cast(Values, torch.from_numpy(diameter).to(phase.device) + step)
+    low, high = within = within_um or (p.low, p.high)
+    if not p.low - 1e-9 <= low < high <= p.high + 1e-9:
+        raise DomainError(
+            f"within_um = ({low}, {high}), need a range inside the curve's domain ({p.low}, {p.high}) um"
+        )
+    if not is_monotonic(p, within):
+        raise DomainError(
+            f"the phase is not monotone between {low} and {high} um: no unique diameter; give a narrower within_um"
+        )
+    values = _to_floats(phase_rad)
+    if not np.isfinite(values).all():
+        raise DomainError(
+            f"phase at index {_first(~np.isfinite(values))} is not finite"
+        )
+    # the table of the inverse, from the end of least phase
+    d = np.linspace(low, high, 16 * TABLE)
+    phases = evaluate_curve(p, d)
+    if phases[-1] < phases[0]:
+        d, phases = d[::-1], phases[::-1]
+    start, cover = float(phases[0]), float(phases[-1] - phases[0])
+    if gap == "refuse" and cover < TURN:
+        missing = (values.astype(float) - start) % TURN > cover + 1e-6
+        if missing.any():
+            raise DomainError(
+                f"no pillar between {low:.4g} and {high:.4g} um has the phase at index {_first(missing)}: "
+                f"they cover {cover / TURN:.3f} of a turn ({int(missing.sum())} sites); "
+                "widen the diameters, change the cell, or take the nearest with gap='nearest'"
+            )
+    table = np.interp(np.linspace(start, start + cover, TABLE), phases, d)
+
+    def invert(chunk: Array) -> Array:
+        target = (chunk.astype(float) - start) % TURN
+        beyond = target > cover
+        nearest = target - cover <= TURN - target
+        target[beyond] = np.where(nearest[beyond], cover, 0.0)
+        found = _newton(p, start + target, target * ((TABLE - 1) / cover), table)
+        for least, most in excluded_um:
+            # an end outside the considered range is no place to move to
+            middle = np.inf if most > high else (least + most) / 2
+            middle = -np.inf if least < low else middle
+            inside = (found > least) & (found < most)
+            found[inside] = np.where(found[inside] < middle, least, most)
+        return found.astype(chunk.dtype)
+
+    return cast(Values, _over_chunks(invert, values)[()])
+
+
+def _newton(p: ChebyshevCurve, phase: Array, place: Array, table: Array) -> Array:
+    """Diameters of phases, by linear interpolation in a table and Newton's steps, d -=
+    (p(d) - phase) / slope(d).
+
+    Convergence is quadratic, and one step is the rule. It is linear (by halves) where
+    the slope vanishes at the root; a diameter of zero slope stays.
+
+    Args:
+        p: monotone phase over the diameter.
+        phase: (n,) rad.
+        place: (n,) place in the table.
+        table: (TABLE,) diameters at even steps of the phase, um.
+    """
+    index = np.minimum(place.astype(np.int64), TABLE - 2)
+    d = table[index] + (place - index) * np.diff(table)[index]
+    for _ in range(54):  # a double has 53 bits
+        error = _sum_powers(p, d) - phase
+        # below the documented 1e-10 rad, above the rounding of 100 rad
+        if np.abs(error).max(initial=0.0) < 1e-12:
+            break
+        slope = _sum_powers(p.derivative, d) * p.power * d ** (p.power - 1)
+        d -= np.divide(error, slope, out=np.zeros_like(d), where=slope != 0)
+        np.clip(d, table.min(), table.max(), out=d)
+    return d
+
+
+def _first(mask: Array) -> tuple[int, ...]:
+    """Index of the first True value."""
+    return tuple(int(i) for i in np.argwhere(mask)[0])

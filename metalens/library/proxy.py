@@ -3,17 +3,16 @@ transmission (paper Eq. 2).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
-from metalens.library import inverse, polynomial
-from metalens.library.inverse import Values, is_tensor
+from metalens.library import polynomial
+from metalens.library.polynomial import Values
 
 # largest error of t: the tolerance of a library, and for the pillars of a lens the
 # root mean square of their error bars over |t|
@@ -101,28 +100,28 @@ class Proxy:
                 proxy's domain.
         """
         curve = self.at(wavelength_um, angle_rad)
-        return _evaluate(polynomial.evaluate_curve, curve, diameter_um)
+        return polynomial.evaluate_curve(curve, diameter_um)
 
     def transmission(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Magnitude |T| in [0, 1]; otherwise as :meth:`phase_rad`."""
         curve = self.level_at(wavelength_um, angle_rad)
-        return _evaluate(polynomial.evaluate_curve, curve, diameter_um)
+        return polynomial.evaluate_curve(curve, diameter_um)
 
     def dphase_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of the phase, rad/um; otherwise as :meth:`phase_rad`."""
         curve = self.at(wavelength_um, angle_rad)
-        return _evaluate(polynomial.evaluate_slope, curve, diameter_um)
+        return polynomial.evaluate_slope(curve, diameter_um)
 
     def dtransmission_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of |T|, 1/um; otherwise as :meth:`phase_rad`."""
         curve = self._curve(self.transmission_coefficients, wavelength_um, angle_rad)
-        return _evaluate(polynomial.evaluate_slope, curve, diameter_um)
+        return polynomial.evaluate_slope(curve, diameter_um)
 
     def diameter_um(
         self,
@@ -153,7 +152,7 @@ class Proxy:
             DomainError: the phase is not monotone within ``within_um``, or no pillar
                 has a phase.
         """
-        return inverse.invert_phase(
+        return polynomial.invert_phase(
             self.at(wavelength_um, angle_rad),
             phase_rad,
             within_um=within_um,
@@ -288,22 +287,3 @@ class Proxy:
         return min(
             1.0, 2 * (math.sin(angle_rad) / math.sin(self.max_angle_rad)) ** 2 - 1
         )
-
-
-def _evaluate(
-    evaluator: Callable[[polynomial.ChebyshevCurve, Any], Any],
-    curve: polynomial.ChebyshevCurve,
-    diameter_um: Values,
-) -> Values:
-    """Values of a curve at diameters in um, in their type: array, tensor or number.
-
-    Args:
-        evaluator: :func:`polynomial.evaluate_curve` or its slope.
-        curve: of the diameter.
-        diameter_um: array, tensor or number.
-    """
-    if is_tensor(diameter_um):
-        return cast(Values, evaluator(curve, diameter_um))
-    array = np.asarray(diameter_um)
-    array = array if array.dtype.kind == "f" else array.astype(float)
-    return cast(Values, evaluator(curve, array)[()])
