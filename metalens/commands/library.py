@@ -288,9 +288,6 @@ def _values(
             "max_transmission_error": proxy.max_transmission_error,
             "entry_error": proxy.entry_error,
             "polarization_spread": fitted.polarization_spread,
-            "error_against_coefficients": [
-                dataclasses.asdict(trial) for trial in fitted.table
-            ],
         }
     return values
 

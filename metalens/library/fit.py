@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -72,29 +73,14 @@ class ProxyTolerances:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class FitTrial:
-    """Errors of a proxy with a given number of coefficients, for the table of a fit.
-
-    coefficients: of phase and |T| together.
-    power: the polynomials run in diameter^power.
-    phase_error_rad, transmission_error: largest deviation from the entries.
-    """
-
-    coefficients: int
-    power: int
-    phase_error_rad: float
-    transmission_error: float
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class ProxyFit:
     """A proxy with the limits of its domain and its errors.
 
     proxy: the polynomials.
     notes: where the domain was cut, and the reasons.
-    table: error against the number of coefficients on that domain.
-    turns: phase range of the domain, the least over wavelengths and angles.
+    turns: phase range of the domain, the least over wavelengths and angles; nan for
+        circular light, whose phase is the turn of the pillars.
     polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy describes
         their mean.
     shortfall: message on tolerances that the proxy misses; empty where it meets them.
@@ -104,7 +90,6 @@ class ProxyFit:
 
     proxy: Proxy
     notes: tuple[str, ...]
-    table: tuple[FitTrial, ...]
     turns: float
     polarization_spread: float
     shortfall: str
@@ -113,7 +98,7 @@ class ProxyFit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MonotonicBranch:
-    """Consecutive diameters without resonance.
+    """Consecutive diameters without resonance that a proxy may follow.
 
     phase: (angle, wavelength, diameter) rad, unwrapped along every axis.
     level: |t|, as phase.
@@ -122,6 +107,9 @@ class MonotonicBranch:
     polarization_spread: largest |t_s - t_p| / 2; phase and level are of their mean.
     gaps_um: (least, largest) diameters around narrow resonances inside the branch,
         which no pillar of a lens should have.
+    middle: index of the diameter around which a domain lies; 0 for domains from the
+        least diameter on.
+    monotonic: whether the phase rises or falls throughout.
     """
 
     phase: Array
@@ -132,21 +120,27 @@ class MonotonicBranch:
     notes: tuple[str, ...] = ()
     polarization_spread: float = 0.0
     gaps_um: tuple[tuple[float, float], ...] = ()
+    middle: int = 0
+    monotonic: bool = True
 
-    def part(self, some: slice) -> "MonotonicBranch":
-        """The branch restricted to a slice of its diameters."""
+    def within(self, reach: int) -> "MonotonicBranch":
+        """The branch restricted to ``reach`` diameters on either side of its middle."""
+        some = slice(max(0, self.middle - reach), self.middle + reach + 1)
         return dataclasses.replace(
             self,
             phase=self.phase[..., some],
             level=self.level[..., some],
             diameter_um=self.diameter_um[some],
+            middle=min(self.middle, reach),
         )
 
     @property
     def turns(self) -> float:
         """Phase range over the diameters in turns, the least over wavelengths and
-        angles.
+        angles; nan where the phase may turn back.
         """
+        if not self.monotonic:
+            return math.nan
         return float(abs(self.phase[..., -1] - self.phase[..., 0]).min() / TURN)
 
 
@@ -158,10 +152,7 @@ def longest_monotonic_branch(
 ) -> MonotonicBranch:
     """The run of diameters that covers most phase without a fault.
 
-    A fault is, at any wavelength, angle or polarisation: |t| below
-    ``least_transmission``, an error bar above half of |t|, a resonance narrower than
-    ``least_half_width_um``, or a phase that falls with the diameter. For openings,
-    which leave less film the wider they are, it is a phase that rises.
+    Faults are those of :func:`find_faults`.
 
     Args:
         library: the swept cell.
@@ -172,28 +163,25 @@ def longest_monotonic_branch(
     Raises:
         DomainError: no such run holds 12 entries; the message states the faults.
     """
-    low, high = tolerances.within_um or (0.0, np.inf)
     d = library.diameter_um
-    inside = (d >= low - 1e-9) & (d <= high + 1e-9)
-    narrow = [
-        (angle, wavelength, centre, width)
-        for _, angle, wavelength, centre, width in library.resonances.tolist()
-        if width < tolerances.least_half_width_um
-        and inside.any()
-        and d[inside][0] <= centre <= d[inside][-1]
-    ]
+    inside, narrow = _usable(library, tolerances)
     gaps = _gaps(narrow, tolerances.least_half_width_um) if across_resonances else ()
     for start, end in gaps:
         inside &= (d < start) | (d > end)
     d = d[inside]
     t = library.t[..., inside]
-    bars = library.t_error[..., inside]
-    faults = _faults(library, d, t, bars, tolerances.least_transmission)
-    faults += [] if gaps else [_near_resonance(d, *resonance) for resonance in narrow]
-    faulty = np.any([mask for mask, _ in faults], axis=0)
+    faults = find_faults(
+        d,
+        t,
+        library.t_error[..., inside],
+        least_transmission=tolerances.least_transmission,
+        hole=library.cell.shape.hole,
+        resonances=() if gaps else narrow,
+    )
+    faulty = np.any([fault.mask for fault in faults], axis=0)
     runs = [run for run in find_runs(~faulty) if run.stop - run.start >= LEAST_ENTRIES]
     if not runs:
-        reasons = "; ".join(text for mask, text in faults if mask.any())
+        reasons = "; ".join(fault.text for fault in faults if fault.mask.any())
         raise DomainError(
             f"no {LEAST_ENTRIES} diameters in a row are free of resonances ({reasons}): choose another pitch, height "
             "or material, fewer wavelengths or angles, or sweep with more samples"
@@ -221,18 +209,34 @@ def longest_monotonic_branch(
     )
 
 
+def _usable(
+    library: PillarLibrary, tolerances: ProxyTolerances
+) -> tuple[Array, list[list[float]]]:
+    """(mask of the diameters to consider, narrow resonances among them)."""
+    low, high = tolerances.within_um or (0.0, np.inf)
+    d = library.diameter_um
+    inside = (d >= low - 1e-9) & (d <= high + 1e-9)
+    low, high = d[inside][[0, -1]] if inside.any() else (np.inf, -np.inf)
+    narrow = [
+        [centre, width, wavelength, angle]
+        for _, angle, wavelength, centre, width in library.resonances.tolist()
+        if width < tolerances.least_half_width_um and low <= centre <= high
+    ]
+    return inside, narrow
+
+
 def _gaps(
-    narrow: Sequence[tuple[float, ...]], half_width: float
+    narrow: Sequence[Sequence[float]], half_width: float
 ) -> tuple[tuple[float, float], ...]:
     """(least, largest) diameters excluded around narrow resonances, um; overlapping
     intervals are merged.
 
     Args:
-        narrow: (angle, wavelength, centre, half-width) of each resonance, rad and um.
+        narrow: (centre, half-width, …) of each resonance, um.
         half_width: least half-width of an interval, um.
     """
     gaps: list[tuple[float, float]] = []
-    for _, _, centre, width in sorted(narrow, key=lambda resonance: resonance[2]):
+    for centre, width, *_ in sorted(narrow):
         reach = max(half_width, REACH * width)
         low, high = centre - reach, centre + reach
         if gaps and low <= gaps[-1][1]:
@@ -241,49 +245,72 @@ def _gaps(
     return tuple(gaps)
 
 
-def _faults(
-    library: PillarLibrary, d: Array, t: Array, bars: Array, least: float
-) -> list[tuple[Array, str]]:
-    """(mask, reason) of each kind of fault over the diameters.
+class Fault(NamedTuple):
+    """Diameters that no lens should have: (n,) mask, reason, and its numbers."""
+
+    mask: Array
+    reason: str
+    detail: str
+
+    @property
+    def text(self) -> str:
+        """The reason with its numbers."""
+        return self.reason + self.detail
+
+
+def find_faults(
+    d: Array,
+    t: Array,
+    bars: Array,
+    *,
+    least_transmission: float,
+    hole: bool,
+    resonances: Sequence[Sequence[float]],
+) -> list[Fault]:
+    """Faults of pillars over the diameter, at any wavelength, angle or polarisation.
+
+    They are: |t| below a limit; a phase that falls with the diameter (for openings,
+    which leave less film the wider they are, one that rises); an error bar above half
+    of |t|; and narrow resonances, with the entries next to them on either side.
 
     Args:
-        d: (n,) diameters, um.
-        t: (polarization, angle, wavelength, n) complex amplitudes.
-        bars: error bars, as t.
-        least: smallest |t| that is accepted.
+        d: (n,) rising diameters, um.
+        t: (…, n) complex amplitudes.
+        bars: (…, n) error bars of t.
+        least_transmission: smallest |t| that is accepted.
+        hole: whether the diameters are of openings.
+        resonances: (diameter, half-width, wavelength, angle in rad) of narrow ones, um.
     """
+    t, bars = t.reshape(-1, len(d)), bars.reshape(-1, len(d))
     level = np.abs(t)
-    phase = np.unwrap(np.angle(t), axis=-1)
-    hole = library.cell.shape.hole
-    too_weak = np.asarray((level < least).any(axis=(0, 1, 2)))
-    uncertain = np.asarray((bars > UNKNOWN * level).any(axis=(0, 1, 2)))
-    reversal = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
-    reversed_phase = np.zeros(len(d), bool)
-    reversed_phase[1:] |= reversal
-    reversed_phase[:-1] |= reversal
-    reversal_reason = (
-        "the phase rises with the size of the opening"
-        if hole
-        else "the phase falls with the diameter"
-    )
-    return [
-        (too_weak, f"|t| falls to {level.min():.2f}, below {least:g}"),
-        (uncertain, f"error bars reach {bars.max():.2g}, above half of |t|"),
-        (reversed_phase, reversal_reason),
+    weak = (level < least_transmission).any(axis=0)
+    step = np.diff(np.unwrap(np.angle(t), axis=-1), axis=-1) * (-1 if hole else 1)
+    reversal = np.pad((step < 0).any(axis=0), 1)
+    faults = [
+        Fault(
+            weak, "|t| falls", f" to {level.min():.2f}, below {least_transmission:g}"
+        ),
+        Fault(
+            reversal[1:] | reversal[:-1],
+            "the phase rises" if hole else "the phase falls",
+            " with the size of the opening" if hole else " with the diameter",
+        ),
+        Fault(
+            (bars > UNKNOWN * level).any(axis=0),
+            "an error bar above half of |t|",
+            f" ({bars.max():.2g})",
+        ),
     ]
-
-
-def _near_resonance(
-    d: Array, angle: float, wavelength: float, centre: float, width: float
-) -> tuple[Array, str]:
-    """(mask, reason) of one narrow resonance: diameters within two half-widths, and the
-    entries next to it on either side.
-    """
-    mask = np.abs(d - centre) <= REACH * width
-    next_entry = int(np.searchsorted(d, centre))
-    mask[[max(0, next_entry - 1), next_entry]] = True
-    text = f"resonance at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({wavelength:g} um"
-    return mask, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")
+    for centre, width, wavelength, angle in resonances:
+        near = np.abs(d - centre) <= REACH * width
+        above = int(np.searchsorted(d, centre))  # first entry not below the resonance
+        near[max(0, above - 1) : above + 1] = True
+        light = f"{wavelength:g} um" + (
+            f", {np.degrees(angle):.3g} deg" if angle else ""
+        )
+        place = f" at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({light})"
+        faults.append(Fault(near, "a narrow resonance", place))
+    return faults
 
 
 def find_runs(good: Array) -> list[slice]:
@@ -292,18 +319,18 @@ def find_runs(good: Array) -> list[slice]:
     return [slice(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def _ends(run: slice, d: Array, faults: list[tuple[Array, str]]) -> tuple[str, ...]:
+def _ends(run: slice, d: Array, faults: list[Fault]) -> tuple[str, ...]:
     """What bounds a run on either side, in words.
 
     Args:
         run: places of its diameters.
         d: (n,) all diameters, um.
-        faults: (mask, reason) over d.
+        faults: of the diameters.
     """
     notes = []
     for outside, edge in ((run.start - 1, run.start), (run.stop, run.stop - 1)):
         if 0 <= outside < len(d):
-            reasons = "; ".join(text for mask, text in faults if mask[outside])
+            reasons = "; ".join(fault.text for fault in faults if fault.mask[outside])
             notes.append(f"cut at {d[edge]:.4f} um: {reasons}")
     return tuple(notes)
 
@@ -334,13 +361,15 @@ def fit(library: PillarLibrary, tolerances: ProxyTolerances | None = None) -> Pr
     Raises:
         DomainError: no run of diameters without resonance holds enough entries.
     """
-    tolerances = tolerances or ProxyTolerances()
+    limits = tolerances or ProxyTolerances()
     if library.sweep.light == "circular":
-        return _fit_converted(library, tolerances)
-    one_side = _fit_branch(library, tolerances, across_resonances=False)
-    if any(width < tolerances.least_half_width_um for *_, width in library.resonances):
+        return _fit_branch(library, limits, _converted_branch(library, limits))
+    branch = longest_monotonic_branch(library, limits)
+    one_side = _fit_branch(library, limits, branch)
+    if any(width < limits.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
-            crossing = _fit_branch(library, tolerances, across_resonances=True)
+            branch = longest_monotonic_branch(library, limits, across_resonances=True)
+            crossing = _fit_branch(library, limits, branch)
             crosses = bool(crossing.proxy.gaps_um) and not crossing.shortfall
             if crosses and crossing.turns > one_side.turns:
                 return crossing
@@ -348,17 +377,15 @@ def fit(library: PillarLibrary, tolerances: ProxyTolerances | None = None) -> Pr
 
 
 def _fit_branch(
-    library: PillarLibrary, limits: ProxyTolerances, *, across_resonances: bool
+    library: PillarLibrary, limits: ProxyTolerances, branch: MonotonicBranch
 ) -> ProxyFit:
-    """Proxy of the longest monotonic branch, and its table of error against
-    coefficients.
+    """Proxy of the longest domain of a branch.
 
     Args:
-        across_resonances: whether the branch may cross narrow resonances.
+        library: the swept cell.
+        limits: tolerances and limits of the fit.
+        branch: of the library.
     """
-    branch = longest_monotonic_branch(
-        library, limits, across_resonances=across_resonances
-    )
     limits = limits.with_defaults(entry_error(library, branch.diameter_um))
     domain, proxy, terms = _choose_coefficients(branch, limits)
     low, high = proxy.domain_um
@@ -367,32 +394,16 @@ def _fit_branch(
         entry_error=entry_error(library, domain.diameter_um),
         gaps_um=tuple((a, b) for a, b in branch.gaps_um if low < a and b < high),
     )
-    coefficient_counts = range(4, max(18, 2 * terms + 5), 2)
-    trials = (
-        _trial(domain, proxy.power, count)
-        for count in coefficient_counts
-        if count // 2 < len(domain.diameter_um) // 3
-    )
     notes = branch.notes
-    if len(domain.diameter_um) < len(branch.diameter_um):
+    if branch.monotonic and len(domain.diameter_um) < len(branch.diameter_um):
         notes += (
             f"cut at {domain.diameter_um[-1]:.4f} um: up to {branch.diameter_um[-1]:.4f} um the phase is smooth, but "
             f"{2 * terms} coefficients do not describe it within the tolerances",
         )
-    shortfall = (
-        TURNS_BACK
-        if math.isinf(_cost(proxy, limits))
-        else tolerance_shortfall(proxy, limits)
-    )
-    return ProxyFit(
-        proxy,
-        notes,
-        tuple(trial for trial in trials if trial is not None),
-        domain.turns,
-        branch.polarization_spread,
-        shortfall,
-        branch.turns,
-    )
+    turns_back = branch.monotonic and not _is_monotone(proxy)
+    shortfall = TURNS_BACK if turns_back else tolerance_shortfall(proxy, limits)
+    spread = branch.polarization_spread
+    return ProxyFit(proxy, notes, domain.turns, spread, shortfall, branch.turns)
 
 
 def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
@@ -415,47 +426,34 @@ def _choose_coefficients(
     coefficients for phase and for |T| each.
 
     Starts from half of ``limits.coefficients``. Takes more where a full turn needs
-    them, fewer where the polynomial oscillates between too few entries. Cuts the last
-    diameters where the tolerances are still missed.
+    them, fewer where the polynomial oscillates between too few entries. Where the
+    tolerances are still missed, cuts the last diameters, next to the fault that ends
+    the branch: at most a tenth of the phase, and none where that is not enough.
     """
     terms = more = min(max(2, limits.coefficients // 2), len(branch.diameter_um) // 3)
-    domain, proxy = _longest_domain(branch, limits, terms)
+    cost, domain, proxy = _longest_domain(branch, limits, terms)
     while more < 24 and domain.turns < 1 <= branch.turns:
         more += 2
         # so many coefficients may take |T| below 0: then the last result stands
         with contextlib.suppress(DomainError):
-            longer_domain, longer_proxy = _longest_domain(branch, limits, more)
-            is_longer = len(longer_domain.diameter_um) > len(domain.diameter_um)
-            if _cost(longer_proxy, limits) <= 1 and is_longer:
-                domain, proxy, terms = longer_domain, longer_proxy, more
-    if _cost(proxy, limits) <= 1:
+            longer = _longest_domain(branch, limits, more)
+            gain = len(longer[1].diameter_um) - len(domain.diameter_um)
+            if longer[0] <= 1 and gain > 0:
+                (cost, domain, proxy), terms = longer, more
+    if cost <= 1 or not branch.monotonic:
         return domain, proxy, terms
     for fewer in range(terms - 1, 1, -1):
-        candidate = _best_power(domain, limits, fewer)
-        if candidate is not None and _cost(candidate, limits) < _cost(proxy, limits):
-            proxy, terms = candidate, fewer
-    if _cost(proxy, limits) <= 1:
-        return domain, proxy, terms
-    return _cut_last_diameters(domain, limits, terms) or (domain, proxy, terms)
-
-
-def _cut_last_diameters(
-    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
-) -> tuple[MonotonicBranch, Proxy, int] | None:
-    """(domain, proxy, terms) without the last diameters, next to the fault that ends
-    the branch, where this meets the tolerances.
-
-    At most a tenth of the phase is cut; None where that is not enough.
-    """
-    for count in range(len(branch.diameter_um) - 1, LEAST_ENTRIES - 1, -1):
-        domain = branch.part(slice(count))
-        if domain.turns < 0.9 * branch.turns:
-            return None
-        fewer = min(terms, count // 3)
-        candidate = _best_power(domain, limits, fewer)
-        if candidate is not None and _cost(candidate, limits) <= 1:
-            return domain, candidate, fewer
-    return None
+        less_cost, candidate = _best_power(domain, limits, fewer)
+        if candidate is not None and less_cost < cost:
+            cost, proxy, terms = less_cost, candidate, fewer
+    for reach in range(len(domain.diameter_um) - 2, LEAST_ENTRIES - 2, -1):
+        shorter = domain.within(reach)
+        if cost <= 1 or shorter.turns < 0.9 * domain.turns:
+            break
+        less_cost, candidate = _best_power(shorter, limits, terms)
+        if candidate is not None and less_cost <= 1:
+            return shorter, candidate, min(terms, (reach + 1) // 3)
+    return domain, proxy, terms
 
 
 def fit_proxy(
@@ -481,35 +479,33 @@ def proxy_of(library: PillarLibrary) -> Proxy:
 
 def _longest_domain(
     branch: MonotonicBranch, limits: ProxyTolerances, terms: int
-) -> tuple[MonotonicBranch, Proxy]:
-    """(domain, proxy) of the longest domain from the least diameter on which ``terms``
-    coefficients meet the tolerances.
+) -> tuple[float, MonotonicBranch, Proxy]:
+    """(cost, domain, proxy) of the longest domain on which ``terms`` coefficients meet
+    the tolerances, by bisection in the number of diameters.
 
-    Bisection in the number of diameters, from 3 ``terms`` of them to all.
+    The shortest has 3 ``terms`` of them; for circular light 12, with fewer terms.
 
     Raises:
         DomainError: no polynomial stays between 0 and 1 even on the shortest domain.
     """
-    fitted = min(len(branch.diameter_um), 3 * terms)
-    too_many = len(branch.diameter_um) + 1
-    best = _best_power(branch.part(slice(fitted)), limits, terms)
-    if best is None:
+    most = max(branch.middle, len(branch.diameter_um) - 1 - branch.middle)
+    reach = min(most, 3 * terms - 1 if branch.monotonic else LEAST_ENTRIES // 2)
+    domain, too_far = branch.within(reach), most + 1
+    cost, proxy = _best_power(domain, limits, terms)
+    if proxy is None:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
-            f"{branch.diameter_um[fitted - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+            f"{domain.diameter_um[-1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
         )
-    while too_many - fitted > 1:
-        count = (
-            (fitted + too_many + 1) // 2
-            if too_many > len(branch.diameter_um)
-            else (fitted + too_many) // 2
-        )
-        trial = _best_power(branch.part(slice(count)), limits, terms)
-        if trial is not None and _cost(trial, limits) <= 1:
-            fitted, best = count, trial
+    while too_far - reach > 1:
+        middle = (reach + too_far + (too_far > most)) // 2
+        longer = branch.within(middle)
+        longer_cost, candidate = _best_power(longer, limits, terms)
+        if candidate is not None and longer_cost <= 1:
+            reach, cost, domain, proxy = middle, longer_cost, longer, candidate
         else:
-            too_many = count
-    return branch.part(slice(fitted)), best
+            too_far = middle
+    return cost, domain, proxy
 
 
 def tolerance_shortfall(proxy: Proxy, tolerances: ProxyTolerances) -> str:
@@ -542,29 +538,34 @@ def tolerance_ratio(proxy: Proxy, tolerances: ProxyTolerances) -> float:
 
 def _best_power(
     branch: MonotonicBranch, limits: ProxyTolerances, terms: int
-) -> Proxy | None:
-    """Proxy in diameter, its square or its cube, whichever has the least error in units
-    of the tolerances; None where each takes |T| below 0 between the entries.
+) -> tuple[float, Proxy | None]:
+    """(cost, proxy) in diameter, its square or its cube, whichever has the least error
+    in units of the tolerances; None where each takes |T| below 0 between the entries.
+
+    The cost of a phase that turns back, where the library's does not, is infinite.
     """
-    proxies = []
+    best: tuple[float, Proxy | None] = (math.inf, None)
     for power in (3, 2, 1):
         with contextlib.suppress(DomainError):
-            proxies.append(fit_terms(branch, power, terms))
-    return min(proxies, key=lambda proxy: _cost(proxy, limits), default=None)
+            count = len(branch.diameter_um) // 3
+            proxy = fit_terms(branch, power, min(terms, count))
+            turns_back = branch.monotonic and not _is_monotone(proxy)
+            cost = math.inf if turns_back else tolerance_ratio(proxy, limits)
+            if best[1] is None or cost < best[0]:
+                best = cost, proxy
+    return best
 
 
-def _cost(proxy: Proxy, limits: ProxyTolerances) -> float:
-    """:func:`tolerance_ratio`, or infinity where the phase is not monotone (the
-    library's is); tested at the ends and the middle of the wavelengths and at both
-    end angles.
+def _is_monotone(proxy: Proxy) -> bool:
+    """Whether the phase rises or falls throughout, at the ends and the middle of the
+    wavelengths and at both end angles.
     """
     wavelengths_um = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
-    monotone = all(
+    return all(
         proxy.monotone(wavelength, angle)
         for wavelength in wavelengths_um
         for angle in {0.0, proxy.max_angle_rad}
     )
-    return tolerance_ratio(proxy, limits) if monotone else math.inf
 
 
 def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
@@ -684,22 +685,11 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     return best
 
 
-def _trial(data: MonotonicBranch, power: int, coefficients: int) -> FitTrial | None:
-    """Errors of a proxy with this many coefficients in total; None where |T| falls
-    below 0 between the entries.
-    """
-    try:
-        proxy = fit_terms(data, power, coefficients // 2)
-    except DomainError:
-        return None
-    return FitTrial(
-        coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error
-    )
-
-
-def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
-    """Proxy of the light converted to the other hand, (t_x - t_y)/2, on the widest run
-    of sizes around the best one that meets the tolerances.
+def _converted_branch(
+    library: PillarLibrary, limits: ProxyTolerances
+) -> MonotonicBranch:
+    """Light converted to the other hand, (t_x - t_y)/2, around the size that converts
+    most.
 
     Pillars of such a lens may all have one size: their turn carries the phase. The
     proxy describes what another size does (bias, tolerance).
@@ -711,10 +701,10 @@ def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
     d = library.diameter_um
     middle = int(np.searchsorted(d, library.best_converting_um))
     conversion = np.abs(t[:, middle]).min()
-    good = np.abs(t).min(axis=0) >= 0.85 * conversion
-    good &= ~_near_narrow_resonances(library, limits.least_half_width_um)
-    if limits.within_um is not None:
-        good &= (d >= limits.within_um[0]) & (d <= limits.within_um[1])
+    good, narrow = _usable(library, limits)
+    good &= np.abs(t).min(axis=0) >= 0.85 * conversion
+    for centre, width, *_ in narrow:
+        good &= np.abs(d - centre) > REACH * width
     runs = (run for run in find_runs(good) if run.start <= middle < run.stop)
     run = next(runs, slice(0, 0))  # empty where the best size itself is excluded
     if run.stop - run.start < LEAST_ENTRIES:
@@ -722,57 +712,15 @@ def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
             f"fewer than {LEAST_ENTRIES} sizes around {d[middle]:.4g} um, where most light is converted "
             f"({conversion**2:.0%}), are free of resonances: sweep with more samples, or another cell"
         )
-    phase = np.unwrap(np.angle(t[:, run]), axis=-1)
-    at_best = phase[:, middle - run.start]
-    phase += (np.unwrap(at_best) - at_best)[:, None]  # along the wavelengths
-    branch = MonotonicBranch(
-        phase[None],
-        np.abs(t[:, run])[None],
+    return MonotonicBranch(
+        _unwrapped(np.angle(t[None, :, run])),
+        np.abs(t[None, :, run]),
         d[run],
         library.wavelength_um,
         library.angle_rad,
+        (
+            f"converted light: at {d[middle]:.4f} um {conversion**2:.3f} of it changes hand",
+        ),
+        middle=middle - run.start,
+        monotonic=False,
     )
-    limits = limits.with_defaults(entry_error(library, branch.diameter_um))
-    proxy = _widest_domain(branch, middle - run.start, limits)
-    inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
-    proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
-    notes = (
-        f"converted light: at {d[middle]:.4f} um {conversion**2:.3f} of it changes hand",
-    )
-    return ProxyFit(
-        proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, limits), math.nan
-    )
-
-
-def _near_narrow_resonances(
-    library: PillarLibrary, least_half_width_um: float
-) -> Array:
-    """(size,) mask of sizes within two half-widths of a narrow resonance."""
-    mask = np.zeros(len(library.diameter_um), bool)
-    for *_, centre, width in library.resonances:
-        if width < least_half_width_um:
-            mask |= np.abs(library.diameter_um - centre) <= 2 * width
-    return mask
-
-
-def _widest_domain(
-    branch: MonotonicBranch, middle: int, limits: ProxyTolerances
-) -> Proxy:
-    """Proxy on the widest run about the place ``middle`` that meets the tolerances,
-    with the requested number of coefficients; at the least 12 entries.
-
-    The half-length of the run shrinks by a tenth in each round.
-    """
-    half_length = max(middle, len(branch.diameter_um) - 1 - middle)
-    while True:
-        domain = branch.part(
-            slice(max(0, middle - half_length), middle + half_length + 1)
-        )
-        count = len(domain.diameter_um)
-        proxy = fit_terms(domain, 1, min(max(2, limits.coefficients // 2), count // 3))
-        if tolerance_ratio(proxy, limits) <= 1 or count <= LEAST_ENTRIES:
-            return proxy
-        shorter = max(LEAST_ENTRIES // 2, int(0.9 * half_length))
-        if shorter >= half_length:
-            return proxy
-        half_length = shorter

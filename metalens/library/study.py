@@ -15,7 +15,7 @@ from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import CommandConsole
 from metalens.library import engines
 from metalens.library.curve import ResponseCurve
-from metalens.library.fit import REACH, UNKNOWN, find_runs
+from metalens.library.fit import find_faults, find_runs
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
 from metalens.library.workers import SweepJournal, Task, fit_curves
@@ -250,8 +250,7 @@ def judge_cell(
 ) -> CellVerdict:
     """Verdict on one curve: the run of sizes without a fault that covers most phase.
 
-    A fault is |t| below the limit, a falling phase (rising, of openings), an error bar
-    above half of |t|, or a narrow resonance. The curve is sampled at 600 sizes.
+    Faults are those of :func:`metalens.library.fit.find_faults`, at 600 sizes.
 
     Args:
         study: what is compared.
@@ -261,27 +260,28 @@ def judge_cell(
     nodes = curve.nodes.diameter_um
     d = np.linspace(nodes.min(), nodes.max(), 600)
     value, error = curve(d)
-    hole = cell.shape.hole  # the wider an opening, the less phase: its sign is changed
     level = np.abs(value[:, 0])
-    phase = np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
-    reversal = "the phase rises" if hole else "the phase falls"
-    faults = {
-        "|t| falls": level < study.least_transmission,
-        reversal: np.diff(phase, append=np.inf) < 0,
-    }
-    faults["an error bar above half of |t|"] = error > UNKNOWN * level
-    near_resonance = np.zeros(len(d), bool)
-    for centre, width in curve.resonances(study.least_half_width_um):
-        near_resonance |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
-    faults["a narrow resonance"] = near_resonance
+    # the wider an opening, the less phase: its sign is changed
+    phase = np.unwrap(np.angle(value[:, 0])) * (-1 if cell.shape.hole else 1)
+    faults = find_faults(
+        d,
+        value[:, 0],
+        error,
+        least_transmission=study.least_transmission,
+        hole=cell.shape.hole,
+        resonances=[
+            (*pole, wavelength_um, 0.0)
+            for pole in curve.resonances(study.least_half_width_um)
+        ],
+    )
     run = max(
-        find_runs(~np.any(list(faults.values()), axis=0)),
+        find_runs(~np.any([fault.mask for fault in faults], axis=0)),
         key=lambda candidate: phase[candidate.stop - 1] - phase[candidate.start],
         default=slice(0, 0),
     )
     start, stop = run.start, run.stop
     reasons = [
-        name for name, mask in faults.items() if stop < len(d) and mask[stop]
+        fault.reason for fault in faults if stop < len(d) and fault.mask[stop]
     ] or ["the printable range"]
     return CellVerdict(
         cell.pitch_um,
@@ -292,7 +292,7 @@ def judge_cell(
         float(d[max(start, stop - 1)]),
         float(level[run].min(initial=1.0)),
         _mean_over_phase(phase[run], level[run] ** 2),
-        " and ".join(reasons),
+        " and ".join(dict.fromkeys(reasons)),
         max_angle_deg(cell, wavelength_um),
         float(error[run].max(initial=0.0)),
         material_name(cell.pillar),

@@ -118,15 +118,6 @@ def test_a_ripple_between_few_entries_is_left_and_said():
     assert proxy_fit.fit(synthetic()).shortfall == ""
 
 
-def test_more_coefficients_leave_less_error():
-    table = proxy_fit.fit(synthetic()).table
-    assert [trial.coefficients for trial in table] == sorted(
-        trial.coefficients for trial in table
-    )
-    assert table[-1].phase_error_rad < 1e-2 * table[0].phase_error_rad
-    assert table[-1].coefficients == 28  # two lines beyond the 24 that are taken
-
-
 def test_a_proxy_that_falls_short_has_no_more_coefficients_than_were_wanted():
     """Less than a turn, which no more of them would complete."""
     wanted = ProxyTolerances(
@@ -268,7 +259,7 @@ def test_an_entry_whose_bar_is_above_half_of_its_light_cuts_the_domain():
         made.diameter_um[129],
     )
     assert any(
-        f"error bars reach {bars[..., 130].max():.2g}, above half of |t|" in note
+        f"an error bar above half of |t| ({bars[..., 130].max():.2g})" in note
         for note in found.notes
     )
 
