@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from metalens.cell import Blend, Cell, Incidence, Material, index, materials
+from metalens.cell import Blend, Cell, Incidence, Material, index
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import CommandConsole
@@ -39,8 +39,6 @@ class CellStudy:
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end
         a stretch.
-    others: materials that the chosen cell is tried with as well, where their sources
-        hold all the wavelengths; [] for none.
     """
 
     pitches_um: tuple[float, ...] = (
@@ -64,7 +62,6 @@ class CellStudy:
     least_transmission: float = 0.8
     least_half_width_um: float = 0.005
     tolerance: float = field(default=3e-3, metadata={"above": 0})
-    others: tuple[str, ...] = field(default=("a-Si",), metadata={"may_be_empty": True})
     cell: Cell | None = None
 
     def __post_init__(self) -> None:
@@ -88,10 +85,8 @@ class CellStudy:
         """Material of the pillars."""
         return self.pillar if self.cell is None else self.cell.pillar
 
-    def made(
-        self, pitch_um: float, height_um: float, pillar: Material | None = None
-    ) -> Cell:
-        """One cell of the study, or the same with another pillar material.
+    def at(self, pitch_um: float, height_um: float) -> Cell:
+        """One cell of the study.
 
         Where the pillar has layers, those of its own material take the height.
 
@@ -99,7 +94,7 @@ class CellStudy:
             CellError: a height that the films of other materials fill.
         """
         base = (self.cell or Cell(pitch_um)).at_height(height_um)
-        return replace(base, pitch_um=pitch_um, pillar=pillar or self.material)
+        return replace(base, pitch_um=pitch_um, pillar=self.material)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +109,6 @@ class CellVerdict:
     max_angle_deg: of incidence in air up to which no diffraction order propagates, in
         substrate or cover.
     error: largest error estimate of t on it.
-    pillar: name of the material, or n + ik.
     """
 
     pitch_um: float
@@ -128,7 +122,6 @@ class CellVerdict:
     ends: str
     max_angle_deg: float
     error: float
-    pillar: str
 
 
 def run_study(
@@ -137,8 +130,8 @@ def run_study(
     *,
     journal: SweepJournal | None = None,
 ) -> list[CellVerdict]:
-    """Verdicts on every combination, wavelength by wavelength, then on the best cell
-    with other materials.
+    """Verdicts on every combination, wavelength by wavelength, from one rational curve
+    t(D) each, solved on all cores.
 
     Args:
         study: what is compared.
@@ -154,63 +147,15 @@ def run_study(
     """
     for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
         check_light(
-            study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
+            study.at(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
         )
-    materials_tried, _ = other_materials(study)
     combinations = itertools.product(
         study.wavelengths_um, study.heights_um, study.pitches_um
     )
     cases = [
-        (study.made(pitch, height), wavelength)
+        (study.at(pitch, height), wavelength)
         for wavelength, height, pitch in combinations
     ]
-    journal = journal or SweepJournal(None)
-    verdicts = _judge_cells(
-        study, cases, journal, console or CommandConsole(quiet=True)
-    )
-    best = best_cell(study, verdicts)
-    if best is None:
-        return verdicts
-    cells = [study.made(*best, material) for material in materials_tried]
-    best_cases = [
-        (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
-    ]
-    return verdicts + _judge_cells(
-        study, best_cases, journal, CommandConsole(quiet=True)
-    )
-
-
-def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """(tried, untried) other materials than the study's own: those whose sources hold
-    all the wavelengths, and those that lack one.
-
-    Raises:
-        MaterialError: an unknown name or a file that cannot be read.
-    """
-    names = [name for name in dict.fromkeys(study.others) if name != study.material]
-    ranges = {name: materials.find_material(name).range_um for name in names}
-    covered = [
-        all(low <= wavelength <= high for wavelength in study.wavelengths_um)
-        for low, high in ranges.values()
-    ]
-    tried = tuple(
-        name for name, is_covered in zip(names, covered, strict=True) if is_covered
-    )
-    return tried, tuple(name for name in names if name not in tried)
-
-
-def _judge_cells(
-    study: CellStudy,
-    cases: list[tuple[Cell, float]],
-    journal: SweepJournal,
-    console: CommandConsole,
-) -> list[CellVerdict]:
-    """Verdict on every case, from one rational curve t(D) each, solved on all cores.
-
-    Args:
-        cases: (cell, wavelength in um).
-        journal: of curves that are solved already.
-    """
     tasks = [
         Task(
             "curves",
@@ -222,8 +167,10 @@ def _judge_cells(
         )
         for cell, wavelength in cases
     ]
+    journal = journal or SweepJournal(None)
     verdicts = []
-    for case, solved in zip(cases, journal.run(tasks, console, "cells"), strict=True):
+    solutions = journal.run(tasks, console or CommandConsole(quiet=True), "cells")
+    for case, solved in zip(cases, solutions, strict=True):
         (curve,) = fit_curves(solved, tolerance=study.tolerance)
         verdicts.append(judge_cell(study, *case, curve))
     return verdicts
@@ -295,7 +242,6 @@ def judge_cell(
         " and ".join(dict.fromkeys(reasons)),
         max_angle_deg(cell, wavelength_um),
         float(error[run].max(initial=0.0)),
-        material_name(cell.pillar),
     )
 
 
@@ -350,10 +296,7 @@ def study_markdown(
             "",
             f"## {1e3 * wavelength:g} nm",
             "",
-            *_table(
-                study,
-                [v for v in _own(study, verdicts) if v.wavelength_um == wavelength],
-            ),
+            *_table(study, [v for v in verdicts if v.wavelength_um == wavelength]),
         ]
     uncertain = uncertain_entries(study, verdicts)
     lines += ["", uncertain[0].upper() + uncertain[1:] + "."] if uncertain else []
@@ -376,7 +319,7 @@ def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
     place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
     return (
         f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
-        f"largest of {worst.error:.2g} ({worst.pillar}, {place})"
+        f"largest of {worst.error:.2g} ({place})"
     )
 
 
@@ -393,7 +336,7 @@ def _limits(study: CellStudy) -> str:
     """The printable sizes, in words."""
     least = f"{1e3 * study.min_diameter_um:.4g} nm"
     gap = f"{1e3 * study.min_gap_um:.4g} nm"
-    if study.made(study.pitches_um[0], study.heights_um[0]).round:
+    if study.at(study.pitches_um[0], study.heights_um[0]).round:
         return f"diameter from {least} to the pitch less {gap}"
     return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
 
@@ -408,11 +351,6 @@ def material_name(material: Material) -> str:
         if isinstance(material, str)
         else f"n = {material.n:g} + {material.k:g}i"
     )
-
-
-def _own(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[CellVerdict]:
-    """Verdicts on the study's own material."""
-    return [v for v in verdicts if v.pillar == material_name(study.material)]
 
 
 def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
@@ -449,7 +387,7 @@ def best_cell(
         verdicts: of its cells.
     """
     by_cell: dict[tuple[float, float], list[float]] = {}
-    for v in _own(study, verdicts):
+    for v in verdicts:
         by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
     worst_turns = {
         cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1
@@ -465,7 +403,7 @@ def best_cell(
 
 
 def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
-    """Markdown lines on the best cell, with each material and wavelength."""
+    """Markdown lines on the best cell at each wavelength."""
     waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
     best = best_cell(study, verdicts)
     if best is None:
@@ -480,16 +418,12 @@ def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
     ]
     for v in chosen:
         lines.append(
-            f"- {v.pillar}, {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
+            f"- {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
             f"{1e3 * v.to_um:.0f} nm "
             f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
             f"order up to {v.max_angle_deg:.0f} deg"
         )
-    _, outside = other_materials(study)
-    return lines + [
-        f"- {name} was not tried: its source does not hold {waves} nm"
-        for name in outside
-    ]
+    return lines
 
 
 def round_to_tolerance(value: object) -> object:

@@ -1,10 +1,8 @@
 """Unit-cell tables of other solvers (Lumerical, COMSOL, CST, Meep) as pillar libraries."""
 
-import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +17,24 @@ from metalens.library.record import PillarLibrary, Sweep
 
 LIGHT_UM_THZ = 299.792458  # speed of light: wavelength in um times frequency in THz
 LENGTHS = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6}
-FREQUENCIES = {"thz": 1.0, "ghz": 1e-3, "hz": 1e-12}
 ANGLES = {"deg": math.pi / 180, "degrees": math.pi / 180, "rad": 1.0}
 PHASES = ANGLES | {"turns": 2 * math.pi, "waves": 2 * math.pi, "cycles": 2 * math.pi}
-KINDS = {  # quantity: names of its column, without unit
-    "diameter": ("diameter", "d", "size", "width"),
-    "radius": ("radius", "r"),
-    "wavelength": ("wavelength", "lambda", "wl"),
-    "frequency": ("frequency", "freq", "f"),
-    "angle": ("angle", "theta", "incidence", "angle_of_incidence"),
-    "phase": ("phase", "phi", "arg_t", "s21_phase", "arg_s21", "phase_t"),
-    "power": ("transmission", "transmittance", "t", "power"),
-    "amplitude": ("amplitude", "abs_t", "t_abs", "abs_s21", "s21_abs", "s21"),
-    "real": ("re_t", "t_re", "t_real", "real_t", "re_s21", "s21_re", "s21_real"),
-    "imaginary": ("im_t", "t_im", "t_imag", "imag_t", "im_s21", "s21_im", "s21_imag"),
-    "error": ("t_error", "error", "sigma"),
-}
+KINDS: tuple[tuple[str, dict[str, float], str], ...] = (
+    # quantity; its units in um, THz or rad; names of its column without unit
+    ("size", LENGTHS, "diameter d size width"),
+    ("size", {unit: 2 * um for unit, um in LENGTHS.items()}, "radius r"),
+    ("wavelength", LENGTHS, "wavelength lambda wl"),
+    ("frequency", {"thz": 1.0, "ghz": 1e-3, "hz": 1e-12}, "frequency freq f"),
+    ("angle", ANGLES, "angle theta incidence angle_of_incidence"),
+    ("phase", PHASES, "phase phi arg_t s21_phase arg_s21 phase_t"),
+    ("power", {}, "transmission transmittance t power"),
+    ("amplitude", {}, "amplitude abs_t t_abs abs_s21 s21_abs s21"),
+    ("real", {}, "re_t t_re t_real real_t re_s21 s21_re s21_real"),
+    ("imaginary", {}, "im_t t_im t_imag imag_t im_s21 s21_im s21_imag"),
+    ("error", {}, "t_error error sigma"),
+)
+NAMES = {name: kind[:2] for kind in KINDS for name in kind[2].split()}
 LEAST_SIZES = 12  # that a smooth proxy needs
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    kind: str
-    scale: float
-    values: Array
 
 
 def from_table(
@@ -90,24 +82,30 @@ def from_table(
     where = "the table" if isinstance(table, Mapping) else str(table)
     raw_columns = table if isinstance(table, Mapping) else _read(Path(table), columns)
     quantities = _recognise(raw_columns, where)
+    if "size" not in quantities:
+        raise DomainError(
+            f"{where}: no column of the size; need diameter_nm or radius_nm"
+        )
     t, notes = _amplitudes(quantities, where)
-    size_um = _sizes(quantities, where)
-    wavelengths_um = _wavelengths(quantities, wavelength_um, len(size_um), where)
-    angles_rad = (
-        quantities["angle"].values if "angle" in quantities else np.zeros(len(size_um))
-    )
-    error = (
-        quantities["error"].values if "error" in quantities else np.full(len(t), np.nan)
-    )
-    axes, rows = _grid(angles_rad, wavelengths_um, size_um, where)
-    t, error = t[rows], error[rows]
-    t, conjugated = _with_rising_phase(t)
-    notes.append(
-        "phase fell with the size: conjugated to exp(-iwt)"
-        if conjugated
-        else "phase rises with the size, as of exp(-iwt)"
-    )
+    if "frequency" in quantities:
+        quantities["wavelength"] = LIGHT_UM_THZ / quantities["frequency"]
+    elif wavelength_um is not None:
+        quantities.setdefault("wavelength", np.full(len(t), wavelength_um))
+    if "wavelength" not in quantities:
+        raise DomainError(
+            f"{where}: no column of the wavelength; state it (wavelength_um)"
+        )
+    quantities.setdefault("angle", np.zeros(len(t)))
+    axes, rows = _grid(quantities, where)
+    t = t[rows]
+    phase = np.unwrap(np.angle(t), axis=-1)
+    if np.median(phase[..., -1] - phase[..., 0]) < 0:  # over wavelengths and angles
+        t = t.conj()
+        notes.append("phase fell with the size: conjugated to exp(-iwt)")
+    else:
+        notes.append("phase rises with the size, as of exp(-iwt)")
     if "error" in quantities:
+        error = quantities["error"][rows]
         notes.append("error bars from their column")
     else:
         error = _left_out_errors(axes[2], t)
@@ -188,139 +186,98 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
     lines = [ln for ln in text.splitlines() if ln.strip() and ln[0] not in "#%"]
     if not lines:
         raise DomainError(f"{path}: empty; need a header and a row for each entry")
-    separator = next((m for m in "\t;," if m in lines[0]), None)
-    if separator in (";", "\t"):
+    separator = next((mark for mark in "\t;," if mark in lines[0]), None)
+    names = list(columns) or [n.strip(' "') for n in lines.pop(0).split(separator)]
+    if separator in (";", "\t"):  # commas are decimal
         lines = [line.replace(",", ".") for line in lines]
-    rows = (
-        [ln.split() for ln in lines]
-        if separator is None
-        else [*csv.reader(lines, delimiter=separator)]
-    )
-    header = list(columns) or rows.pop(0)
     try:
-        body = np.array([[float(field) for field in row] for row in rows])
-    except ValueError:
-        bad = next(i for i, row in enumerate(rows) if not _numbers(row))
-        raise DomainError(
-            f"{path}, row {bad + 1}: {rows[bad]} is not numbers; --columns names the "
-            "columns of a file without a header"
-        ) from None
-    if body.ndim != 2 or body.shape[1] != len(header):
-        raise DomainError(
-            f"{path}: rows do not match the {len(header)} columns {header}"
+        body = np.loadtxt(
+            lines, delimiter=separator, ndmin=2, comments=None, quotechar='"'
         )
-    return dict(zip(header, body.T, strict=True))
+    except ValueError as error:
+        raise DomainError(
+            f"{path}: {error}; --columns names the columns of a file without a header"
+        ) from None
+    if body.shape[1] != len(names):
+        raise DomainError(f"{path}: rows do not match the {len(names)} columns {names}")
+    return dict(zip(names, body.T, strict=True))
 
 
-def _numbers(row: list[str]) -> bool:
-    """Whether every field of a row is a number."""
-    try:
-        list(map(float, row))
-    except ValueError:
-        return False
-    return True
-
-
-def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, _Column]:
-    """{quantity: column} of a table, in um, rad and fractions.
+def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, Array]:
+    """{quantity: (n,) values} of a table, in um, THz, rad and fractions.
 
     Args:
         raw_columns: {name: values}.
         where: names the table in errors.
 
     Raises:
-        DomainError: an unknown or repeated column, unequal lengths, or values that are
-            not finite.
+        DomainError: an unknown or repeated column, no known unit, unequal lengths, or
+            values that are not finite.
     """
-    quantities: dict[str, _Column] = {}
+    quantities: dict[str, Array] = {}
     for name, content in raw_columns.items():
-        kind, unit = _quantity(str(name))
+        plain = _plain_name(str(name))
+        stem, _, unit = plain.rpartition("_")
+        if plain in NAMES:
+            stem, unit = plain, ""
+        quantity, units = NAMES.get(stem, ("", {}))
         values = np.ravel(np.asarray(content))
-        if kind == "power" and np.iscomplexobj(values):
-            kind = "complex"
-        if not kind:
+        if quantity == "power" and np.iscomplexobj(values):
+            quantity = "complex"
+        if not quantity or (unit and not units):
+            known = ", ".join(names.split()[0] for *_, names in KINDS)
             raise DomainError(
-                f"{where}: column {name!r} is unknown; known are "
-                f"{', '.join(n[0] for n in KINDS.values())} with a unit (diameter_nm)"
+                f"{where}: column {name!r} is unknown; known are {known} with a unit "
+                "(diameter_nm)"
             )
-        if kind in quantities:
-            raise DomainError(f"{where}: two columns of {kind}")
-        quantities[kind] = _Column(
-            kind, *_scaled(kind, unit, values, f"{where}: {name!r}")
-        )
-    lengths = {len(column.values) for column in quantities.values()}
+        if quantity in quantities:
+            raise DomainError(f"{where}: two columns of {quantity}")
+        if units and unit not in units:
+            raise DomainError(
+                f"{where}: {name!r} states no unit; name the column {stem}_UNIT, of "
+                f"{', '.join(units)}"
+            )
+        if not np.isfinite(values).all():
+            raise DomainError(f"{where}: {quantity} holds values that are not finite")
+        quantities[quantity] = values * units[unit] if units else values
+    lengths = {len(values) for values in quantities.values()}
     if len(lengths) != 1:
         raise DomainError(f"{where}: columns of different lengths {sorted(lengths)}")
-    for kind, column in quantities.items():
-        if not np.isfinite(column.values).all():
-            raise DomainError(f"{where}: {kind} holds values that are not finite")
     return quantities
 
 
-def _quantity(name: str) -> tuple[str, str]:
-    """(kind, unit) of a column's name, as ("diameter", "nm") of "Diameter (nm)"; the
-    kind is empty where it is not known.
+def _plain_name(name: str) -> str:
+    """Name of a column in small letters with underscores, as "diameter_nm" of
+    "Diameter (nm)".
     """
     plain = name.strip().lower().replace("μ", "u").replace("µ", "u").replace("°", "deg")
     plain = re.sub(r"\|t\|(\^2|²)", "transmission", plain).replace("|t|", "abs_t")
-    plain = re.sub(r"[^\w]+", "_", plain).strip("_")
-    stem, _, last = plain.rpartition("_")
-    units = {*LENGTHS, *FREQUENCIES, *PHASES}
-    for candidate, unit in ((plain, ""), (stem, last if last in units else "-")):
-        for kind, names in KINDS.items():
-            if candidate in names and unit != "-":
-                return kind, unit
-    return "", ""
+    return re.sub(r"[^\w]+", "_", plain).strip("_")
 
 
-def _scaled(kind: str, unit: str, values: Array, where: str) -> tuple[float, Array]:
-    """(scale, scaled values) of a column in um, THz or rad; scale 1 for quantities
-    without a unit.
-
-    Raises:
-        DomainError: no unit that this kind has.
-    """
-    units: dict[str, dict[str, float]] = {
-        "diameter": LENGTHS,
-        "radius": LENGTHS,
-        "wavelength": LENGTHS,
-        "frequency": FREQUENCIES,
-        "angle": ANGLES,
-        "phase": PHASES,
-    }
-    if kind not in units:
-        return 1.0, values
-    if unit not in units[kind]:
-        raise DomainError(
-            f"{where} states no unit; name the column {kind}_UNIT, of "
-            f"{', '.join(units[kind])}"
-        )
-    return units[kind][unit], values * units[kind][unit]
-
-
-def _amplitudes(quantities: dict[str, _Column], where: str) -> tuple[Array, list[str]]:
+def _amplitudes(quantities: dict[str, Array], where: str) -> tuple[Array, list[str]]:
     """(n,) complex t of the rows, and a note on how it was stated.
 
     Args:
-        quantities: {quantity: column}.
+        quantities: {quantity: (n,) values}.
         where: names the table in errors.
 
     Raises:
         DomainError: missing columns, or |t| above 1.
     """
     if "complex" in quantities:
-        t = quantities["complex"].values.astype(complex)
+        t = quantities["complex"].astype(complex)
         notes = ["complex t"]
     elif {"real", "imaginary"} <= quantities.keys():
-        t = quantities["real"].values + 1j * quantities["imaginary"].values
+        t = quantities["real"] + 1j * quantities["imaginary"]
         notes = ["t from its real and imaginary part"]
     elif "phase" in quantities and ("power" in quantities or "amplitude" in quantities):
         by_power = "power" in quantities
-        level = quantities["power" if by_power else "amplitude"].values
+        level = quantities["power" if by_power else "amplitude"]
         if level.min() < 0:
             raise DomainError(f"{where}: transmission {level.min():g} is below 0")
         level = np.sqrt(level) if by_power else level
-        t = level * np.exp(1j * quantities["phase"].values)
+        t = level * np.exp(1j * quantities["phase"])
         notes = [f"|t| from {'a share of power' if by_power else 'an amplitude'}"]
     else:
         raise DomainError(
@@ -336,75 +293,37 @@ def _amplitudes(quantities: dict[str, _Column], where: str) -> tuple[Array, list
     return t / max(1.0, peak), notes
 
 
-def _sizes(quantities: dict[str, _Column], where: str) -> Array:
-    """(n,) sizes of the rows, um: diameters, or twice the radii."""
-    if "diameter" in quantities:
-        return np.asarray(quantities["diameter"].values)
-    if "radius" in quantities:
-        return np.asarray(2 * quantities["radius"].values)
-    raise DomainError(f"{where}: no column of the size; need diameter_nm or radius_nm")
-
-
-def _wavelengths(
-    quantities: dict[str, _Column], stated_um: float | None, rows: int, where: str
-) -> Array:
-    """(n,) wavelengths of the rows, um: their column, 299.79 um THz / frequency, or the
-    stated one.
-    """
-    if "wavelength" in quantities:
-        return np.asarray(quantities["wavelength"].values)
-    if "frequency" in quantities:
-        return np.asarray(LIGHT_UM_THZ / quantities["frequency"].values)
-    if stated_um is None:
-        raise DomainError(
-            f"{where}: no column of the wavelength; state it (wavelength_um)"
-        )
-    return np.full(rows, float(stated_um))
-
-
 def _grid(
-    angles: Array, wavelengths: Array, sizes: Array, where: str
+    quantities: dict[str, Array], where: str
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """Axes (angle, wavelength, size) of the table, and the (angle, wavelength, size)
     array of row numbers.
 
     Args:
-        angles: (n,) rad of the rows.
-        wavelengths: (n,) wavelengths, um.
-        sizes: (n,) um.
+        quantities: {quantity: (n,) values}, in rad and um.
         where: names the table in errors.
 
     Raises:
         DomainError: under 12 sizes, or entries that are missing or repeated.
     """
-    axes = tuple(np.unique(np.round(v, 9)) for v in (angles, wavelengths, sizes))
-    shape = tuple(map(len, axes))
-    if shape[2] < LEAST_SIZES:
-        raise DomainError(f"{where}: {shape[2]} sizes; need {LEAST_SIZES} at least")
-    row_of = np.full(shape, -1)
-    positions = tuple(
-        np.searchsorted(axis, np.round(v, 9))
-        for axis, v in zip(axes, (angles, wavelengths, sizes), strict=True)
+    (angles, i), (wavelengths, j), (sizes, k) = (
+        np.unique(np.round(quantities[name], 9), return_inverse=True)
+        for name in ("angle", "wavelength", "size")
     )
-    row_of[positions] = np.arange(len(sizes))
-    if (row_of < 0).any():
-        a, w, s = np.argwhere(row_of < 0)[0]
+    if len(sizes) < LEAST_SIZES:
+        raise DomainError(f"{where}: {len(sizes)} sizes; need {LEAST_SIZES} at least")
+    row_of = np.full((len(angles), len(wavelengths), len(sizes)), -1)
+    row_of[i, j, k] = np.arange(len(k))
+    missing = np.argwhere(row_of < 0)
+    if len(missing):
+        a, w, s = missing[0]
         raise DomainError(
-            f"{where}: {int((row_of < 0).sum())} entries are missing, the first at "
-            f"{math.degrees(axes[0][a]):g} deg, {axes[1][w]:g} um, size {axes[2][s]:g} um"
+            f"{where}: {len(missing)} entries are missing, the first at "
+            f"{math.degrees(angles[a]):g} deg, {wavelengths[w]:g} um, size {sizes[s]:g} um"
         )
-    if len(sizes) > row_of.size:
-        raise DomainError(f"{where}: {len(sizes) - row_of.size} entries stand twice")
-    return (axes[0], axes[1], axes[2]), row_of
-
-
-def _with_rising_phase(t: Array) -> tuple[Array, bool]:
-    """t, conjugated where its phase falls with the size (median over wavelengths and
-    angles), and whether it was.
-    """
-    phase = np.unwrap(np.angle(t), axis=-1)
-    falls = float(np.median(phase[..., -1] - phase[..., 0])) < 0
-    return (t.conj() if falls else t), falls
+    if len(k) > row_of.size:
+        raise DomainError(f"{where}: {len(k) - row_of.size} entries stand twice")
+    return (angles, wavelengths, sizes), row_of
 
 
 def _left_out_errors(sizes: Array, t: Array) -> Array:

@@ -213,7 +213,6 @@ pitches_um = [0.30]
 heights_um = [0.7]
 wavelengths_um = [0.85]
 tolerance = 2e-2
-others = []
 """
 
 

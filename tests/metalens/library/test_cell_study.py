@@ -29,19 +29,17 @@ def verdicts():
 
 
 def test_known_coverages(verdicts):
-    narrow, wide, film = verdicts
+    narrow, wide = verdicts
     assert narrow.turns == pytest.approx(1.53, abs=0.03)
     assert wide.turns == pytest.approx(0.77, abs=0.03)
     assert narrow.max_angle_deg == 90
     assert wide.max_angle_deg == pytest.approx(
         42.3, abs=0.1
     )  # sin = 0.85/0.40 - 1.4525
-    assert film.pillar == "a-Si"
-    assert film.turns < 0.6  # the absorbing film of Pierce and Spicer
 
 
 def test_choice_takes_the_lowest_then_the_most(verdicts):
-    narrow, wide, _ = verdicts
+    narrow, wide = verdicts
     assert cell_study.best_cell(SMALL, verdicts) == (0.30, 0.7)
     taller = dataclasses.replace(narrow, height_um=0.9, turns=2.0)
     assert cell_study.best_cell(SMALL, [taller, narrow]) == (0.30, 0.7)
@@ -85,49 +83,19 @@ def test_pitches_above_cutoff_are_refused_and_named():
         )
 
 
-def test_other_materials_are_tried_where_they_hold_and_never_the_own_one_again():
-    """a-Si is tabulated from 0.31 to 2.066 um, Si-infrared beyond; what does not hold
-    is said, not stumbled over.
-    """
-    base = dataclasses.replace(
-        SMALL,
-        pitches_um=(0.9,),
-        heights_um=(2.2,),
-        wavelengths_um=(2.5,),
-        pillar=Index(3.48),
-    )
-    far = dataclasses.replace(base, others=("a-Si", "Si-infrared", "a-Si"))
-    assert cell_study.other_materials(far) == (("Si-infrared",), ("a-Si",))
-    own = dataclasses.replace(
-        base,
-        pillar="Si-infrared",
-        others=("Si-infrared", "TiO2"),
-        wavelengths_um=(1.5,),
-    )
-    assert cell_study.other_materials(own) == (("TiO2",), ())
-    full = cell_study.CellVerdict(
-        0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i"
-    )
-    assert (
-        "a-Si was not tried: its source does not hold 2500 nm"
-        in cell_study.study_markdown(far, [full], command="x")
-    )
-
-
 @pytest.mark.parametrize(
-    ("cell", "others", "says"),
+    ("cell", "says"),
     [
-        (Cell(0.3), ("a_Si",), "unknown material 'a_Si'"),
+        (Cell(0.3, pillar="a_Si"), "unknown material 'a_Si'"),
         (
             Cell(0.3, under=(Film("Si-infrared", 0.1),)),
-            ("a-Si",),
             "Si-infrared at 0.85 um",
         ),
-        (Cell(0.3, substrate=Index(1.5, 0.1)), ("a-Si",), "substrate absorbs"),
+        (Cell(0.3, substrate=Index(1.5, 0.1)), "substrate absorbs"),
     ],
 )
 def test_what_cannot_be_solved_is_refused_before_any_cell_is(
-    cell, others, says, monkeypatch
+    cell, says, monkeypatch
 ):
     monkeypatch.setattr(
         executor,
@@ -135,7 +103,7 @@ def test_what_cannot_be_solved_is_refused_before_any_cell_is(
         lambda work, tasks: pytest.fail("cells were solved first"),
     )
     with pytest.raises(MetalensError, match=says):
-        cell_study.run_study(dataclasses.replace(SMALL, cell=cell, others=others))
+        cell_study.run_study(dataclasses.replace(SMALL, cell=cell))
 
 
 def test_heights_of_layered_pillars_are_made_of_their_own_material():
@@ -146,15 +114,15 @@ def test_heights_of_layered_pillars_are_made_of_their_own_material():
         Layer(0.04, grow_um=-0.01, material=Index(1.9)),
     )
     study = dataclasses.replace(SMALL, cell=Cell(0.3, 0.6, Index(3.6), layers=layers))
-    made = study.made(0.33, 0.75, Index(2.4))
+    made = study.at(0.33, 0.75)
     assert [layer.height_um for layer in made.layers] == pytest.approx(
         [0.06, 0.65, 0.04]
     )
-    assert (made.pitch_um, made.height_um, made.pillar) == (0.33, 0.75, Index(2.4))
+    assert (made.pitch_um, made.height_um, made.pillar) == (0.33, 0.75, Index(3.6))
     with pytest.raises(
         CellError, match=r"0\.1 um of it of other films: need a larger height"
     ):
-        study.made(0.33, 0.09)
+        study.at(0.33, 0.09)
 
 
 def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
@@ -170,7 +138,7 @@ def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
         cell=cell,
     )
     want = (0.2, 0.98 * 0.3 - 0.7 * math.tan(0.04))
-    assert cell_study._span(leaning, leaning.made(0.3, 0.7)) == pytest.approx(
+    assert cell_study._span(leaning, leaning.at(0.3, 0.7)) == pytest.approx(
         want, rel=1e-12
     )
 
@@ -183,7 +151,7 @@ def test_the_page_says_what_is_printable_of_any_shape():
         cell=Cell(0.3, shape=Cross(0.4)),
     )
     verdict = cell_study.CellVerdict(
-        0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si"
+        0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3
     )
     page = cell_study.study_markdown(
         dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x"
@@ -232,7 +200,7 @@ def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
         file.write(b'["cut sho')
     monkeypatch.setattr(executor, "run_parallel", counted)
     assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
-    assert solved == [1, 1]  # the other cell, and the chosen one of another material
+    assert solved == [1]  # the other cell
     assert not journal.exists()
     (tmp_path / "whole").mkdir()
     assert (
