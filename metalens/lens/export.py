@@ -19,7 +19,7 @@ ARRAYS, GRID = (".npz", ".mat"), ".dat"
 SUFFIXES = (*ARRAYS, GRID)
 # grid-phase file: mm per um (unit flag 0), and the flag of a point without data
 _MM, _NO_DATA = 1e-3, 1
-# points from the rim: the effect of an edge on a cubic spline decays as 0.27^points
+# points beyond the rim to which a phase is extended: a cubic spline then reads the rim
 _RIM = 4
 
 
@@ -114,8 +114,8 @@ class GridPhase:
     phase_rad: (n, n), extended a few points beyond the lens, so that its rim can be
         interpolated; nan further out.
     step_um: spacing of the points.
-    error_rad: largest difference between the pillars and the cubic interpolation of the
-        points, taken a few points inside the rim.
+    error_rad: largest difference between the pillars and the linear interpolation of
+        the points.
     """
 
     phase_rad: Array
@@ -144,8 +144,7 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
     aperture, and its interpolation error.
 
     The phase is interpolated linearly between pillars, and extrapolated beyond the rim
-    by a parabola. The error compares it, interpolated back by a cubic spline, with the
-    pillars inside the rim.
+    by a parabola. The error compares it, interpolated back linearly, with the pillars.
 
     Args:
         lens: on a square lattice.
@@ -155,7 +154,7 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
         LensError: fewer than 5 samples, or another lattice than a square one; see
             :func:`unwrap_phase`.
     """
-    from scipy.ndimage import binary_erosion, map_coordinates
+    from scipy.ndimage import map_coordinates
 
     if lens.diameters.lattice.kind != "square":
         raise LensError(
@@ -169,31 +168,20 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
     centre = [(n - 1) / 2 for n in phase.shape]
     offset = (np.arange(samples) - (samples - 1) / 2) * step / d.pitch_um
     sample_sites = np.meshgrid(offset + centre[0], offset + centre[1], indexing="ij")
-    grid = map_coordinates(phase, sample_sites, order=1, cval=np.nan)
+    extended = _continued(phase, _RIM * step / d.pitch_um + 1)
+    grid = map_coordinates(extended, sample_sites, order=1, cval=np.nan)
     if np.isfinite(grid).sum() < samples:
         raise LensError(
             f"{samples} samples find hardly a point with pillars all around; need a wider lens"
         )
-    has_pillar = np.isfinite(phase)
-    rows, columns = np.nonzero(has_pillar)
+    rows, columns = np.nonzero(np.isfinite(phase))
     pillar_points = [
-        (rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
-        (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2,
+        (site - middle) * d.pitch_um / step + (samples - 1) / 2
+        for site, middle in zip((rows, columns), centre, strict=True)
     ]
-    interior = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
-    is_interior = map_coordinates(interior, pillar_points, order=1) > 1 - 1e-9
-    interpolated = map_coordinates(
-        _filled(grid),
-        [points[is_interior] for points in pillar_points],
-        order=3,
-        mode="nearest",
-    )
-    extended = _continued(phase, _RIM * step / d.pitch_um + 1)
-    return GridPhase(
-        map_coordinates(extended, sample_sites, order=1, cval=np.nan),
-        step,
-        float(np.abs(interpolated - phase[has_pillar][is_interior]).max(initial=0)),
-    )
+    read_back = map_coordinates(grid, pillar_points, order=1, mode="nearest")
+    error = np.abs(read_back - phase[rows, columns])
+    return GridPhase(grid, step, float(np.nanmax(error, initial=0)))
 
 
 def _continued(phase: Array, reach: float) -> Array:
@@ -222,16 +210,6 @@ def _at(grid: Array, places: Array) -> Array:
     inside = ((places >= 0) & (places < grid.shape)).all(1)
     row, column = np.where(inside[:, None], places, 0).T
     return np.where(inside, grid[row, column], np.nan)
-
-
-def _filled(grid: Array) -> Array:
-    """Grid whose points without data take the value of the closest one with data."""
-    from scipy.ndimage import distance_transform_edt
-
-    nearest = distance_transform_edt(
-        np.isnan(grid), return_distances=False, return_indices=True
-    )
-    return np.asarray(grid[tuple(nearest)])
 
 
 def unwrap_phase(lens: Lens) -> Array:

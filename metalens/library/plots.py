@@ -90,7 +90,7 @@ def library_figure(
         library: the swept cell.
         proxy_fit: the fit of its proxy; None where there is none.
     """
-    figure, panels = report.make_figure(4, 1, size=(7.5, 8.5))
+    figure, panels = report.make_figure(4, 1, size=(7.5, 8.5), sharex=True)
     phase, level, bars, residuals = panels
     d = NM * library.diameter_um
     for i, j, k in np.ndindex(*library.t.shape[:3]):
@@ -104,7 +104,7 @@ def library_figure(
         bars.semilogy(d, error)
     bars.axhline(library.sweep.bar, color="0.5", ls="--")
     if np.prod(library.t.shape[:3]) <= 12:
-        phase.legend()
+        phase.legend(fontsize=6, ncols=2)
     cell = library.cell
     phase.set(
         title=f"pitch {NM * cell.pitch_um:g} nm, height {NM * cell.height_um:g} nm, engine {library.engine}",

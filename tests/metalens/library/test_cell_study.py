@@ -87,16 +87,11 @@ def test_pitches_above_cutoff_are_refused_and_named():
     ("cell", "says"),
     [
         (Cell(0.3, pillar="a_Si"), "unknown material 'a_Si'"),
-        (
-            Cell(0.3, under=(Film("Si-infrared", 0.1),)),
-            "Si-infrared at 0.85 um",
-        ),
+        (Cell(0.3, under=(Film("Si-infrared", 0.1),)), "Si-infrared at 0.85 um"),
         (Cell(0.3, substrate=Index(1.5, 0.1)), "substrate absorbs"),
     ],
 )
-def test_what_cannot_be_solved_is_refused_before_any_cell_is(
-    cell, says, monkeypatch
-):
+def test_what_cannot_be_solved_is_refused_before_any_cell_is(cell, says, monkeypatch):
     monkeypatch.setattr(
         executor,
         "run_parallel",
