@@ -5,12 +5,14 @@ ellipse: Jones matrices of every pair, an error bar on each.
 import dataclasses
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates, maximum_filter
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import maximum_filter
 
 from metalens.cell import Cell, Incidence
 from metalens.cell.shapes import Ellipse, Rectangle
@@ -20,6 +22,7 @@ from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance, typed_reader
 from metalens.library import rational
+from metalens.library.curve import SolvedNodes
 from metalens.library.record import Sweep, check_light
 from metalens.library.workers import SweepJournal, Task
 
@@ -298,18 +301,11 @@ def _interpolate_in_turn(
     )
 
 
-class SolvedPillar(NamedTuple):
-    """(2, 2) Jones matrix of one pillar, and its error bar."""
-
-    t: Array
-    error: float
-
-
 class _Nodes:
     """Exact solves of one wavelength by pair of sizes, each solved once; where the
     sizes may be exchanged, half of them follow by symmetry.
 
-    solves: number of pairs solved so far.
+    known: {pair: (5,) Jones matrix xx, xy, yx, yy, and error bar}.
     """
 
     def __init__(
@@ -318,83 +314,56 @@ class _Nodes:
         sweep: Sweep,
         wavelength_um: float,
         reach: int,
-        journal: SweepJournal,
+        run: Callable[[list[Task], str], list[list[SolvedNodes]]],
     ) -> None:
         self._cell = cell
-        self._wavelength = wavelength_um
+        self._light = (Incidence(wavelength_um),)
         self._reach = reach
-        self._journal = journal
+        self._run = run
         self.swaps = is_exchange_symmetric(cell, sweep)
         self._tolerance = sweep.bar
-        self._known: dict[tuple[float, float], SolvedPillar] = {}
-        self.solves = 0
+        self.known: dict[tuple[float, float], Array] = {}
 
-    def solve(
-        self, pairs: list[tuple[float, float]], console: CommandConsole, label: str
-    ) -> list[SolvedPillar]:
-        """Jones matrix and error bar of every pair; new pairs are solved in parallel.
+    def solve(self, pairs: Array, label: str) -> tuple[Array, Array]:
+        """(n, 4) Jones matrices and (n,) error bars of every pair; new pairs are solved
+        in parallel.
 
         Args:
-            pairs: (x, y) sizes, um.
-            console: where progress is shown.
+            pairs: (n, 2) sizes along x and y, um.
             label: names the pairs in the progress.
         """
-        new_pairs = list(
-            dict.fromkeys(
-                self._first(pair)
-                for pair in pairs
-                if self._first(pair) not in self._known
-            )
-        )
-        light = (Incidence(self._wavelength),)
+        # by symmetry, the larger size is solved first
+        solved = -np.sort(-pairs, axis=1) if self.swaps else pairs
+        keys = [(float(x), float(y)) for x, y in solved]
+        new = [key for key in dict.fromkeys(keys) if key not in self.known]
         tasks = [
             Task(
                 "jones",
                 cell_of_sizes(self._cell, x, y),
-                light,
+                self._light,
                 (x,),
                 self._tolerance,
                 harmonics=self._reach,
             )
-            for x, y in new_pairs
+            for x, y in new
         ]
-        for pair, (solved,) in zip(
-            new_pairs, self._journal.run(tasks, console, label), strict=True
-        ):
-            t = solved.response[:, 0].reshape(2, 2)
-            self._known[pair] = SolvedPillar(t, float(solved.error.max()))
-        self.solves += len(new_pairs)
-        return [self._of(pair) for pair in pairs]
+        for key, (nodes,) in zip(new, self._run(tasks, label), strict=True):
+            self.known[key] = np.append(nodes.response[:, 0], nodes.error.max())
+        found = np.array([self.known[key] for key in keys])
+        swapped = (solved != pairs).any(axis=1)
+        found[swapped, :4] = found[swapped, 3::-1]  # exchanges x and y of t
+        return found[:, :4], found[:, 4].real
 
-    def _first(self, pair: tuple[float, float]) -> tuple[float, float]:
-        """The pair that is solved for this one; by symmetry, the larger size first."""
-        return (max(pair), min(pair)) if self.swaps else pair
-
-    def _of(self, pair: tuple[float, float]) -> SolvedPillar:
-        """Pillar of a solved pair; exchanging its sizes exchanges x and y of t."""
-        pillar = self._known[self._first(pair)]
-        if self._first(pair) == pair:
-            return pillar
-        return SolvedPillar(pillar.t[::-1, ::-1], pillar.error)
-
-    def grid(
-        self, x: Array, y: Array, console: CommandConsole, label: str
-    ) -> tuple[Array, Array]:
+    def grid(self, x: Array, y: Array) -> tuple[Array, Array]:
         """(m, n, 4) Jones matrices and (m, n) error bars of all pairs of nodes.
 
         Args:
             x: (m,) sizes, um.
             y: (n,) sizes, um.
-            console: where progress is shown.
-            label: names the pairs in the progress.
         """
-        pillars = self.solve(
-            [(float(a), float(b)) for a in x for b in y], console, label
-        )
-        shape = len(x), len(y)
-        return np.array([pillar.t for pillar in pillars]).reshape(*shape, 4), np.array(
-            [pillar.error for pillar in pillars]
-        ).reshape(shape)
+        pairs = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+        t, error = self.solve(pairs.reshape(-1, 2), "pillars")
+        return t.reshape(*pairs.shape[:2], 4), error.reshape(pairs.shape[:2])
 
 
 def sweep_two_sizes(
@@ -424,8 +393,8 @@ def sweep_two_sizes(
     """
     check_axes_sweep(cell, settings)
     settings = settings.with_tolerance(cell)
-    console = console or CommandConsole(quiet=True)
     journal = SweepJournal(checkpoint, cell, settings)
+    output = console or CommandConsole(quiet=True)
     places = size_entries(settings)
     reach = _choose_truncation(cell, settings)
     t = []
@@ -433,11 +402,17 @@ def sweep_two_sizes(
     held = []
     solves = 0
     for index, wavelength in enumerate(settings.wavelengths_um):
-        nodes = _Nodes(cell, settings, wavelength, reach, journal)
-        x, y = _choose_lines(nodes, settings, console)
-        values, bars = nodes.grid(x, y, console, "pillars")
+        nodes = _Nodes(
+            cell,
+            settings,
+            wavelength,
+            reach,
+            lambda tasks, label: journal.run(tasks, output, label),
+        )
+        x, y = _choose_lines(nodes, settings)
+        values, bars = nodes.grid(x, y)
         table = interpolate_table((x, y), values, places, tolerance=settings.bar)
-        held_pairs = _held_out(nodes, places, table.value, table.doubt, console)
+        held_pairs = _held_out(nodes, places, table)
         # half of the held-out pairs scale the bars, the other half tests them
         scale = max(0.5, 2 * float((held_pairs[::2, 2] / held_pairs[::2, 3]).max()))
         bar = np.minimum(
@@ -448,7 +423,7 @@ def sweep_two_sizes(
         t.append(table.value.reshape(*table.doubt.shape, 2, 2))
         error.append(bar)
         held.append(np.insert(held_pairs, 0, index, axis=1))
-        solves += nodes.solves
+        solves += len(nodes.known)
     provenance = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
     library = AxesLibrary(
         cell,
@@ -505,9 +480,7 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     return most
 
 
-def _choose_lines(
-    nodes: _Nodes, sweep: Sweep, console: CommandConsole
-) -> tuple[Array, Array]:
+def _choose_lines(nodes: _Nodes, sweep: Sweep) -> tuple[Array, Array]:
     """(x, y) nodes: seven Chebyshev points each, and lines added between them where the
     interpolations disagree most.
 
@@ -522,7 +495,7 @@ def _choose_lines(
         line[[0, -1]] = span
     while True:
         x, y = lines
-        values, _ = nodes.grid(x, y, console, "pillars")
+        values, _ = nodes.grid(x, y)
         doubt = interpolate_table((x, y), values, grid, tolerance=sweep.bar).doubt
         share_above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
         # a few pairs in a hundred may lie near resonances
@@ -555,11 +528,7 @@ def _add_lines(lines: Array, sizes: Array, profile: Array) -> Array:
 
 
 def _held_out(
-    nodes: _Nodes,
-    places: tuple[Array, Array],
-    value: Array,
-    doubt: Array,
-    console: CommandConsole,
+    nodes: _Nodes, places: tuple[Array, Array], table: InterpolatedTable
 ) -> Array:
     """(k, 4) x and y in um, error, and error estimate of the interpolation at the
     held-out entries, which are solved but not interpolated.
@@ -567,19 +536,13 @@ def _held_out(
     Args:
         nodes: solver of the wavelength.
         places: (p,) and (q,) sizes of the library, um.
-        value: (p, q, 4) interpolated Jones matrices.
-        doubt: (p, q) error estimate of the interpolation.
+        table: interpolated at these.
     """
     rows, columns = _held_out_places(places)
-    pairs = [
-        (float(places[0][i]), float(places[1][j]))
-        for i, j in zip(rows, columns, strict=True)
-    ]
-    exact = np.array(
-        [pillar.t.ravel() for pillar in nodes.solve(pairs, console, "held out")]
-    )
-    error = np.abs(value[rows, columns] - exact).max(axis=1)
-    return np.column_stack([np.array(pairs), error, doubt[rows, columns]])
+    pairs = np.column_stack([places[0][rows], places[1][columns]])
+    exact, _ = nodes.solve(pairs, "held out")
+    error = np.abs(table.value[rows, columns] - exact).max(axis=1)
+    return np.column_stack([pairs, error, table.doubt[rows, columns]])
 
 
 def _held_out_places(places: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -616,17 +579,10 @@ def _solver_error(
         derivative = np.abs(np.gradient(value, places[axis], axis=axis)).max(axis=-1)
         slope = np.hypot(slope, derivative)
     slope += 2 / (places[0][-1] - places[0][0])  # of a curve without features
-    node_index = [
-        np.interp(node, size, np.arange(len(size)))
-        for node, size in zip(nodes, places, strict=True)
-    ]
-    node_grid = np.stack(np.meshgrid(*node_index, indexing="ij"))
-    shift = bars / map_coordinates(slope, node_grid, order=1)
-    largest_shift = np.maximum.reduce(
-        [shift[:-1, :-1], shift[1:, :-1], shift[:-1, 1:], shift[1:, 1:]]
+    slope_at_nodes = RectBivariateSpline(*places, slope, kx=1, ky=1)(*nodes)
+    shift = bars / slope_at_nodes
+    largest_shift = sliding_window_view(shift, (2, 2)).max(axis=(2, 3))
+    row, column = (
+        np.digitize(size, node[1:-1]) for node, size in zip(nodes, places, strict=True)
     )
-    interval = [
-        np.clip(np.searchsorted(node, size, side="right") - 1, 0, len(node) - 2)
-        for node, size in zip(nodes, places, strict=True)
-    ]
-    return np.asarray(largest_shift[interval[0][:, None], interval[1]] * slope)
+    return np.asarray(largest_shift[row[:, None], column] * slope)
