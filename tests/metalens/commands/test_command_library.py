@@ -279,7 +279,6 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
     )  # 0.24 between drawn polygons, whose flats lie inside the circle
     verdict = found["verdicts"][0]
     assert verdict["pitch_um"] == 0.62
-    assert verdict["pillar"] == "Si-infrared"
     assert verdict["max_angle_deg"] == pytest.approx(
         48.9, abs=0.4
     )  # sin = 1.55/0.62 - 1.7462
