@@ -16,8 +16,8 @@ from layout import solids
 from layout.mask import cells, fields
 from layout.process.process import EtchProfile, ExposureSettings, Process
 from layout.study import focus, stitching, tolerance
-from layout.study.sensitivity import LogSensitivities
 from metalens.cell.record import Cell
+from metalens.fabrication import ResponseRates
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
 from metalens.propagate import chief_path, field_at
@@ -31,8 +31,8 @@ PROXY = Proxy(
     0.0,
 )
 TABLE_UM = np.arange(100, 301, 2) * 1e-3
-SENS = LogSensitivities(
-    TABLE_UM,
+SENS = ResponseRates(
+    TABLE_UM[:, None],
     np.array(
         [
             8j + 30j * (TABLE_UM - 0.1) - 1,
@@ -41,6 +41,7 @@ SENS = LogSensitivities(
         ]
     ),
     0.0,
+    np.zeros(len(TABLE_UM)),
 )
 BEAM = ExposureSettings(alpha_um=0.010, beta_um=31.0, eta=0.6)
 PROCESS = Process(etch=EtchProfile(sidewall_deg=1.0), exposure=BEAM)

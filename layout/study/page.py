@@ -10,14 +10,14 @@ import numpy as np
 from layout.mask.fields import FieldPlan
 from layout.process.process import Process
 from layout.study import stitching, tolerance
-from layout.study.sensitivity import LogSensitivities, compute_sensitivities
+from layout.study.sensitivity import compute_sensitivities
 from metalens.core.report import Section, Table
 from metalens.core.units import deg
-from metalens.fabrication import PairSensitivities, pair_sensitivities
+from metalens.fabrication import ResponseRates, pair_sensitivities
 from metalens.lens import Lens
 
 Answers = Mapping[
-    str, LogSensitivities | PairSensitivities
+    str, ResponseRates
 ]  # of light along "x" and "y"; of pillars of one size under ""
 
 
@@ -64,10 +64,7 @@ def study_sections(
 
 
 def _of_light(
-    lens: Lens,
-    process: Process,
-    plan: FieldPlan,
-    answers: LogSensitivities | PairSensitivities,
+    lens: Lens, process: Process, plan: FieldPlan, answers: ResponseRates
 ) -> list[Section]:
     """Sections on stitching and tolerance for one polarisation."""
     return [_stitching(lens, plan, process), tolerance_section(lens, process, answers)]
@@ -96,9 +93,7 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
     return Section("Stitching", text, [Table(("", "mean", "worst"), rows, digits=5)])
 
 
-def tolerance_section(
-    lens: Lens, process: Process, answers: LogSensitivities | PairSensitivities
-) -> Section:
+def tolerance_section(lens: Lens, process: Process, answers: ResponseRates) -> Section:
     """Each cause alone and all together, and what the numbers are not of.
 
     Args:

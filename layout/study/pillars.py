@@ -7,12 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
-from layout.study.sensitivity import LogSensitivities
 from metalens.core.arrays import Array
 from metalens.fabrication import (
     Kinds,
-    PairSensitivities,
     PairTable,
+    ResponseRates,
     State,
     perturbed_transmission,
 )
@@ -36,7 +35,7 @@ class OneSize:
 
     proxy: Proxy
     wavelength_um: float
-    sens: LogSensitivities
+    sens: ResponseRates
     diameter_um: Array
 
     def curve(self, bias_um: Array, state: State) -> Array:
@@ -71,7 +70,7 @@ class TwoSizes:
 
 
 def classify_pillars(
-    lens: Lens, sens: LogSensitivities | PairSensitivities
+    lens: Lens, sens: ResponseRates
 ) -> tuple[Array, Array, PillarKindsOfLens]:
     """Distinct kinds of the pillars of a lens.
 
@@ -85,7 +84,7 @@ def classify_pillars(
     """
     kinds = Kinds.of(lens.diameters)
     index = (kinds.index(lens.diameters) + 1) % (len(kinds.count) + 1)
-    if isinstance(sens, LogSensitivities):
+    if sens.sizes_um.shape[1] == 1:
         return (
             index,
             kinds.count,

@@ -11,10 +11,9 @@ import numpy as np
 
 from layout.study.focus import FocusSums
 from layout.study.pillars import PillarKindsOfLens, classify_pillars
-from layout.study.sensitivity import LogSensitivities
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
-from metalens.fabrication import Draw, PairSensitivities, Spread, State, draw_lenses
+from metalens.fabrication import Draw, ResponseRates, Spread, State, draw_lenses
 from metalens.lens import Lens
 
 _BAND, _PARTS = (
@@ -75,12 +74,7 @@ class SpreadModel:
 
 
 def reduce_spread(
-    lens: Lens,
-    sens: LogSensitivities | PairSensitivities,
-    focus: FocusSums,
-    spread: Spread,
-    *,
-    seed: int,
+    lens: Lens, sens: ResponseRates, focus: FocusSums, spread: Spread, *, seed: int
 ) -> SpreadModel:
     """Reduce a lens to sums over its pillars for a basis of their transmissions.
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from layout.process.process import Process
 from layout.study.focus import FocusWindow, focus_window, prepare_focus
-from layout.study.sensitivity import LogSensitivities, compute_sensitivities
+from layout.study.sensitivity import compute_sensitivities
 from layout.study.spread_model import SpreadModel, reduce_spread, reduction_error
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.fabrication import (
     Draw,
-    PairSensitivities,
+    ResponseRates,
     State,
     draw_lenses,
     pair_sensitivities,
@@ -98,7 +98,7 @@ def analyse_tolerance(
     lens: Lens,
     process: Process,
     *,
-    sens: LogSensitivities | PairSensitivities | None = None,
+    sens: ResponseRates | None = None,
     depths_um: tuple[float, ...] = (),
     draws: int = 100,
     seed: int = 0,

@@ -2,7 +2,7 @@ from . import perturbations as perturbations
 from .bias import STEEPEST as STEEPEST
 from .bias import Bias as Bias
 from .bias import read_csv as read_csv
-from .own import OwnRates as OwnRates
+from .own import ResponseRates as ResponseRates
 from .own import own_rates as own_rates
 from .own import pair_rates as pair_rates
 from .perturbations import PERTURBATIONS as PERTURBATIONS
@@ -31,7 +31,6 @@ from .process import of_process as of_process
 from .process import with_table as with_table
 from .response import Answer as Answer
 from .response import Sensitivity as Sensitivity
-from .response import Slopes as Slopes
 from .response import Solved as Solved
 from .response import bias_ratio as bias_ratio
 from .response import designed_transmission as designed_transmission
@@ -40,6 +39,5 @@ from .response import perturbed_transmission as perturbed_transmission
 from .response import prepare_response as prepare_response
 from .response import proxy_sensitivity as proxy_sensitivity
 from .two_sizes import Kinds as Kinds
-from .two_sizes import PairSensitivities as PairSensitivities
 from .two_sizes import PairTable as PairTable
 from .two_sizes import pair_sensitivities as pair_sensitivities

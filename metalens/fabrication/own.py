@@ -2,7 +2,7 @@
 errors, and by their edges.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,11 @@ from metalens.cell import Cell
 from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.perturbations import changed_pillar, response_errors
+from metalens.fabrication.perturbations import (
+    changed_pillar,
+    response_errors,
+    with_missing,
+)
 from metalens.library.axes import cell_of_sizes
 
 if TYPE_CHECKING:
@@ -25,23 +29,53 @@ _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class OwnRates:
-    """Logarithmic derivatives of t at some sizes.
+class ResponseRates:
+    """Logarithmic derivatives of t at solved sizes, and between these by radial
+    functions |r - r_j| (linear interpolation, where pillars have one size).
 
+    Beyond the sizes of pillars of one size, the end value holds.
+
+    sizes_um: (n, k) solved sizes, k = 1 or 2 (along x and along y) a pillar.
     rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0
-        for errors that such pillars cannot have.
-    edges: (n,) by a bias of all edges less that by the size, per um; 0 where a shape
-        keeps its form as its edges move (circles, squares).
+        for errors that such pillars cannot have. Rows that are missing are 0.
     error: largest relative change (rms over the sizes) of one of them from a coarser
-        truncation.
+        truncation, with that of the interpolation of two sizes.
+    edges: (n,) by a bias of all edges less that by the size, per um; 0 where a shape
+        keeps its form as its edges move (circles, squares), and for two sizes.
     """
 
+    sizes_um: Array
     rates: Array
-    edges: Array
     error: float
+    edges: Array
+
+    def at(self, *sizes_um: Array) -> Array:
+        """(pillar-response errors, *shape) derivatives of ln t.
+
+        Args:
+            sizes_um: (*shape) one array of sizes, or those along x and along y, um.
+        """
+        return with_missing(list(self._interpolate(self.rates, sizes_um)))
+
+    def by_edges(self, size_um: Array) -> Array | None:
+        """(*shape) change of ln t per um of a bias of all edges, beyond that of the
+        size; None where that is nothing.
+        """
+        if not self.edges.any():
+            return None
+        return np.asarray(self._interpolate(self.edges[None], (size_um,))[0])
+
+    def _interpolate(self, rows: Array, sizes_um: tuple[Array, ...]) -> Array:
+        """(rows, *shape) values at sizes, from (rows, n) at the solved sizes."""
+        from scipy.interpolate import RBFInterpolator
+
+        places = np.stack(sizes_um, axis=-1)
+        between = RBFInterpolator(self.sizes_um, rows.T, kernel="linear", degree=0)
+        values = between(places.reshape(-1, len(sizes_um)))
+        return np.asarray(values.T.reshape(len(rows), *places.shape[:-1]))
 
 
-def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
+def own_rates(lens: "Lens", size_um: Array) -> ResponseRates:
     """Derivatives of ln t of a lens's pillars by every pillar-response error.
 
     Central differences of RCWA, for the light of the lens's proxy.
@@ -72,7 +106,9 @@ def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
     return rates
 
 
-def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, OwnRates]:
+def pair_rates(
+    lens: "Lens", width_um: Array, length_um: Array
+) -> dict[str, ResponseRates]:
     """As :func:`own_rates`, of pillars of two sizes, for light along "x" and along "y".
 
     Their table knows both sizes, so that nothing is left of a bias of all edges:
@@ -87,7 +123,12 @@ def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, Own
         (cell_of_sizes(lens.cell, float(w), float(d)), float(w))
         for w, d in zip(width_um, length_um, strict=True)
     ]
-    return dict(zip("xy", _rates(lens, cells, {}, (_ALONG_X, _ALONG_Y)), strict=True))
+    sizes = np.stack([width_um, length_um], axis=1)
+    solved = _rates(lens, cells, {}, (_ALONG_X, _ALONG_Y))
+    return {
+        light: replace(rates, sizes_um=sizes)
+        for light, rates in zip("xy", solved, strict=True)
+    }
 
 
 def _rates(
@@ -95,8 +136,8 @@ def _rates(
     cells: list[tuple[Cell, float]],
     edges: dict[str, float],
     weights: tuple[Array, ...],
-) -> list[OwnRates]:
-    """Rates of pillars, one :class:`OwnRates` for each weighting of the Jones matrix.
+) -> list[ResponseRates]:
+    """Rates of pillars, one :class:`ResponseRates` for each weighting of the Jones matrix.
 
     Args:
         lens: the lens.
@@ -109,20 +150,26 @@ def _rates(
     slopes = np.array(list(executor.gather_parallel(_log_slopes, common, tasks)))
     # (truncations, cells, weights, causes) to (weights, truncations, causes, cells)
     slopes = slopes.reshape(len(_TRUNCATIONS), len(cells), len(weights), -1)
-    return [_with_error(coarse, fine) for coarse, fine in slopes.transpose(2, 0, 3, 1)]
+    sizes = np.array([size for _, size in cells])[:, None]
+    return [
+        _with_error(sizes, coarse, fine)
+        for coarse, fine in slopes.transpose(2, 0, 3, 1)
+    ]
 
 
-def _with_error(coarse: Array, fine: Array) -> OwnRates:
+def _with_error(sizes_um: Array, coarse: Array, fine: Array) -> ResponseRates:
     """Rates of the finer truncation, with the largest relative change from the coarser.
 
     Args:
+        sizes_um: (n, 1) sizes.
         coarse, fine: (causes + 1, n) rates, the last row by the edges.
     """
     change = np.linalg.norm(fine - coarse, axis=1)
     relative = change / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
     # rates that a mirror of the cell forbids (a turn) are rounding errors
     nonzero = np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()
-    return OwnRates(fine[:-1], fine[-1], float((relative * nonzero).max()))
+    error = float((relative * nonzero).max())
+    return ResponseRates(sizes_um, fine[:-1], error, fine[-1])
 
 
 def polarization_weights(lens: "Lens") -> Array:

@@ -4,7 +4,6 @@ diameter, and t itself under a change.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
@@ -12,9 +11,8 @@ from numpy.polynomial import chebyshev, polynomial
 from metalens.cell import Cell, Index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.own import own_rates
+from metalens.fabrication.own import ResponseRates, own_rates
 from metalens.fabrication.perturbations import Guide, response_errors, with_missing
-from metalens.fabrication.two_sizes import PairSensitivities
 from metalens.lens import Lens
 from metalens.library import Proxy
 
@@ -75,10 +73,10 @@ class Sensitivity:
     high_um: float = math.inf
     solved: Solved | None = None
     edges: Array | None = None
-    pairs: PairSensitivities | None = None
+    pairs: ResponseRates | None = None
 
     @classmethod
-    def of_pairs(cls, pairs: PairSensitivities) -> "Sensitivity":
+    def of_pairs(cls, pairs: ResponseRates) -> "Sensitivity":
         """Of pillars of two sizes."""
         return cls(np.zeros((0, 1)), 0.0, pairs.error, pairs=pairs)
 
@@ -176,20 +174,6 @@ class Answer:
                     slope = polynomial.polyval(amount, polynomial.polyder(row))
                     out[n] = slope / polynomial.polyval(amount, row)
         return out
-
-
-class Slopes(Protocol):
-    """Anything with the derivatives of ln t by the pillar-response errors."""
-
-    def at(self, diameter_um: Array) -> Array:
-        """(pillar-response errors, *shape) derivatives of ln t by the base unit of
-        each.
-        """
-        ...
-
-    def by_edges(self, diameter_um: Array) -> Array | None:
-        """(*shape) per um, beyond what the size says; None for nothing."""
-        ...
 
 
 def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
@@ -371,7 +355,9 @@ def _phase_and_level(
     return np.asarray(phase), np.asarray(level)
 
 
-def prepare_response(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
+def prepare_response(
+    proxy: Proxy, response: Sensitivity | ResponseRates, diameter_um: Array
+) -> Answer:
     """Response of pillars to the pillar-response errors, for many amounts of these.
 
     Where ``response`` has solved series of t, these replace the linear slopes of their
@@ -394,7 +380,9 @@ def prepare_response(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answ
     )
 
 
-def bias_ratio(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
+def bias_ratio(
+    response: Sensitivity | ResponseRates, d_um: Array, bias_um: Array | float
+) -> Array | float:
     """t of pillars whose edges moved by a bias to sizes ``d_um``, over t of that
     design.
 
@@ -412,7 +400,7 @@ def bias_ratio(response: Slopes, d_um: Array, bias_um: Array | float) -> Array |
 
 def perturbed_transmission(
     proxy: Proxy,
-    response: Slopes,
+    response: Sensitivity | ResponseRates,
     d_um: Array,
     wavelength_um: float,
     answers: Array,

@@ -2,15 +2,14 @@
 answers of a solver.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.own import pair_rates
-from metalens.fabrication.perturbations import with_missing
+from metalens.fabrication.own import ResponseRates, pair_rates
 from metalens.lens import DiameterMap, Lens
 
 _PAIRS = 24  # pairs of sizes that are solved
@@ -154,33 +153,7 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
     return np.where(width > 0, (width << 32) + length, 0)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class PairSensitivities:
-    """Logarithmic derivatives of t by the pillar-response errors, of pillars of two
-    sizes and one polarisation.
-
-    width_um, length_um: (n,) pairs that were solved. rates: (pillar-response errors, n)
-        complex, by the base unit of each (um, rad, 1). error: largest relative change
-        of one of them from a coarser truncation, and what the rates of the second half
-        of the pairs differ by from those of the first half, carried there.
-    """
-
-    width_um: Array
-    length_um: Array
-    rates: Array
-    error: float
-
-    def at(self, width_um: Array, length_um: Array) -> Array:
-        """(pillar-response errors, n) derivatives of ln t."""
-        rates = _interpolate_rates(
-            (self.width_um, self.length_um), self.rates, (width_um, length_um)
-        )
-        return with_missing(list(rates))
-
-
-def pair_sensitivities(
-    lens: Lens, *, count: int = _PAIRS
-) -> dict[str, PairSensitivities]:
+def pair_sensitivities(lens: Lens, *, count: int = _PAIRS) -> dict[str, ResponseRates]:
     """Derivatives of ln t at size pairs of the lens, for light along "x" and along "y".
 
     Up to ``count`` pairs far from one another are solved by RCWA, by central
@@ -199,12 +172,7 @@ def pair_sensitivities(
     width, length = pairs[_farthest_points(pairs, int(kinds.count.argmax()), count)].T
     solved = pair_rates(lens, width, length)
     return {
-        light: PairSensitivities(
-            width,
-            length,
-            rates.rates,
-            rates.error + _held_out_error(width, length, rates.rates),
-        )
+        light: replace(rates, error=rates.error + _held_out_error(rates))
         for light, rates in solved.items()
     }
 
@@ -228,45 +196,21 @@ def _farthest_points(points: Array, first: int, count: int) -> list[int]:
     return chosen
 
 
-def _interpolate_rates(
-    nodes: tuple[Array, Array], rates: Array, places: tuple[Array, Array]
-) -> Array:
-    """(causes, places) rates at size pairs, by linear radial basis functions.
-
-    Args:
-        nodes: (n,) widths and lengths that were solved, um.
-        rates: (causes, n) complex rates there.
-        places: (m,) widths and lengths, um.
-    """
-    from scipy.interpolate import RBFInterpolator
-
-    interpolate = RBFInterpolator(
-        np.stack(nodes, 1), rates.T, kernel="linear", degree=0
-    )
-    return np.asarray(interpolate(np.stack(places, 1)).T)
-
-
-def _held_out_error(width_um: Array, length_um: Array, rates: Array) -> float:
+def _held_out_error(solved: ResponseRates) -> float:
     """Largest relative rms error over causes of rates predicted at held-out pairs.
 
     The second half of the pairs is predicted from the first half.
 
     Args:
-        width_um: (n,) sizes along x, um.
-        length_um: (n,) sizes along y, um.
-        rates: (causes, n) complex rates.
+        solved: (n,) pairs of sizes.
     """
-    half = (len(width_um) + 1) // 2
-    if half == len(width_um):
+    sizes, rates = solved.sizes_um, solved.rates
+    half = (len(sizes) + 1) // 2
+    if half == len(sizes):
         return 0.0
-    fitted, judged = slice(half), slice(half, None)
-    predicted = _interpolate_rates(
-        (width_um[fitted], length_um[fitted]),
-        rates[:, fitted],
-        (width_um[judged], length_um[judged]),
-    )
-    residual = np.linalg.norm(predicted - rates[:, judged], axis=1)
-    scale = np.linalg.norm(rates[:, judged], axis=1)
-    relative = residual / np.maximum(scale, 1e-9)
+    first = replace(solved, sizes_um=sizes[:half], rates=rates[:, :half])
+    judged = rates[:, half:]
+    residual = np.linalg.norm(first.at(*sizes[half:].T)[: len(rates)] - judged, axis=1)
+    relative = residual / np.maximum(np.linalg.norm(judged, axis=1), 1e-9)
     nonzero = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
     return float((relative * nonzero).max())

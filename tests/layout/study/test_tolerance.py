@@ -11,7 +11,7 @@ from layout.mask import fields
 from layout.process.process import EtchProfile, Process, WriteField
 from layout.study import focus, stitching, tolerance
 from layout.study import page as study_page
-from layout.study.sensitivity import LogSensitivities, compute_sensitivities
+from layout.study.sensitivity import compute_sensitivities
 from layout.study.spread_model import reduce_spread, reduction_error
 from metalens import modal
 from metalens.cell.lattice import Lattice
@@ -21,6 +21,7 @@ from metalens.core.errors import ProcessError
 from metalens.core.report import Figure, Table
 from metalens.fabrication import (
     ResponseError,
+    ResponseRates,
     Spread,
     draw_lenses,
     names_of_kind,
@@ -39,8 +40,8 @@ PROXY = Proxy(
     0.0,
 )
 DIAMETERS = np.linspace(0.1, 0.3, 9)
-SENS = LogSensitivities(
-    DIAMETERS,
+SENS = ResponseRates(
+    DIAMETERS[:, None],
     np.array(
         [
             8j + 30j * (DIAMETERS - 0.1) - 1.0,
@@ -49,6 +50,7 @@ SENS = LogSensitivities(
         ]
     ),
     0.01,
+    np.zeros(9),
 )
 
 
@@ -245,7 +247,7 @@ def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, sha
     assert found.rates[2] == pytest.approx(np.zeros(2), abs=1e-6)
     # an index change counts by the area of the pillar, to first order in the contrast
     # (and no coupling)
-    filled = share * found.diameter_um**2 / 0.3**2
+    filled = share * found.sizes_um[:, 0] ** 2 / 0.3**2
     assert found.rates[1].imag == pytest.approx(
         2 * np.pi / 0.85 * 0.7 * filled, rel=0.03
     )
@@ -262,7 +264,7 @@ def test_sensitivities_of_a_layered_film_of_air_are_the_optical_path_of_its_own_
         dataclasses.replace(hyperbolic(), cell=film, proxy=narrow), count=2
     )
     assert found.rates[0] == pytest.approx(np.full(2, 2j * np.pi / 0.85), abs=1e-6)
-    filled = np.pi / 4 * found.diameter_um**2 / 0.3**2
+    filled = np.pi / 4 * found.sizes_um[:, 0] ** 2 / 0.3**2
     assert found.rates[1].imag == pytest.approx(
         2 * np.pi / 0.85 * 0.5 * filled, rel=0.03
     )  # as in the test above

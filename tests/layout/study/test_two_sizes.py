@@ -18,9 +18,9 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.report import Table
 from metalens.fabrication import (
-    PairSensitivities,
     PairTable,
     ResponseError,
+    ResponseRates,
     Spread,
     State,
     draw_lenses,
@@ -94,7 +94,7 @@ def told(lens):
         np.stack([d.diameter_um[d.diameter_um > 0], d.length_um[d.diameter_um > 0]], 1),
         axis=0,
     )
-    return PairSensitivities(*pairs.T, rates(*pairs.T), 0.02)
+    return ResponseRates(pairs, rates(*pairs.T), 0.02, np.zeros(len(pairs)))
 
 
 @pytest.mark.parametrize("light", ["x", "y"])
@@ -147,7 +147,7 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
     """
     lens = two_sizes()
     corner = dataclasses.replace(
-        told(lens), width_um=np.array([0.3]), length_um=np.array([0.12])
+        told(lens), sizes_um=np.array([[0.3, 0.12]])
     )
     corner = dataclasses.replace(corner, rates=np.zeros((3, 1)))
     few = DiameterMap(
@@ -191,7 +191,12 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
 
     def solved(lens, width_um, length_um):
         asked.append(np.stack([width_um, length_um], 1))
-        made = own.OwnRates(rates(width_um, length_um), np.zeros(len(width_um)), 0.03)
+        made = own.ResponseRates(
+            np.stack([width_um, length_um], 1),
+            rates(width_um, length_um),
+            0.03,
+            np.zeros(len(width_um)),
+        )
         return {"x": made, "y": dataclasses.replace(made, rates=2 * made.rates)}
 
     monkeypatch.setattr(by_pairs, "pair_rates", solved)
@@ -199,21 +204,19 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
     every = told(lens)
     assert asked[0].shape == (30, 2)
     gaps = np.linalg.norm(asked[0][:, None] - asked[0], axis=-1) + np.eye(30)
-    covered = np.linalg.norm(
-        asked[0][:, None] - np.stack([every.width_um, every.length_um], 1), axis=-1
-    ).min(0)
+    covered = np.linalg.norm(asked[0][:, None] - every.sizes_um, axis=-1).min(0)
     assert (
         covered.max() <= gaps.min()
     )  # no pair is farther from a solved one than those are from each other
-    want = rates(every.width_um, every.length_um)
+    want = rates(*every.sizes_um.T)
     off = np.linalg.norm(
-        found["x"].at(every.width_um, every.length_um)[:3] - want, axis=1
+        found["x"].at(*every.sizes_um.T)[:3] - want, axis=1
     ) / np.linalg.norm(want, axis=1)
     assert 0.03 + off.max() < found["x"].error < 0.2
     assert found["y"].rates == pytest.approx(2 * found["x"].rates)
-    assert pair_sensitivities(lens, count=10_000)["x"].at(
-        every.width_um, every.length_um
-    )[:3] == pytest.approx(want)
+    assert pair_sensitivities(lens, count=10_000)["x"].at(*every.sizes_um.T)[
+        :3
+    ] == pytest.approx(want)
 
 
 def test_fields_of_pairs_add_up_to_their_light():

@@ -110,7 +110,7 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
 
     def solved(lens, size_um):
         rates = np.array([table(rows.get(i, {}), size_um) for i in range(len(ROWS))])
-        return own.OwnRates(rates, table(edge, size_um), 0.013)
+        return own.ResponseRates(size_um[:, None], rates, 0.013, table(edge, size_um))
 
     monkeypatch.setattr(response, "own_rates", solved)
     found = response.proxy_sensitivity(lens())
