@@ -236,7 +236,7 @@ def _gaps(
         half_width: least half-width of an interval, um.
     """
     gaps: list[tuple[float, float]] = []
-    for centre, width, *_ in sorted(narrow):
+    for centre, width, *_ in sorted(map(list, narrow)):
         reach = max(half_width, REACH * width)
         low, high = centre - reach, centre + reach
         if gaps and low <= gaps[-1][1]:
@@ -283,7 +283,7 @@ def find_faults(
     """
     t, bars = t.reshape(-1, len(d)), bars.reshape(-1, len(d))
     level = np.abs(t)
-    weak = (level < least_transmission).any(axis=0)
+    weak = np.asarray((level < least_transmission).any(axis=0))
     step = np.diff(np.unwrap(np.angle(t), axis=-1), axis=-1) * (-1 if hole else 1)
     reversal = np.pad((step < 0).any(axis=0), 1)
     faults = [
@@ -296,7 +296,7 @@ def find_faults(
             " with the size of the opening" if hole else " with the diameter",
         ),
         Fault(
-            (bars > UNKNOWN * level).any(axis=0),
+            np.asarray((bars > UNKNOWN * level).any(axis=0)),
             "an error bar above half of |t|",
             f" ({bars.max():.2g})",
         ),

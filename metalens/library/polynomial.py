@@ -111,10 +111,11 @@ def evaluate_curve(p: ChebyshevCurve, diameter: Values) -> Values:
     return cast(Values, _over_chunks(functools.partial(_sum_powers, p), d)[()])
 
 
-def evaluate_slope(p: ChebyshevCurve, diameter: Any) -> Any:
+def evaluate_slope(p: ChebyshevCurve, diameter: Values) -> Values:
     """dp/dD at ``diameter`` (um); otherwise as :func:`evaluate_curve` of ``p``."""
-    by_power = evaluate_curve(p.derivative, diameter)
-    return by_power * p.power * diameter ** (p.power - 1)
+    d: Any = diameter
+    by_power = evaluate_curve(p.derivative, d)
+    return cast(Values, by_power * p.power * d ** (p.power - 1))
 
 
 def _sum_powers(p: ChebyshevCurve, d: Any) -> Any:
@@ -183,7 +184,7 @@ def _torch_curve() -> Callable[[Any, ChebyshevCurve], Any]:
 
         @staticmethod
         def vmap(info: Any, dims: Any, diameter: Any, p: ChebyshevCurve) -> Any:
-            return Curve.apply(diameter, p), dims[0]
+            return apply(diameter, p), dims[0]
 
     apply: Callable[[Any, ChebyshevCurve], Any] = Curve.apply
     return apply
@@ -362,7 +363,7 @@ def _newton(p: ChebyshevCurve, phase: Array, place: Array, table: Array) -> Arra
         slope = _sum_powers(p.derivative, d) * p.power * d ** (p.power - 1)
         d -= np.divide(error, slope, out=np.zeros_like(d), where=slope != 0)
         np.clip(d, table.min(), table.max(), out=d)
-    return d
+    return np.asarray(d)
 
 
 def _first(mask: Array) -> tuple[int, ...]:

@@ -146,9 +146,7 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
     curvature is below 1e-3.
     """
     lens = two_sizes()
-    corner = dataclasses.replace(
-        told(lens), sizes_um=np.array([[0.3, 0.12]])
-    )
+    corner = dataclasses.replace(told(lens), sizes_um=np.array([[0.3, 0.12]]))
     corner = dataclasses.replace(corner, rates=np.zeros((3, 1)))
     few = DiameterMap(
         np.array([[0.3, 0.3], [0.0, 0.3]]),
