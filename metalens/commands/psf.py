@@ -112,98 +112,78 @@ class PsfSettings:
     light: Literal["both", "x", "y"] = "both"
 
     def __post_init__(self) -> None:
-        self._check_sources()
-        self._check_window()
-        self._check_light()
-
-    def _check_sources(self) -> None:
-        """Check depths, angles and the size of the source.
+        """Refuse settings out of range, and settings that exclude one another.
 
         Raises:
-            ConfigError: naming the setting and what is needed.
+            ConfigError: naming the settings and what is needed.
         """
         near, far, step = self.depths_mm or (1.0, 1.0, 1.0)
-        if not (0 < near <= far < np.inf and step > 0):
-            raise ConfigError(
-                f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
-            )
-        if not all(depth > 0 for depth in self.sources_mm):
-            raise ConfigError(
-                f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave"
-            )
-        angles = (*(self.angles_deg or ()), *self.angles_y_deg, 0.0)
-        if (far - near) / step > MOST_DEPTHS or max(map(abs, angles)) >= 90:
-            raise ConfigError(
-                f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
-                "angles within 90 degrees"
-            )
-        along_x = len(self.angles_deg or ())
-        if self.angles_deg == () or len(self.angles_y_deg) not in (0, along_x):
-            raise ConfigError(
-                f"{along_x} angles along x, {len(self.angles_y_deg)} along y: need one for each"
-            )
-        if (self.source_um and self.source_deg) or not (
-            self.source_um >= 0 and 0 <= self.source_deg < 90
-        ):
-            raise ConfigError(
-                f"source_um = {self.source_um}, source_deg = {self.source_deg}: need one of both, or 0 for a point"
-            )
-        if self.source_um and math.inf in self.sources_mm:
-            raise ConfigError(
-                f"source_um = {self.source_um}, sources_mm = {self.sources_mm}: a source at infinity has no size in "
-                "um; give source_deg"
-            )
-
-    def _check_window(self) -> None:
-        """Check width, height and samples of the window.
-
-        Raises:
-            ConfigError: naming the setting and what is needed.
-        """
+        depths = 0 < near <= far < math.inf and step > 0
+        along_x, along_y = self.angles_deg, self.angles_y_deg
+        pairs = along_x != () and len(along_y) in (0, len(along_x or ()))
+        steep = any(abs(angle) >= 90 for angle in (*(along_x or ()), *along_y))
+        sizes = self.source_um >= 0 and 0 <= self.source_deg < 90
         width = 1.0 if self.window_um is None else self.window_um
-        if not (2 <= self.samples <= MOST_SAMPLES and 0 < width < np.inf):
-            raise ConfigError(
-                f"samples = {self.samples}, window_um = {self.window_um}: need 2 to {MOST_SAMPLES} samples, window > 0"
-            )
-        if self.window_um is None:
-            if self.height_um:
-                raise ConfigError(f"height_um = {self.height_um}: need window_um too")
-            return
-        rows = self.samples_y
-        if not (self.height_um >= 0 and 1 <= rows <= MOST_SAMPLES):
-            raise ConfigError(
-                f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples"
-            )
-        step = self.window_um / self.samples
-        if self.height_um and abs(self.height_um / step - rows) > 1e-6 * rows:
-            raise ConfigError(
-                f"height_um = {self.height_um}: need a whole number of samples of window_um / samples = {step:g} "
-                f"um, as {rows * step:g}"
-            )
-
-    def _check_light(self) -> None:
-        """Check tolerance, spectrum and weights.
-
-        Raises:
-            ConfigError: naming the setting and what is needed.
-        """
-        if not (0 < self.tolerance < 1 and self.led_fwhm_nm >= 0):
-            raise ConfigError(
-                f"tolerance = {self.tolerance}, led_fwhm_nm = {self.led_fwhm_nm}: need 0 < tolerance < 1, width >= 0"
-            )
-        if bool(self.spectrum) + bool(self.led_fwhm_nm) + bool(self.wavelengths_nm) > 1:
-            raise ConfigError(
-                "two of spectrum, led_fwhm_nm and wavelengths_nm are given: each is the whole spectrum; give one"
-            )
-        if not all(0 < nm < np.inf for nm in self.wavelengths_nm):
-            raise ConfigError(
-                f"wavelengths_nm = {self.wavelengths_nm}: need wavelengths above 0"
-            )
-        good = len(self.weights) == len(self.wavelengths_nm) and sum(self.weights) > 0
-        if self.weights and not (good and min(self.weights) >= 0):
-            raise ConfigError(
-                f"weights = {self.weights} for wavelengths_nm = {self.wavelengths_nm}: need one of 0 or more for each"
-            )
+        fits = 2 <= self.samples <= MOST_SAMPLES and 0 < width < math.inf
+        rows = self.height_um / width * self.samples if fits else 1.0
+        whole = abs(rows - round(rows)) <= 1e-6 * rows
+        waves, weights = self.wavelengths_nm, self.weights
+        lights = bool(self.spectrum) + bool(self.led_fwhm_nm) + bool(waves)
+        weighted = len(weights) == len(waves) and sum(weights) > 0 <= min(
+            weights, default=0
+        )
+        checks = {
+            "depths_mm": (
+                depths and (far - near) / step <= MOST_DEPTHS,
+                "nearest, farthest and step with 0 < nearest <= farthest, and at most "
+                f"{MOST_DEPTHS} depths",
+            ),
+            "sources_mm": (
+                all(depth > 0 for depth in self.sources_mm),
+                "depths above 0, inf for a plane wave",
+            ),
+            "angles_deg, angles_y_deg": (
+                pairs and not steep,
+                "angles within 90 degrees, and along y none or one for each along x",
+            ),
+            "source_um, source_deg": (
+                sizes and not (self.source_um and self.source_deg),
+                "one of both, or 0 for a point",
+            ),
+            "source_um, sources_mm": (
+                not (self.source_um and math.inf in self.sources_mm),
+                "source_deg, as a source at infinity has no size in um",
+            ),
+            "samples, window_um": (
+                fits,
+                f"2 to {MOST_SAMPLES} samples, and a window above 0",
+            ),
+            "height_um, window_um": (
+                not self.height_um
+                or (self.window_um and whole and 1 <= round(rows) <= MOST_SAMPLES),
+                f"window_um, and a height of a whole number of up to {MOST_SAMPLES} "
+                "samples of window_um / samples",
+            ),
+            "tolerance": (0 < self.tolerance < 1, "an error above 0 and below 1"),
+            "spectrum, led_fwhm_nm, wavelengths_nm": (
+                lights <= 1 and self.led_fwhm_nm >= 0,
+                "one of them, each is the whole spectrum",
+            ),
+            "wavelengths_nm": (
+                all(0 < wave < math.inf for wave in waves),
+                "wavelengths above 0",
+            ),
+            "weights, wavelengths_nm": (
+                not weights or weighted,
+                "a weight of 0 or more for each",
+            ),
+        }
+        for names, (met, need) in checks.items():
+            if not met:
+                stated = [
+                    f"{name} = {getattr(self, name)}" for name in names.split(", ")
+                ]
+                raise ConfigError(f"{', '.join(stated)}: need {need}")
 
     @property
     def samples_y(self) -> int:
@@ -250,14 +230,10 @@ class PsfSettings:
                 focus_mm = device.source_distance_um * 1e-3
                 if near < focus_mm < far:
                     depths[np.abs(1 / depths - 1 / focus_mm).argmin()] = focus_mm
-                filled = replace(
-                    filled,
-                    depths_mm=(near, far, (far - near) / 20),
-                    sources_mm=tuple(depths.tolist()),
-                )
+                filled = replace(filled, sources_mm=tuple(depths.tolist()))
         if self.window_um is not None:
             return filled
-        ends = self.sources_mm or (filled.depths_mm or filled.sources_mm)[:2]
+        ends = filled.sources_mm or (filled.depths_mm or ())[:2]
         ends_um = tuple(z * 1e3 for z in ends)
         return replace(filled, window_um=reach.window_um(device, ends_um, airy=AIRY))
 
@@ -345,10 +321,8 @@ def _angles_deg(
     if angles_rad is not None and len(angles_rad):
         x, y = np.rad2deg(np.unique(angles_rad, axis=0)).T
         return tuple(x.tolist()), tuple(y.tolist())
-    distances = device.sensor_distance_um, device.source_distance_um
-    focus = design.Focus(device.wavelength_um, *distances, device.layers)
     radius_um = device.diameters.radius_um + device.diameters.pitch_um / 2
-    half = math.degrees(design.field_angle(focus, radius_um))
+    half = math.degrees(design.field_angle(design.lens_focus(device), radius_um))
     return (0.0, float(f"{half:.2g}")), (0.0, 0.0)
 
 

@@ -299,11 +299,10 @@ def test_depths_and_window_that_are_left_out_follow_the_lens():
     settings = PsfSettings(angles_deg=(0.0,)).about(made)
     rim = made.diameters.radius_um
     most = 2 * 1.75 * 0.85 / rim**2
-    near, far, step = settings.depths_mm
+    near, far = settings.sources_mm[0], settings.sources_mm[-1]
     assert near == pytest.approx(1e-3 / (1 / 1300 + most), rel=0.05)  # two digits
     assert far == pytest.approx(10 * near, rel=0.05)
     assert len(settings.view.depths_um) == 21
-    assert step == pytest.approx((far - near) / 20)
     blur = rim * 120 * (1 / (near * 1e3) - 1 / 1300)
     assert settings.window_um == pytest.approx(
         max(28 * 0.85 * 120 / rim, 8 * blur), rel=5e-3
