@@ -157,7 +157,6 @@ def test_info_shows_kind_and_provenance(tmp_path):
     text = run("info", tmp_path / "f.h5").stdout
     assert "psf version 1" in text
     assert "config: x = 1" in text
-    assert "@" in text
     values = json.loads(run("info", tmp_path / "f.h5", "--json").stdout)
     assert values["kind"] == "psf"
     assert values["arrays"]["image"] == "float64 (20, 20)"

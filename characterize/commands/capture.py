@@ -41,7 +41,7 @@ def run(options: Options) -> int:
 
 def _plan(options: Options, path: Path) -> int:
     """Plan the captures of a protocol, write them as a stage table, print; exit 0."""
-    if options.spread:
+    if options.workers is not None:
         raise ConfigError(
             "--workers shares out the frames of --truth; a plan takes none"
         )

@@ -71,7 +71,7 @@ class Options(DistributedOptions):
             ConfigError, WorkerError: as of other verbs; workers without --study, which
                 is all that they share.
         """
-        if self.spread and not self.study:
+        if self.workers is not None and not self.study:
             raise ConfigError(
                 "--workers shares out the work of --study: ask for it too, or leave it"
             )

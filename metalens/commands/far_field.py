@@ -59,8 +59,8 @@ def far_field_request(options: Any, built_lens: lens.Lens) -> FarFieldRequest:
         built_lens: the lens, whose wavelength is the default.
 
     Raises:
-        ConfigError: an option that says nothing of a far field, or more than one depth
-            or wavelength.
+        ConfigError: an option that says nothing of a far field or is out of range, or
+            more than one depth or wavelength.
     """
     for field in dataclasses.fields(options):
         stated = getattr(options, field.name) not in (None, False)
@@ -68,30 +68,19 @@ def far_field_request(options: Any, built_lens: lens.Lens) -> FarFieldRequest:
             raise ConfigError(
                 f"{field.name}: not for a far field, which takes {', '.join(TAKES[:5])}"
             )
-    sources = options.sources_mm or (math.inf,)
-    waves = options.wavelengths_nm or (1e3 * built_lens.wavelength_um,)
-    along_x = options.angles_deg or (0.0,)
-    along_y = options.angles_y_deg or (0.0,) * len(along_x)
-    if len(sources) > 1 or len(waves) > 1 or len(along_x) != len(along_y):
-        raise ConfigError(
-            f"sources_mm = {options.sources_mm}, wavelengths_nm = "
-            f"{options.wavelengths_nm}, {len(along_x)} angles along x, {len(along_y)} "
-            "along y: a far field takes one depth, one wavelength, and as many angles "
-            "along y as along x"
-        )
-    source = sources[0]
-    wave = waves[0]
-    tilted = max(map(abs, (*along_x, *along_y)))
-    if not (source > 0 and 0 < wave < math.inf and tilted < 90):
-        raise ConfigError(
-            f"sources_mm = {source}, wavelengths_nm = {wave}, angles to {tilted} deg: "
-            "need a depth and a wavelength above 0, and angles within 90 degrees"
-        )
+    settings = options.settings
+    sources = settings.sources_mm or (math.inf,)
+    waves = settings.wavelengths_nm or (1e3 * built_lens.wavelength_um,)
+    along_x = settings.angles_deg or (0.0,)
+    along_y = settings.angles_y_deg or (0.0,) * len(along_x)
     samples = SAMPLES if options.samples is None else options.samples
-    if not 3 <= samples <= 4001:
-        raise ConfigError(f"samples = {samples}: need 3 to 4001 across a far field")
+    if len(sources) > 1 or len(waves) > 1 or not 3 <= samples <= 4001:
+        raise ConfigError(
+            f"sources_mm = {sources}, wavelengths_nm = {waves}, samples = {samples}: a "
+            "far field takes one depth, one wavelength, and 3 to 4001 samples across"
+        )
     angles = tuple(zip(along_x, along_y, strict=True))
-    return FarFieldRequest(angles, source, wave, samples)
+    return FarFieldRequest(angles, sources[0], waves[0], samples)
 
 
 def compute_far_fields(

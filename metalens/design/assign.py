@@ -16,7 +16,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, LensError
 from metalens.core.store import Provenance
 from metalens.design import phase_map, profiles
-from metalens.design.candidates import CandidateTable, make_candidates
+from metalens.design.candidates import CandidateTable
 from metalens.design.focusing import field_angle
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.design.sites import LatticeSites, PhaseOf, lattice_sites, least_period_um
@@ -279,7 +279,7 @@ def assign_multi_wavelength(
     tabulated = _table_sizes(proxy, span, waves)
     responses = (_response(proxy, tabulated, wave) for wave in waves)
     t = [level * np.exp(1j * phase) for phase, level in responses]
-    table = make_candidates(np.stack(t), np.array(weights))
+    table = CandidateTable(np.stack(t), np.array(weights))
 
     def choose_sizes(targets: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
         chosen = span[0] + (tabulated[1] - tabulated[0]) * table.between(targets)
@@ -343,7 +343,7 @@ def assign_polarization_multiplexed(
     jones = library.t[wave, row, column]  # (candidates, 2, 2)
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]])
     sizes = np.array([library.x_um[row], library.y_um[column]], np.float32)
-    table = make_candidates(t, np.ones(2), common_piston=phases[1] is None)
+    table = CandidateTable(t, np.ones(2), common_piston=phases[1] is None)
     counts = np.zeros(t.shape[1], int)  # sites at which each candidate stands
 
     def choose_pairs(targets: Array) -> tuple[Array, list[tuple[Array, Array]]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,7 @@ _CONVERGED_RAD = 1e-3  # pistons that move less have converged
 _ROWS = 256  # sites whose sums (1) stay in a processor's cache
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class CandidateTable:
     """Candidate pillars for several channels, and the sums that rank them.
 
@@ -24,15 +25,22 @@ class CandidateTable:
     t: (channels, n) complex transmission of each candidate.
     weights: (channels,) w of (1), above 0.
     common_piston: whether all channels share one piston.
-    factors: (2 channels, n) float32 coefficients of cos phi and sin phi in (1).
-    power: (n,) sum_c w_c |t_cj|², the part of (1) that no phase changes.
     """
 
     t: Array
     weights: Array
-    common_piston: bool
-    factors: Array
-    power: Array
+    common_piston: bool = False
+
+    @cached_property
+    def factors(self) -> Array:
+        """(2 channels, n) float32 coefficients of cos phi and sin phi in (1)."""
+        weighted = -2 * self.weights[:, None] * self.t
+        return np.concatenate([weighted.real, weighted.imag]).astype(np.float32)
+
+    @cached_property
+    def power(self) -> Array:
+        """(n,) sum_c w_c |t_cj|², the part of (1) that no phase changes."""
+        return np.asarray(self.weights @ np.abs(self.t) ** 2, np.float32)
 
     def sums(self, phases_rad: Array) -> Array:
         """Sums (1) less the sum of the weights.
@@ -110,22 +118,6 @@ class CandidateTable:
                 break
         least = self.sums(phases + pistons[:, None]).min(1)
         return float(least.sum(dtype=float)), pistons
-
-
-def make_candidates(
-    t: Array, weights: Array, *, common_piston: bool = False
-) -> CandidateTable:
-    """The table of candidates with these transmissions.
-
-    Args:
-        t: (channels, n) complex transmission of each candidate.
-        weights: (channels,) w of (1), above 0.
-        common_piston: whether all channels share one piston.
-    """
-    weighted = -2 * weights[:, None] * t
-    factors = np.concatenate([weighted.real, weighted.imag]).astype(np.float32)
-    power = (weights @ np.abs(t) ** 2).astype(np.float32)
-    return CandidateTable(t, weights, common_piston, factors, power)
 
 
 def _vertices(sums: Array) -> Array:

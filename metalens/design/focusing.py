@@ -19,9 +19,7 @@ DARK = 1e-3  # of a perfect lens's peak; a darker meeting point is a vortex
 PLACES = 121  # points across the lens at which its wave front is sampled
 
 
-def has_focus(
-    phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float
-) -> bool:
+def has_focus(phase: PhaseOf, focus: Focus, radius_um: float, pitch_um: float) -> bool:
     """Whether rays from the design source meet in one bright spot of the sensor.
 
     They meet where their rms width on the sensor is at most 0.2 of that on the lens. An
@@ -56,22 +54,16 @@ def has_focus(
 
 def lens_has_focus(lens: Lens) -> bool:
     """Whether the rays of a lens meet, as :func:`has_focus`, by its nearest pillars."""
-    phase, focus, radius_um = _nearest_pillar_phase(lens)
-    pitch_um = lens.diameters.pitch_um
-    return has_focus(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
+    return has_focus(*_lens_rays(lens))
 
 
 def lens_meeting_um(lens: Lens) -> tuple[float, float, float] | None:
     """As :func:`meeting_um`, of the pillars of a lens."""
-    phase, focus, radius_um = _nearest_pillar_phase(lens)
-    pitch_um = lens.diameters.pitch_um
-    return meeting_um(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
+    return meeting_um(*_lens_rays(lens))
 
 
-def _nearest_pillar_phase(lens: Lens) -> tuple[PhaseOf, Focus, float]:
-    """Phase of the pillar nearest to a place, the design focus, and the radius in
-    um.
-    """
+def _lens_rays(lens: Lens) -> tuple[PhaseOf, Focus, float, float]:
+    """Phase of the pillar nearest to a place, design focus, radius and pitch in um."""
     d = lens.diameters
 
     def nearest(x_um: Array, y_um: Array) -> Array:
@@ -81,16 +73,14 @@ def _nearest_pillar_phase(lens: Lens) -> tuple[PhaseOf, Focus, float]:
                 (y_um, x_um), d.steps_um[::-1], d.diameter_um.shape, strict=True
             )
         )
-        row_phases = [
-            lens.rows_phase_rad(slice(row, row + 1))[0] for row in rows.tolist()
-        ]
-        return np.stack([row[columns] for row in row_phases])
+        ranges = (slice(row, row + 1) for row in rows.tolist())
+        return np.concatenate([lens.rows_phase_rad(row)[:, columns] for row in ranges])
 
-    return nearest, lens_focus(lens), d.radius_um + d.pitch_um / 2
+    return nearest, lens_focus(lens), d.radius_um + d.pitch_um / 2, d.pitch_um
 
 
 def meeting_um(
-    phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float
+    phase: PhaseOf, focus: Focus, radius_um: float, pitch_um: float
 ) -> tuple[float, float, float] | None:
     """Place (x, y, z) in um behind the lens where rays of the design source pass
     closest.

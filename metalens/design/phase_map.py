@@ -356,7 +356,7 @@ def _text(path: Path, shape: PhaseMap) -> PhaseSamples:
         ) from error
     if table.shape[1] == 3 and len(table) > 3 and _is_triple(header, table):
         return _gridded(path, table, header, shape)
-    return _square(_without_counts(table, header), path, shape)
+    return _square(_without_counts(table), path, shape)
 
 
 def _header(words: list[str]) -> list[str]:
@@ -379,20 +379,20 @@ def _counts(values: Array) -> bool:
     return len(values) > 2 and bool((values == start + np.arange(len(values))).all())
 
 
-def _without_counts(table: Array, header: list[str]) -> Array:
+def _without_counts(table: Array) -> Array:
     """A matrix without a leading row and column of counts (0, 1, 2 ...), as tables are
     saved.
 
     A table of whole numbers throughout is left as it is.
     """
     if len(table) > 2 and min(table.shape) > 2:
-        named_corner = np.isnan(table[0, 0]) and _counts(table[0, 1:])
         body = table[1:, 1:]
-        integers = bool((body == np.rint(body)).all())
-        if (named_corner or _counts(table[0])) and not integers:
+        if (body == np.rint(body)).all():
+            return table
+        if _counts(table[0]) or (np.isnan(table[0, 0]) and _counts(table[0, 1:])):
             table = table[1:]
-        if (named_corner or header or _counts(table[:, 0])) and not integers:
-            table = table[:, 1:] if _counts(table[:, 0]) else table
+        if _counts(table[:, 0]):
+            table = table[:, 1:]
     return table
 
 
