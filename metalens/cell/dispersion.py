@@ -80,7 +80,7 @@ class DispersionFormula:
             square = sum(a * w**p / (w2 - b**q) for a, p, b, q in poles)
             return cmath.sqrt(first + square + sum(b * w**e for b, e in powers))
         if self.number == 5:
-            return first + sum(b * w**e for b, e in pairs)
+            return complex(first + sum(b * w**e for b, e in pairs))
         if self.number == 6:
             return 1 + first + sum(b / (e - 1 / w2) for b, e in pairs)
         a, b, c, d, e = (*rest, *[0.0] * 5)[:5]

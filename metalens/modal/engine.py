@@ -8,7 +8,6 @@ import numpy as np
 
 from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
-from metalens.modal.assembly import AssembledDisc, assemble_disc
 from metalens.modal.case import ModalCase
 from metalens.modal.few_modes import (
     electric_pencil,
@@ -16,7 +15,6 @@ from metalens.modal.few_modes import (
     is_lossless,
     magnetic_pencil,
 )
-from metalens.modal.homogeneous import HomogeneousBasis, homogeneous_modes
 from metalens.modal.layer import LayerMedium, electric_modes, magnetic_modes
 from metalens.modal.match import (
     HalfSpace,
@@ -25,8 +23,8 @@ from metalens.modal.match import (
     scattering_matrix,
     zero_order,
 )
-from metalens.modal.mesh import MeshPlan
-from metalens.modal.spaces import build_symmetry_class, class_topology
+from metalens.modal.mesh import CellMatrices, MeshPlan, assemble_disc
+from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
 
 SMALL = 500  # unknowns of a symmetry class: more of the bases up to it are cached
 
@@ -49,7 +47,7 @@ class MeshSolution:
 
 
 @lru_cache(maxsize=4)
-def disc_geometry(rho: float, plan: MeshPlan) -> AssembledDisc:
+def disc_geometry(rho: float, plan: MeshPlan) -> tuple[CellMatrices, CellMatrices]:
     """Finite-element matrices of a disc ``rho`` pitches wide on the mesh of a ``plan``,
     cached.
     """
@@ -66,7 +64,8 @@ def homogeneous_basis(
         rho: diameter over pitch. plan: of the mesh.
         electric: whether the y walls are electric. bloch: half the Bloch phase.
     """
-    small = class_topology(plan, electric, bloch or None).vectors.size <= SMALL
+    space = symmetry_class(plan, electric, bloch or None)
+    small = space.gradient.shape[0] <= SMALL
     return (small_cached_basis if small else cached_basis)(rho, plan, electric, bloch)
 
 
@@ -79,9 +78,7 @@ def cached_basis(
     and ``bloch``.
     """
     return homogeneous_modes(
-        build_symmetry_class(
-            disc_geometry(rho, plan), electric=electric, half_phase_rad=bloch or None
-        )
+        disc_geometry(rho, plan), plan, electric=electric, half_phase_rad=bloch or None
     )
 
 

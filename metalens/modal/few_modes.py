@@ -18,8 +18,8 @@ from metalens.modal.dense import (
     symmetric_eigenvectors,
     whitened_levels,
 )
-from metalens.modal.homogeneous import HomogeneousBasis
 from metalens.modal.layer import LayerMedium, axial_wavenumber
+from metalens.modal.spaces import HomogeneousBasis
 
 # levels are diagonalised up to this multiple of the largest contribution of the
 # permittivities to the diagonal

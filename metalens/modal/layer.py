@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.homogeneous import HomogeneousBasis
+from metalens.modal.spaces import HomogeneousBasis
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from metalens.modal.case import Films
 from metalens.modal.few_modes import FewModes, LayerPencil
-from metalens.modal.homogeneous import HomogeneousBasis
 from metalens.modal.layer import LayerModes, axial_wavenumber
+from metalens.modal.spaces import HomogeneousBasis
 
 # relative distance of k² from its cutoff within which an order takes its exact
 # wavenumber

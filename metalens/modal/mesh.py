@@ -1,4 +1,6 @@
-"""The quarter cell as curvilinear quadrilaterals that follow the disc."""
+"""The quarter cell as curvilinear quadrilaterals that follow the disc, and its
+finite-element matrices with every wall natural.
+"""
 
 import math
 from dataclasses import dataclass
@@ -6,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from metalens.core.errors import CellError
 from metalens.modal.shapes import (
     IntervalBasis,
     SquareBasis,
@@ -14,360 +17,312 @@ from metalens.modal.shapes import (
     square_basis,
 )
 
-X0, X1, Y0, Y1 = (
-    1,
-    2,
-    4,
-    8,
-)  # walls of the quarter cell, as bits: x = 0, x = 1, y = 0, y = 1
+# walls of the quarter cell, as bits: x = 0, x = 1, y = 0, y = 1
+X0, X1, Y0, Y1 = 1, 2, 4, 8
+# of vertices at the centre, on the x axis (a), on the y axis (b) and on the diagonal;
+# and in addition at the edge of the cell
+WALLS = {"centre": X0 | Y0, "a": Y0, "b": X0, "diagonal": 0}
+EDGE_WALLS = {"a": X1, "b": Y1, "diagonal": X1 | Y1}
 
 
 @dataclass(frozen=True, slots=True)
 class MeshPlan:
     """What fixes the topology and the basis of a mesh (everything but the diameter).
 
-    radial, angular: polynomial degree across and along the rim; outside: radial degree
-    outside the disc.
-    exponents: of the rim bubbles. inner, outer: outer ends of the rings, as fractions
-    of the way from the core to
-    the circle, and from the circle to the edge of the cell. sectors: ends of the
-    sectors, as fractions of 45
-    degrees. core: half width of the core over the radius of the disc.
+    radial, angular: polynomial degree across and along the rim.
+    rings: ends of the rings around the disc but the last, as fractions of the way from
+        the circle to the edge of the cell, rising; inside likewise, to the core.
+    exponents: of the rim bubbles.
+    core: half width of the core over the radius of the disc.
     """
 
     radial: int
     angular: int
-    outside: int
+    rings: tuple[float, ...] = ()
     exponents: tuple[float, ...] = (0.7, 1.3)
-    inner: tuple[float, ...] = (1.0,)
-    outer: tuple[float, ...] = (1.0,)
-    sectors: tuple[float, ...] = (1.0,)
     core: float = 0.6
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MeshPatch:
-    """Elements that share one reference basis. Jacobians are (elements, points, 2)
-    arrays of (x, y).
+Vertex = tuple[str, int]  # place, ring from the core
 
-    inside: whether the elements belong to the disc. copies: 2 where each stands for
-    itself and its mirror image.
-    rho_xi, rho_eta, rest_xi, rest_eta: derivatives of P and Q along xi and eta.
-    vector, scalar: (copies, elements, functions) global numbers of the functions.
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MeshElement:
+    """The core of the disc (ring -1), or one ring with its mirror image.
+
+    start, end: of the ring, as fractions of the way from its inner to its outer curve.
+    vector, scalar: (copies, functions) global numbers of the functions.
     """
 
     basis: SquareBasis
     inside: bool
-    rho_xi: np.ndarray
-    rho_eta: np.ndarray
-    rest_xi: np.ndarray
-    rest_eta: np.ndarray
+    ring: int
+    start: float
+    end: float
+    radial: IntervalBasis
+    angular: IntervalBasis
     vector: np.ndarray
     scalar: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DiscMesh:
-    """Patches and the global numbering; ``vector_wall`` and ``scalar_wall`` hold the
-    wall bits of each function.
-    """
+    """Elements, and the wall bits of each function: ``vector_wall``, ``scalar_wall``."""
 
     plan: MeshPlan
-    patches: tuple[MeshPatch, ...]
+    elements: tuple[MeshElement, ...]
     vector_wall: np.ndarray
     scalar_wall: np.ndarray
 
 
-Vertex = tuple[str, int, int]
-
-
 class FunctionNumbering:
-    """Hands out global numbers for functions on vertices, edges and interiors; records
-    the walls they lie on.
+    """Hands out global numbers for functions on vertices, edges and interiors, each
+    with the walls it lies on.
     """
 
-    def __init__(self, rings: int, sectors: int) -> None:
-        self.rings, self.sectors = rings, sectors
-        self.vectors: dict[tuple[object, ...], int] = {}
-        self.scalars: dict[tuple[object, ...], int] = {}
-        self.vector_wall: list[int] = []
-        self.scalar_wall: list[int] = []
+    def __init__(self, rings: int) -> None:
+        self.rings = rings
+        self.vectors: dict[object, tuple[int, int]] = {}
+        self.scalars: dict[object, tuple[int, int]] = {}
 
     def wall_bits(self, vertex: Vertex) -> int:
         """Walls of the quarter cell that a vertex lies on, as bits."""
-        kind, i, j = vertex
-        if kind == "core":
-            return (X0 if i == 0 else 0) | (Y0 if j == 0 else 0)
-        last = i == self.rings
-        if kind == "diagonal":
-            return X1 | Y1 if last else 0
-        start, end = (Y0, X1) if kind == "A" else (X0, Y1)
-        return (start if j == 0 else 0) | (end if last else 0)
-
-    def number_vector(self, wall: int, *key: object) -> int:
-        """Number of the vector function ``key``; a new key takes the next number."""
-        if key not in self.vectors:
-            self.vectors[key] = len(self.vectors)
-            self.vector_wall.append(wall)
-        return self.vectors[key]
-
-    def number_scalar(self, wall: int, *key: object) -> int:
-        """Number of the scalar function ``key``; a new key takes the next number."""
-        if key not in self.scalars:
-            self.scalars[key] = len(self.scalars)
-            self.scalar_wall.append(wall)
-        return self.scalars[key]
+        place, ring = vertex
+        return WALLS[place] | (EDGE_WALLS[place] if ring == self.rings else 0)
 
     def number_element(
-        self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
+        self, v: tuple[Vertex, ...], px: int, py: int
     ) -> tuple[list[int], list[int]]:
         """Global numbers of the vector and scalar functions of one element.
 
-        Functions on an edge or a vertex are shared with the neighbours; interior
-        functions belong to the element.
+        A function belongs to the corner, edge or interior on which it does not vanish,
+        and is shared by the elements there.
 
         Args:
             v: corners v00, v10, v01, v11.
             px, py: polynomial degrees along both parameters.
         """
-        walls = [self.wall_bits(vertex) for vertex in v]
-        x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 
-        def on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.number_vector(
-                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
-            )
+        def number(
+            table: dict[object, tuple[int, int]],
+            xs: tuple[int, ...],
+            ys: tuple[int, ...],
+            *orders: object,
+        ) -> int:
+            corners = tuple(v[x + 2 * y] for y in ys for x in xs)
+            wall = X0 | X1 | Y0 | Y1
+            for corner in corners:
+                wall &= self.wall_bits(corner)
+            return table.setdefault((corners, orders), (len(table), wall))[0]
 
-        def scalar_on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.number_scalar(
-                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
-            )
+        def ends(order: int) -> tuple[int, ...]:
+            return (order,) if order < 2 else (0, 1)
 
         vectors = [
-            on_edge(x_ends[j], i) if j < 2 else self.number_vector(0, "x", v, i, j)
+            number(self.vectors, (0, 1), ends(j), i, *(("x", j) if j > 1 else ()))
             for i in range(px)
             for j in range(py + 1)
         ] + [
-            on_edge(y_ends[i], j) if i < 2 else self.number_vector(0, "y", v, i, j)
+            number(self.vectors, ends(i), (0, 1), j, *(("y", i) if i > 1 else ()))
             for i in range(px + 1)
             for j in range(py)
         ]
-        scalars = []
-        for i in range(px + 1):
-            for j in range(py + 1):
-                if i < 2 and j < 2:
-                    scalars.append(self.number_scalar(walls[i + 2 * j], v[i + 2 * j]))
-                elif j < 2:
-                    scalars.append(scalar_on_edge(x_ends[j], i))
-                elif i < 2:
-                    scalars.append(scalar_on_edge(y_ends[i], j))
-                else:
-                    scalars.append(self.number_scalar(0, "z", v, i, j))
+        scalars = [
+            number(self.scalars, ends(i), ends(j), *(k for k in (i, j) if k > 1))
+            for i in range(px + 1)
+            for j in range(py + 1)
+        ]
         return vectors, scalars
-
-
-def core_vertex(i: int, j: int, n: int) -> Vertex:
-    """Name of the corner (i, j) of a core of n by n elements; those on its rim are
-    named as the rings name them.
-    """
-    if i == n and j == n:
-        return ("diagonal", 0, 0)
-    if i == n:
-        return ("A", 0, j)
-    return ("B", 0, i) if j == n else ("core", i, j)
-
-
-def ring_vertex(side: str, ring: int, j: int, n: int) -> Vertex:
-    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above) with n
-    sectors; both sides share the diagonal. ring: from the core.
-    """
-    return ("diagonal", ring, 0) if j == n else (side, ring, j)
-
-
-def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
-    """Core of the disc: a bilinear quadrilateral with corners (0, 0), (a, 0), (c, c),
-    (0, a), cut along both parameters.
-
-    Args:
-        plan: of the mesh. numbers: hands out global numbers.
-    """
-    half_width = plan.core
-    excess = 0.8 * half_width - half_width
-    ends = np.concatenate([[0.0], plan.sectors])
-    n = len(plan.sectors)
-    line = polynomial_interval(plan.angular, plan.angular + 4)
-    points = line.point
-    along_u, along_v, vectors, scalars = [], [], [], []
-    for i in range(n):
-        for j in range(n):
-            du, dv = ends[i + 1] - ends[i], ends[j + 1] - ends[j]
-            u, v = np.meshgrid(
-                ends[i] + du * points, ends[j] + dv * points, indexing="ij"
-            )
-            along_u.append(
-                du * np.stack([half_width + excess * v, excess * v], -1).reshape(-1, 2)
-            )
-            along_v.append(
-                dv * np.stack([excess * u, half_width + excess * u], -1).reshape(-1, 2)
-            )
-            corners = tuple(
-                core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1)
-            )
-            numbered = numbers.number_element(corners, plan.angular, plan.angular)  # type: ignore[arg-type]
-            vectors.append(numbered[0])
-            scalars.append(numbered[1])
-    xi, eta = np.array(along_u), np.array(along_v)
-    zero = np.zeros_like(xi)
-    return MeshPatch(
-        square_basis(line, line),
-        True,
-        xi,
-        eta,
-        zero,
-        zero,
-        np.array([vectors]),
-        np.array([scalars]),
-    )
-
-
-def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as
-    parts P and Q of rho P + Q, each with its derivative.
-
-    Args:
-        plan: of the mesh. inside: whether the rings lie in the disc.
-    """
-    phi, rate = v * math.pi / 4, math.pi / 4
-    circle = np.stack([np.cos(phi), np.sin(phi)], -1)
-    d_circle = rate * np.stack([-np.sin(phi), np.cos(phi)], -1)
-    if inside:
-        a, c = plan.core, 0.8 * plan.core
-        start = np.stack([a + (c - a) * v, c * v], -1)
-        d_start = np.broadcast_to([c - a, c], start.shape)
-        return start, d_start, circle, d_circle
-    edge = np.stack([np.ones_like(phi), np.tan(phi)], -1)
-    d_edge = rate * np.stack([np.zeros_like(phi), 1 / np.cos(phi) ** 2], -1)
-    return circle, d_circle, edge, d_edge
-
-
-def ring_patch(
-    plan: MeshPlan,
-    numbers: FunctionNumbering,
-    rings: range,
-    *,
-    inside: bool,
-    radial: IntervalBasis,
-) -> MeshPatch:
-    """Elements of some rings on both sides of the diagonal.
-
-    An element maps (g, v) to (1 - g) start(v) + g end(v). Its Jacobian is stored as the
-    parts P and Q of rho P + Q, for side A; side B is its mirror image.
-
-    Args:
-        plan: of the mesh. numbers: hands out global numbers.
-        rings: counted from the core. inside: whether they lie in the disc.
-        radial: basis along the radius.
-    """
-    ring_ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
-    first = 0 if inside else len(plan.inner)
-    sector_ends = np.concatenate([[0.0], plan.sectors])
-    n = len(plan.sectors)
-    angular = polynomial_interval(plan.angular, plan.angular + 5)
-    jacobians: list[tuple[np.ndarray, ...]] = []
-    vectors: list[list[list[int]]] = [[], []]
-    scalars: list[list[list[int]]] = [[], []]
-    for ring in rings:
-        g0 = ring_ends[ring - first]
-        dg = ring_ends[ring - first + 1] - ring_ends[ring - first]
-        for j in range(n):
-            dv = sector_ends[j + 1] - sector_ends[j]
-            g, v = np.meshgrid(
-                g0 + dg * radial.point,
-                sector_ends[j] + dv * angular.point,
-                indexing="ij",
-            )
-            start, d_start, end, d_end = ring_curves(plan, inside, v.ravel())
-            g = g.reshape(-1, 1)
-            from_start = (-dg * start, dv * (1 - g) * d_start)
-            from_end = (dg * end, dv * g * d_end)
-            zero = np.zeros_like(start)
-            if inside:
-                jacobians.append(
-                    (
-                        from_start[0] + from_end[0],
-                        from_start[1] + from_end[1],
-                        zero,
-                        zero,
-                    )
-                )
-            else:
-                jacobians.append((*from_start, *from_end))
-            for copy, side in enumerate("AB"):
-                corners = tuple(
-                    ring_vertex(side, ring + k, j + m, n)
-                    for m in (0, 1)
-                    for k in (0, 1)
-                )
-                numbered = numbers.number_element(corners, radial.degree, plan.angular)  # type: ignore[arg-type]
-                vectors[copy].append(numbered[0])
-                scalars[copy].append(numbered[1])
-    parts = [np.array(part) for part in zip(*jacobians, strict=True)]
-    return MeshPatch(
-        square_basis(radial, angular),
-        inside,
-        parts[0],
-        parts[1],
-        parts[2],
-        parts[3],
-        np.array(vectors),
-        np.array(scalars),
-    )
 
 
 @lru_cache(maxsize=32)
 def build_mesh(plan: MeshPlan) -> DiscMesh:
-    """All patches of a mesh plan; cached, as they do not depend on the diameter.
+    """Elements of a mesh plan from the centre: core, rings of the disc, rings around
+    it; cached, as they do not depend on the diameter.
 
-    From the centre: the core, the plain rings of the disc, the ring at the rim inside
-    and the one outside with graded rules, and the plain rings around them.
+    The rings at the rim have singular functions and a graded rule.
     """
-    inner, outer = len(plan.inner), len(plan.outer)
-    numbers = FunctionNumbering(inner + outer, len(plan.sectors))
-    points = plan.radial + 24  # of the graded rule: masses to 1e-13
-    plain_inside = polynomial_interval(plan.radial, plan.radial + 5)
-    patches = [core_patch(plan, numbers)]
-    if inner > 1:
-        patches.append(
-            ring_patch(
-                plan, numbers, range(inner - 1), inside=True, radial=plain_inside
+    count = len(plan.rings) + 1
+    outer = (0.0, *plan.rings, 1.0)
+    fractions = [*(1 - end for end in reversed(outer)), *outer[1:]]
+    numbers = FunctionNumbering(2 * count)
+    line = polynomial_interval(plan.angular, plan.angular + 4)
+    corners = (("centre", 0), ("a", 0), ("b", 0), ("diagonal", 0))
+    vector, scalar = numbers.number_element(corners, plan.angular, plan.angular)
+    elements = [
+        MeshElement(
+            square_basis(line, line),
+            True,
+            -1,
+            0.0,
+            1.0,
+            line,
+            line,
+            np.array([vector]),
+            np.array([scalar]),
+        )
+    ]
+    angular = polynomial_interval(plan.angular, plan.angular + 5)
+    for ring in range(2 * count):
+        inside = ring < count
+        if ring in (count - 1, count):
+            points = plan.radial + 24  # of the graded rule: masses to 1e-13
+            radial = rim_interval(plan.radial, points, plan.exponents, inside)
+        else:
+            radial = polynomial_interval(plan.radial, plan.radial + 5)
+        start = 0.0 if ring == count else fractions[ring]
+        numbered = [
+            numbers.number_element(
+                (
+                    (side, ring),
+                    (side, ring + 1),
+                    ("diagonal", ring),
+                    ("diagonal", ring + 1),
+                ),
+                radial.degree,
+                plan.angular,
+            )
+            for side in "ab"
+        ]
+        vectors, scalars = (np.array(both) for both in zip(*numbered, strict=True))
+        elements.append(
+            MeshElement(
+                square_basis(radial, angular),
+                inside,
+                ring,
+                start,
+                fractions[ring + 1],
+                radial,
+                angular,
+                vectors,
+                scalars,
             )
         )
-    graded_inside = rim_interval(plan.radial, points, plan.exponents, True)
-    patches.append(
-        ring_patch(
-            plan, numbers, range(inner - 1, inner), inside=True, radial=graded_inside
+    walls = (
+        np.array([wall for _, wall in table.values()])
+        for table in (numbers.vectors, numbers.scalars)
+    )
+    return DiscMesh(plan, tuple(elements), *walls)
+
+
+def element_jacobian(
+    plan: MeshPlan, element: MeshElement, rho: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (points, 2) of (x, y) along both parameters of an element.
+
+    The core is bilinear, with corners (0, 0), (a, 0), (c, c), (0, a) and c = 0.8 a. A
+    ring maps (g, v) to (1 - g) start(v) + g end(v), between the core and the circle or
+    the circle and the edge of the cell; the mirror image has the same matrices.
+
+    Args:
+        plan: of the mesh. element: of it. rho: diameter over pitch.
+    """
+    a, c = rho * plan.core, 0.8 * rho * plan.core
+    g, v = (
+        axis.reshape(-1, 1)
+        for axis in np.meshgrid(
+            element.radial.point, element.angular.point, indexing="ij"
         )
     )
-    graded_outside = rim_interval(plan.outside, points, plan.exponents, False)
-    patches.append(
-        ring_patch(
-            plan, numbers, range(inner, inner + 1), inside=False, radial=graded_outside
-        )
+    if element.ring < 0:
+        along = np.concatenate([a + (c - a) * v, (c - a) * v], 1)
+        across = np.concatenate([(c - a) * g, a + (c - a) * g], 1)
+        return along, across
+    size = element.end - element.start
+    g = element.start + size * g
+    phi, rate = v * math.pi / 4, math.pi / 4
+    circle = rho * np.concatenate([np.cos(phi), np.sin(phi)], 1)
+    d_circle = rho * rate * np.concatenate([-np.sin(phi), np.cos(phi)], 1)
+    if element.inside:
+        start = np.concatenate([a + (c - a) * v, c * v], 1)
+        d_start = np.array([[c - a, c]])
+        return size * (circle - start), (1 - g) * d_start + g * d_circle
+    edge = np.concatenate([np.ones_like(phi), np.tan(phi)], 1)
+    d_edge = rate * np.concatenate([np.zeros_like(phi), 1 / np.cos(phi) ** 2], 1)
+    return size * (edge - circle), (1 - g) * d_circle + g * d_edge
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CellMatrices:
+    """Mass, curl-curl and scalar mass matrices of a part of the cell."""
+
+    mass: np.ndarray
+    curl: np.ndarray
+    scalar: np.ndarray
+
+
+def element_matrices(
+    basis: SquareBasis, xi: np.ndarray, eta: np.ndarray
+) -> CellMatrices:
+    """Finite-element matrices of one element.
+
+    With the covariant components a, b of a function N along xi and eta, N_i N_j dA =
+    (g22 a_i a_j - g12 (a_i b_j + b_i a_j) + g11 b_i b_j) / area.
+
+    Args:
+        basis: of the reference element. xi, eta: (points, 2) its Jacobian.
+    """
+    area = np.abs(xi[:, 0] * eta[:, 1] - xi[:, 1] * eta[:, 0])
+
+    def gram(left: np.ndarray, weight: np.ndarray, right: np.ndarray) -> np.ndarray:
+        product: np.ndarray = (left * (weight * basis.weight)) @ right.T
+        return product
+
+    cross = gram(basis.along_xi, -(xi * eta).sum(1) / area, basis.along_eta)
+    mass = np.block(
+        [
+            [gram(basis.along_xi, (eta * eta).sum(1) / area, basis.along_xi), cross],
+            [cross.T, gram(basis.along_eta, (xi * xi).sum(1) / area, basis.along_eta)],
+        ]
     )
-    if outer > 1:
-        plain_outside = polynomial_interval(plan.outside, plan.outside + 5)
-        patches.append(
-            ring_patch(
-                plan,
-                numbers,
-                range(inner + 1, inner + outer),
-                inside=False,
-                radial=plain_outside,
-            )
+    curl = basis.curl.T @ gram(basis.turn, 1 / area, basis.turn) @ basis.curl
+    return CellMatrices(mass, curl, gram(basis.scalar, area, basis.scalar))
+
+
+@lru_cache(maxsize=32)
+def gradient_matrix(plan: MeshPlan) -> np.ndarray:
+    """Discrete gradient (vectors, scalars): coefficients of the gradients of the scalar
+    functions in the vector functions, exact and by topology alone.
+
+    plan: of the mesh.
+    """
+    mesh = build_mesh(plan)
+    gradient = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
+    for element in mesh.elements:
+        rows, columns = np.nonzero(element.basis.gradient)
+        values = element.basis.gradient[rows, columns]
+        gradient[element.vector[:, rows], element.scalar[:, columns]] = values
+    return gradient
+
+
+def assemble_disc(rho: float, plan: MeshPlan) -> tuple[CellMatrices, CellMatrices]:
+    """Finite-element matrices of the whole quarter cell and of its part inside a disc,
+    in half pitches: what a geometry costs once, for all wavelengths.
+
+    Args:
+        rho: diameter over pitch. plan: of the mesh.
+
+    Raises:
+        CellError: the disc is not strictly inside the cell: elements between it and the
+            wall would vanish.
+    """
+    if not (math.isfinite(rho) and 0 < rho < 1):
+        raise CellError(
+            f"diameter = {rho:.6g} pitches: the elements that follow the disc need one above 0 and below 1; "
+            "touching pillars are solved by metalens.rcwa"
         )
-    return DiscMesh(
-        plan,
-        tuple(patches),
-        np.array(numbers.vector_wall),
-        np.array(numbers.scalar_wall),
+    mesh = build_mesh(plan)
+    nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
+    whole, disc = (
+        CellMatrices(np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns)))
+        for _ in range(2)
     )
+    for element in mesh.elements:
+        blocks = element_matrices(element.basis, *element_jacobian(plan, element, rho))
+        for part in (whole, disc) if element.inside else (whole,):
+            for vectors, scalars in zip(element.vector, element.scalar, strict=True):
+                corner = np.ix_(vectors, vectors)
+                part.mass[corner] += blocks.mass
+                part.curl[corner] += blocks.curl
+                part.scalar[np.ix_(scalars, scalars)] += blocks.scalar
+    return whole, disc

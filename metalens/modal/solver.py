@@ -24,8 +24,7 @@ def mesh_of_degree(degree: int) -> MeshPlan:
     """
     rings = (degree - 3) // 2 if degree > 4 else 0
     ends = tuple(GRADING**k for k in range(rings, 0, -1))
-    inner = tuple(1 - end for end in reversed(ends))
-    return MeshPlan(degree, degree + 1, degree, inner=(*inner, 1.0), outer=(*ends, 1.0))
+    return MeshPlan(degree, degree + 1, ends)
 
 
 GRADING = 0.15
