@@ -9,13 +9,14 @@ import numpy as np
 from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
 from metalens.modal.case import ModalCase
-from metalens.modal.few_modes import (
-    electric_pencil,
+from metalens.modal.layer import (
+    LayerMedium,
+    electric_modes,
     few_modes,
     is_lossless,
-    magnetic_pencil,
+    layer_pencil,
+    magnetic_modes,
 )
-from metalens.modal.layer import LayerMedium, electric_modes, magnetic_modes
 from metalens.modal.match import (
     HalfSpace,
     few_scattering,
@@ -132,7 +133,7 @@ def scatter_layer(
     """
     medium = LayerMedium(case.k0, case.disc, case.around)
     if foot.lossless and top.lossless and is_lossless(medium):
-        pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
+        pencil = layer_pencil(b, medium, magnetic=magnetic)
         modes = few_modes(pencil, case.height, weak=loss)
         if modes is not None:
             return few_scattering(pencil, modes, case.height, foot, top), magnetic

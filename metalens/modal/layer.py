@@ -1,8 +1,12 @@
-"""Modes of the patterned layer, in the basis of the homogeneous modes."""
+"""Modes of the patterned layer, in the basis of the homogeneous modes: all of them, or
+the few that carry light over it.
+"""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as sl
 
 from metalens.modal.spaces import HomogeneousBasis
 
@@ -108,4 +112,234 @@ def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
         axial_wavenumber(-1 / value),
         vectors / scaling[:, None],
         scaling[:, None] * (growth @ vectors),
+    )
+
+
+# --- the modes that carry light over a layer, and all others in one matrix root
+
+SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
+ROUNDS = 6  # of enlarging the trial space, at most
+STEPS = 80  # of the fixed point, at most
+SETTLED = 0.03  # change of the slow rows, over that of the last full step, until a next
+SLOW = 8  # the rows of the lowest eighth of the levels go on alone
+ROUGH, ROUNDING = 3e-7, 1e-14  # accuracy in single precision, and in double
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LayerPencil:
+    """Equation square y = -q^2 y of a lossless layer, real, with diagonal TE and TM
+    blocks.
+
+    square: (n, n) growth⁻¹ stiffness, symmetric but for the rows' ``sign`` (n,), that
+        of growth. turn: (n, n) block-diagonal, fields of y in the homogeneous basis.
+    te_count: size of the TE block. dual: whether the unknown is the partner.
+    """
+
+    square: np.ndarray
+    sign: np.ndarray
+    turn: np.ndarray
+    te_count: int
+    dual: bool
+
+    def congruence(self, diagonal: np.ndarray) -> np.ndarray:
+        """turnᵀ diagonal turn (n, n) of a ``diagonal`` (n,)."""
+        a = self.te_count
+        blocks = (slice(a), slice(a, None))
+        turns = [(self.turn[block, block], diagonal[block]) for block in blocks]
+        return sl.block_diag(*(turn.T @ (d[:, None] * turn) for turn, d in turns))
+
+
+def is_lossless(medium: LayerMedium) -> bool:
+    """Whether a ``medium`` has positive real permittivities, as the definite blocks
+    need.
+    """
+    return all(
+        e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around))
+    )
+
+
+def layer_pencil(
+    basis: HomogeneousBasis, medium: LayerMedium, *, magnetic: bool
+) -> LayerPencil:
+    """Block-diagonalised equation of the layer.
+
+    Electric form, u = E_t: growth = diag(1, (scalar_eps^-1 tm / k0^2 - 1)^-1 negative),
+    stiffness = curl - k0^2 mass_eps. Magnetic form, for the dual unknown of u = H_t:
+    growth = stiffness^-1, stiffness = mass_(1/eps)^-1 - diag(0, tm / k0^2).
+
+    Args:
+        basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
+        magnetic: the form.
+    """
+    a, k2 = len(basis.te), medium.k0**2
+    disc, around = (float(e.real) for e in (medium.disc, medium.around))
+    if magnetic:
+        disc, around = 1 / disc, 1 / around
+    contrast = disc - around
+    mass = contrast * basis.disc_mass + around * np.eye(basis.size)
+    if magnetic:
+        weighted = np.linalg.inv(mass)
+        curl = contrast * basis.disc_curl + np.diag(around * basis.te - k2)
+        te, te_turn = sl.eigh(curl, weighted[:a, :a], type=2)
+        te_turn = te_turn * np.sqrt(np.abs(te))
+        tm, tm_turn = np.linalg.eigh(np.diag(basis.tm) - k2 * weighted[a:, a:])
+        tm_turn = tm_turn * medium.k0
+        te_sign, tm_sign = np.sign(te), -np.ones(len(tm))
+        cross = weighted[:a, a:]
+    else:
+        te, te_turn = np.linalg.eigh(np.diag(basis.te) - k2 * mass[:a, :a])
+        scalar = contrast * basis.disc_scalar + around * np.eye(len(basis.tm))
+        root = np.sqrt(basis.tm / k2)
+        inner = root[:, None] * np.linalg.inv(scalar) * root - np.eye(len(root))
+        tm, tm_turn = sl.eigh(inner, k2 * mass[a:, a:], type=2)
+        tm_turn = tm_turn * np.sqrt(np.abs(tm))
+        te_sign, tm_sign = np.ones(a), -np.sign(tm)
+        cross = -k2 * mass[:a, a:]
+    coupling = te_turn.T @ cross @ tm_turn
+    square = np.diag(np.concatenate([te, tm]))
+    square[:a, a:] = te_sign[:, None] * coupling
+    square[a:, :a] = tm_sign[:, None] * coupling.T
+    sign = np.concatenate([te_sign, tm_sign])
+    return LayerPencil(square, sign, sl.block_diag(te_turn, tm_turn), a, dual=magnetic)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FewModes:
+    """Modes that carry, in the coordinates y of the pencil, and the rest.
+
+    q: (c,) axial wavenumbers. field, partner: (n, c), partner = growth field.
+    near: (n, n) real admittance of the layer without end, with ``near_rate`` in place
+        of i q for the modes that carry.
+    """
+
+    q: np.ndarray
+    field: np.ndarray
+    partner: np.ndarray
+    near: np.ndarray
+    near_rate: float
+
+
+def carrying_modes(
+    pencil: LayerPencil, height: float, weak: float, accuracy: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """-q^2 (c,) and vectors (n, c) of the modes that carry light, by Davidson's method.
+
+    Each round solves the Rayleigh-Ritz problem on a trial space of pure TE and TM
+    vectors, at first those of the low levels. The residuals of the high levels, divided
+    by (level - value), enlarge it until they are negligible.
+
+    Args:
+        pencil: of the layer, of this ``height``. weak: as in :func:`few_modes`.
+        accuracy: of the vectors, relative.
+
+    Returns:
+        None if the modes are too many.
+    """
+    square, sign, a = pencil.square, pencil.sign, pencil.te_count
+    level, n = square.diagonal(), len(sign)
+    low = level < SPARE * (math.log(weak) / height) ** 2 + EXTRA
+    trial = np.eye(n)[:, low]
+    te_high, tm_high = (~low & (np.arange(n) < a)), (~low & (np.arange(n) >= a))
+    if (sign[te_high] < 0).any() or (sign[tm_high] > 0).any():
+        return None
+    for _ in range(ROUNDS):
+        if trial.shape[1] > 0.6 * n:
+            return None
+        image = square @ trial
+        growth = np.sign(sign @ trial**2)
+        small = growth[:, None] * (trial.T @ (sign[:, None] * image))
+        value, y = np.linalg.eig(small)
+        fade = np.abs(np.exp(1j * axial_wavenumber(-value) * height))
+        value, y = value[fade > weak], y[:, fade > weak]
+        residual = image @ y - (trial @ y) * value
+        change = residual / (level[:, None] - value)
+        if np.abs(change[~low]).max(initial=0.0) < accuracy:
+            return value, trial @ y
+        parts = [change.real, change.imag] if np.iscomplexobj(change) else [change]
+        for block in (te_high, tm_high):
+            added = np.concatenate(parts, 1) * block[:, None]
+            added -= trial @ (trial.T @ added)
+            left, size, _ = np.linalg.svd(added, full_matrices=False)
+            trial = np.concatenate([trial, left[:, size > 1e-3 * size.max()]], 1)
+    return None
+
+
+def matrix_root(
+    square: np.ndarray, sign: np.ndarray, least: float, accuracy: float
+) -> np.ndarray | None:
+    """Matrix square root X with eigenvalues in the right half plane; None if the
+    iteration does not converge.
+
+    X = D + E, D the root of the diagonal. (D_i + D_j) E_ij + (E²)_ij = (X² - D²)_ij is
+    solved by a fixed point, first in single precision. The rows of the lowest levels
+    converge last: they iterate alone until they move by less than a share of the last
+    full step's change.
+
+    Args:
+        square: X². sign: of growth, with respect to which it is symmetric.
+        least: levels of the diagonal below it are raised to it.
+        accuracy: relative, of the result.
+    """
+    n = len(square)
+    slow = max(1, n // SLOW)
+    root = np.sqrt(np.maximum(square.diagonal(), least))
+    order = np.argsort(root)
+    root, sign = root[order], sign[order]
+    mirror = sign[:, None] * sign
+    exact_weight = 1 / (root[:, None] + root)
+    exact_offset = square.take(order, 0).take(order, 1) * exact_weight
+    exact_offset.ravel()[:: n + 1] -= root / 2
+    limit = max(accuracy * root[0], ROUNDING * root[-1])
+    correction = exact_offset
+    for kind, aim in ((np.float32, max(limit, ROUGH * root[0])), (np.float64, limit)):
+        weight, offset = exact_weight.astype(kind), exact_offset.astype(kind)
+        e = correction.astype(kind)
+        change = last = first = math.inf
+        for step in range(STEPS):
+            whole = step == 0 or change < max(aim, SETTLED * last)
+            rows = slice(None if whole else slow)
+            moved = offset[rows] - weight[rows] * (e[rows] @ e)
+            change = float(np.abs(moved[:slow] - e[:slow]).max())
+            e[rows] = moved
+            if not whole:
+                e[:, :slow] = mirror[:, :slow] * moved.T
+                continue
+            last = change
+            first = min(first, change)
+            if change < aim or not change <= 2 * first:
+                break
+        if not change < aim:
+            return None
+        # an asymmetry of rounding would lose energy
+        correction = (e + mirror * e.T) / 2
+    correction.ravel()[:: n + 1] += root
+    back = np.argsort(order)
+    return np.asarray(correction.take(back, 0).take(back, 1))
+
+
+def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | None:
+    """Modes of a layer that carry light over its height, and the admittance of the
+    rest; None where they are not few.
+
+    Args:
+        pencil: of the layer. height: in half pitches.
+        weak: relative accuracy; modes weaker than this are left out.
+    """
+    carrying = carrying_modes(pencil, height, weak, 0.1 * math.sqrt(weak))
+    if carrying is None:
+        return None
+    value, field = carrying
+    partner = pencil.sign[:, None] * field
+    common = max(float(np.abs(value).max(initial=0.0)), 1.0)
+    norm = np.einsum("ij,ij->j", partner, field)
+    others = pencil.square + ((field * ((common - value) / norm)) @ partner.T).real
+    root = matrix_root(others, pencil.sign, common, weak)
+    if root is None:
+        return None
+    return FewModes(
+        axial_wavenumber(-value),
+        field,
+        partner,
+        -pencil.sign[:, None] * root,
+        -math.sqrt(common),
     )

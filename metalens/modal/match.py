@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.modal.case import Films
-from metalens.modal.few_modes import FewModes, LayerPencil
-from metalens.modal.layer import LayerModes, axial_wavenumber
+from metalens.modal.layer import FewModes, LayerModes, LayerPencil, axial_wavenumber
 from metalens.modal.spaces import HomogeneousBasis
 
 # relative distance of k² from its cutoff within which an order takes its exact
@@ -218,17 +217,9 @@ def few_interface(
     """
     half = half.dual if pencil.dual else half
     stand_in, ports = half.real_admittance(dual=pencil.dual), half.ports
-    te_count, carry_count = len(pencil.te), len(modes.q)
-    operator = modes.near.copy()
-    pencil.te_turn.add_congruence(operator[:te_count, :te_count], stand_in[:te_count])
-    pencil.tm_turn.add_congruence(operator[te_count:, te_count:], stand_in[te_count:])
-    port_columns = np.zeros((len(operator), len(ports)))
-    is_te = ports < te_count
-    port_columns[:te_count, is_te] = pencil.te_turn.take_rows(ports[is_te]).T
-    port_columns[te_count:, ~is_te] = pencil.tm_turn.take_rows(
-        ports[~is_te] - te_count
-    ).T
-    columns = np.concatenate([modes.partner, port_columns], 1)
+    carry_count = len(modes.q)
+    operator = modes.near + pencil.congruence(stand_in)
+    columns = np.concatenate([modes.partner, pencil.turn[ports].T], 1)
     green = columns.T @ solve_real(operator, columns)
     norm = modes.partner.T @ modes.field
     rate = 1j * modes.q

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.linalg as sl
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csr_array
 
 from metalens.modal.mesh import (
     X0,
@@ -24,14 +24,18 @@ from metalens.modal.mesh import (
 SMALL_PHASE_RAD = 0.05
 
 
+Unknowns = tuple[np.ndarray, np.ndarray]  # places of the functions, complex weights
+
+
 def select_functions(
     wall: np.ndarray, *, electric: bool, half_phase_rad: float | None
-) -> tuple[csr_array, ...]:
+) -> Unknowns:
     """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with
     electric x walls for None.
 
-    The unknowns are the real parts inside and at x = 0, the imaginary parts inside, and
-    the moduli at x = pitch / 2, where the field has half the phase.
+    The field is the sum over the real unknowns of u times a weight times a function:
+    real parts inside and at x = 0, imaginary parts inside, and the moduli at x = pitch
+    / 2, where the field has half the phase.
 
     Args:
         wall: bits of each quarter-cell function. electric: whether the y walls are
@@ -39,36 +43,32 @@ def select_functions(
         half_phase_rad: phase over half a pitch.
 
     Returns:
-        (functions, unknowns) matrices to the real and to the imaginary part; without
-        Bloch phase the real part alone.
+        Place of the function and weight of each unknown, (n,) each.
     """
     free = (wall & (Y0 | Y1)) == 0 if electric else np.ones(len(wall), bool)
     at_start, at_end = (wall & X0) != 0, (wall & X1) != 0
-    one = csr_array(np.eye(len(wall)))
     inside, start, end = (
-        one[:, np.flatnonzero(free & part)]
-        for part in (~at_start & ~at_end, at_start, at_end)
+        np.flatnonzero(free & part) for part in (~at_start & ~at_end, at_start, at_end)
     )
     if half_phase_rad is None:
-        return (inside,)
-    cosine, sine = np.cos(half_phase_rad), np.sin(half_phase_rad)
-    return tuple(
-        csr_array(hstack(blocks))
-        for blocks in (
-            (inside, start, 0 * inside, cosine * end),
-            (0 * inside, 0 * start, inside, sine * end),
-        )
+        return inside, np.ones(len(inside))
+    groups = (inside, 1), (start, 1), (inside, 1j), (end, np.exp(1j * half_phase_rad))
+    return (
+        np.concatenate([places for places, _ in groups]),
+        np.concatenate([np.full(len(places), weight) for places, weight in groups]),
     )
 
 
 def restrict_matrix(
-    matrix: np.ndarray, rows: tuple[csr_array, ...], columns: tuple[csr_array, ...]
+    matrix: np.ndarray, rows: Unknowns, columns: Unknowns
 ) -> np.ndarray:
     """Quarter-cell ``matrix``, acting on the unknowns ``rows`` and ``columns``."""
-    return sum(
-        (right.T @ (left.T @ matrix).T).T
-        for left, right in zip(rows, columns, strict=True)
-    )
+    restricted = matrix.take(rows[0], 0).take(columns[0], 1)
+    if np.isrealobj(rows[1]):
+        return restricted
+    weight = np.outer(rows[1].real, columns[1].real)
+    weight += np.outer(rows[1].imag, columns[1].imag)
+    return np.asarray(restricted * weight)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -80,8 +80,8 @@ class SymmetryClass:
         edges off a spanning tree).
     """
 
-    vectors: tuple[csr_array, ...]
-    scalars: tuple[csr_array, ...]
+    vectors: Unknowns
+    scalars: Unknowns
     gradient: csr_array
     cotree: np.ndarray
 
