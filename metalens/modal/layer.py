@@ -117,18 +117,21 @@ def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
 
 # --- the modes that carry light over a layer, and all others in one matrix root
 
+LOW = 32.0  # times the contrast: levels above are not diagonalised
 SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
 ROUNDS = 6  # of enlarging the trial space, at most
 STEPS = 80  # of the fixed point, at most
 SETTLED = 0.03  # change of the slow rows, over that of the last full step, until a next
 SLOW = 8  # the rows of the lowest eighth of the levels go on alone
-ROUGH, ROUNDING = 3e-7, 1e-14  # accuracy in single precision, and in double
+# accuracy of a root in single precision, whose errors matter ten times less, and in
+# double
+ROUGH, ROUNDING = 3e-7, 1e-14
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerPencil:
-    """Equation square y = -q^2 y of a lossless layer, real, with diagonal TE and TM
-    blocks.
+    """Equation square y = -q^2 y of a lossless layer, real, with nearly diagonal TE and
+    TM blocks.
 
     square: (n, n) growth⁻¹ stiffness, symmetric but for the rows' ``sign`` (n,), that
         of growth. turn: (n, n) block-diagonal, fields of y in the homogeneous basis.
@@ -158,6 +161,23 @@ def is_lossless(medium: LayerMedium) -> bool:
     )
 
 
+def diagonalize_low(
+    block: np.ndarray, contrast: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A symmetric matrix with its low levels diagonalised, and the turn (n, n).
+
+    Args:
+        block: (n, n), a rising diagonal plus a perturbation.
+        contrast: size of the perturbation; levels of ``LOW`` times it hardly change.
+    """
+    m = max(1, int(np.searchsorted(block.diagonal(), LOW * contrast)))
+    turn = np.eye(len(block))
+    turn[:m, :m] = low = np.linalg.eigh(block[:m, :m])[1]
+    block[:m] = low.T @ block[:m]
+    block[:, :m] = block[:, :m] @ low
+    return block, turn
+
+
 def layer_pencil(
     basis: HomogeneousBasis, medium: LayerMedium, *, magnetic: bool
 ) -> LayerPencil:
@@ -181,25 +201,26 @@ def layer_pencil(
         weighted = np.linalg.inv(mass)
         curl = contrast * basis.disc_curl + np.diag(around * basis.te - k2)
         te, te_turn = sl.eigh(curl, weighted[:a, :a], type=2)
-        te_turn = te_turn * np.sqrt(np.abs(te))
-        tm, tm_turn = np.linalg.eigh(np.diag(basis.tm) - k2 * weighted[a:, a:])
+        te_block, te_turn = np.diag(te), te_turn * np.sqrt(np.abs(te))
+        tm_block = np.diag(basis.tm) - k2 * weighted[a:, a:]
+        tm_block, tm_turn = diagonalize_low(tm_block, k2 * abs(contrast))
         tm_turn = tm_turn * medium.k0
-        te_sign, tm_sign = np.sign(te), -np.ones(len(tm))
+        te_sign, tm_sign = np.sign(te), -np.ones(len(basis.tm))
         cross = weighted[:a, a:]
     else:
-        te, te_turn = np.linalg.eigh(np.diag(basis.te) - k2 * mass[:a, :a])
+        te_block = np.diag(basis.te) - k2 * mass[:a, :a]
+        te_block, te_turn = diagonalize_low(te_block, k2 * abs(contrast))
         scalar = contrast * basis.disc_scalar + around * np.eye(len(basis.tm))
         root = np.sqrt(basis.tm / k2)
         inner = root[:, None] * np.linalg.inv(scalar) * root - np.eye(len(root))
         tm, tm_turn = sl.eigh(inner, k2 * mass[a:, a:], type=2)
-        tm_turn = tm_turn * np.sqrt(np.abs(tm))
+        tm_block, tm_turn = np.diag(tm), tm_turn * np.sqrt(np.abs(tm))
         te_sign, tm_sign = np.ones(a), -np.sign(tm)
         cross = -k2 * mass[:a, a:]
     coupling = te_turn.T @ cross @ tm_turn
-    square = np.diag(np.concatenate([te, tm]))
-    square[:a, a:] = te_sign[:, None] * coupling
-    square[a:, :a] = tm_sign[:, None] * coupling.T
     sign = np.concatenate([te_sign, tm_sign])
+    upper, lower = te_sign[:, None] * coupling, tm_sign[:, None] * coupling.T
+    square = np.block([[te_block, upper], [lower, tm_block]])
     return LayerPencil(square, sign, sl.block_diag(te_turn, tm_turn), a, dual=magnetic)
 
 
@@ -264,6 +285,18 @@ def carrying_modes(
     return None
 
 
+def signed_square(e: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+    """e @ e of a matrix e = mirror * eᵀ, whose square is so too: three quarters of the
+    products.
+    """
+    half = len(e) // 2
+    out = np.empty_like(e)
+    out[:half] = e[:half] @ e
+    out[half:, half:] = e[half:] @ e[:, half:]
+    out[half:, :half] = mirror[half:, :half] * out[:half, half:].T
+    return out
+
+
 def matrix_root(
     square: np.ndarray, sign: np.ndarray, least: float, accuracy: float
 ) -> np.ndarray | None:
@@ -271,7 +304,7 @@ def matrix_root(
     iteration does not converge.
 
     X = D + E, D the root of the diagonal. (D_i + D_j) E_ij + (E²)_ij = (X² - D²)_ij is
-    solved by a fixed point, first in single precision. The rows of the lowest levels
+    solved by a fixed point, in single precision and, if that is not enough, double. The rows of the lowest levels
     converge last: they iterate alone until they move by less than a share of the last
     full step's change.
 
@@ -285,20 +318,24 @@ def matrix_root(
     root = np.sqrt(np.maximum(square.diagonal(), least))
     order = np.argsort(root)
     root, sign = root[order], sign[order]
-    mirror = sign[:, None] * sign
+    mirror = (sign[:, None] * sign).astype(np.float32)
     exact_weight = 1 / (root[:, None] + root)
     exact_offset = square.take(order, 0).take(order, 1) * exact_weight
     exact_offset.ravel()[:: n + 1] -= root / 2
     limit = max(accuracy * root[0], ROUNDING * root[-1])
     correction = exact_offset
-    for kind, aim in ((np.float32, max(limit, ROUGH * root[0])), (np.float64, limit)):
+    rough = max(limit, ROUGH * root[0])
+    for kind, aim in ((np.float32, rough), (np.float64, limit)):
+        if kind is np.float64 and accuracy > ROUGH / 10:
+            break
         weight, offset = exact_weight.astype(kind), exact_offset.astype(kind)
         e = correction.astype(kind)
         change = last = first = math.inf
         for step in range(STEPS):
             whole = step == 0 or change < max(aim, SETTLED * last)
             rows = slice(None if whole else slow)
-            moved = offset[rows] - weight[rows] * (e[rows] @ e)
+            product = signed_square(e, mirror) if whole else e[:slow] @ e
+            moved = offset[rows] - weight[rows] * product
             change = float(np.abs(moved[:slow] - e[:slow]).max())
             e[rows] = moved
             if not whole:

@@ -149,6 +149,16 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
     return squares
 
 
+def congruence_product(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """outerᵀ inner outer of a semidefinite matrix: rows and columns with zero diagonal
+    are zero, and are left out.
+    """
+    rows = np.flatnonzero(inner.diagonal())
+    reduced = outer[rows]
+    product: np.ndarray = reduced.T @ (inner[np.ix_(rows, rows)] @ reduced)
+    return product
+
+
 def homogeneous_modes(
     geometry: tuple[CellMatrices, CellMatrices],
     plan: MeshPlan,
@@ -203,7 +213,7 @@ def homogeneous_modes(
         tm=tm,
         te_exact=exact_zero_order(te, half_phase_rad),
         tm_exact=exact_zero_order(tm, half_phase_rad),
-        disc_mass=fields.T @ disc_mass @ fields,
-        disc_curl=x.T @ disc_curl @ x,
-        disc_scalar=scalar.T @ disc_scalar @ scalar,
+        disc_mass=congruence_product(disc_mass, fields),
+        disc_curl=congruence_product(disc_curl, x),
+        disc_scalar=congruence_product(disc_scalar, scalar),
     )
