@@ -175,8 +175,8 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
     """Zero-order scattering matrix on one mesh: the mean of the electric and magnetic
     forms, whose errors tend to have opposite signs; cached.
 
-    Layer modes that decay over the height below 10^-(3 + degree), a hundredth of the
-    error of a mesh of that degree, do not cross the layer.
+    Layer modes that decay over the height below 1e-7, or 10^-(3 + degree), do not cross
+    the layer. This is below the error of a mesh of that degree.
 
     Args:
         case: the problem. plan: of the mesh.
@@ -185,7 +185,7 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
         CellError: a disc so thin or so wide that the matrices of its elements are
             singular.
     """
-    loss = 10.0 ** -(3 + plan.radial)
+    loss = min(1e-7, 10.0 ** -(3 + plan.radial))
     try:
         # matrices of a few hundred rows: on two threads of BLAS a solve takes three to
         # six times as long; degenerate elements, which divide by 0, are refused below

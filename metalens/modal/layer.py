@@ -172,7 +172,7 @@ def diagonalize_low(
     """
     m = max(1, int(np.searchsorted(block.diagonal(), LOW * contrast)))
     turn = np.eye(len(block))
-    turn[:m, :m] = low = np.linalg.eigh(block[:m, :m])[1]
+    turn[:m, :m] = low = np.linalg.eigh(block[:m, :m], UPLO="U")[1]
     block[:m] = low.T @ block[:m]
     block[:, :m] = block[:, :m] @ low
     return block, turn
@@ -200,7 +200,7 @@ def layer_pencil(
     if magnetic:
         weighted = np.linalg.inv(mass)
         curl = contrast * basis.disc_curl + np.diag(around * basis.te - k2)
-        te, te_turn = sl.eigh(curl, weighted[:a, :a], type=2)
+        te, te_turn = sl.eigh(curl, weighted[:a, :a], type=2, lower=False)
         te_block, te_turn = np.diag(te), te_turn * np.sqrt(np.abs(te))
         tm_block = np.diag(basis.tm) - k2 * weighted[a:, a:]
         tm_block, tm_turn = diagonalize_low(tm_block, k2 * abs(contrast))
@@ -213,7 +213,7 @@ def layer_pencil(
         scalar = contrast * basis.disc_scalar + around * np.eye(len(basis.tm))
         root = np.sqrt(basis.tm / k2)
         inner = root[:, None] * np.linalg.inv(scalar) * root - np.eye(len(root))
-        tm, tm_turn = sl.eigh(inner, k2 * mass[a:, a:], type=2)
+        tm, tm_turn = sl.eigh(inner, k2 * mass[a:, a:], type=2, lower=False)
         tm_block, tm_turn = np.diag(tm), tm_turn * np.sqrt(np.abs(tm))
         te_sign, tm_sign = np.ones(a), -np.sign(tm)
         cross = -k2 * mass[:a, a:]
@@ -272,9 +272,10 @@ def carrying_modes(
         value, y = np.linalg.eig(small)
         fade = np.abs(np.exp(1j * axial_wavenumber(-value) * height))
         value, y = value[fade > weak], y[:, fade > weak]
-        residual = image @ y - (trial @ y) * value
-        change = residual / (level[:, None] - value)
-        if np.abs(change[~low]).max(initial=0.0) < accuracy:
+        change = image @ y - (trial @ y) * value
+        change[low] = 0.0
+        change[~low] /= level[~low, None] - value
+        if np.abs(change).max(initial=0.0) < accuracy:
             return value, trial @ y
         parts = [change.real, change.imag] if np.iscomplexobj(change) else [change]
         for block in (te_high, tm_high):
@@ -348,7 +349,7 @@ def matrix_root(
         if not change < aim:
             return None
         # an asymmetry of rounding would lose energy
-        correction = (e + mirror * e.T) / 2
+        correction = ((e + mirror * e.T) / 2).astype(float)
     correction.ravel()[:: n + 1] += root
     back = np.argsort(order)
     return np.asarray(correction.take(back, 0).take(back, 1))

@@ -194,14 +194,14 @@ def homogeneous_modes(
         tm = value[::-1] ** 2
         scalar = sl.solve_triangular(lower.T, left[:, ::-1])
     else:
-        tm, scalar = sl.eigh(space.gradient.T @ mass_gradient, scalar_mass)
+        tm, scalar = sl.eigh(space.gradient.T @ mass_gradient, scalar_mass, lower=False)
     normalized = scalar / np.sqrt(tm)
     coupling = normalized.T @ mass_gradient[cotree].T
     corner = np.ix_(cotree, cotree)
     curl, disc_curl = (
         restrict_matrix(part.curl, vectors, vectors)[corner] for part in (whole, disc)
     )
-    te, x = sl.eigh(curl, mass[corner] - coupling.T @ coupling)
+    te, x = sl.eigh(curl, mass[corner] - coupling.T @ coupling, lower=False)
     tm_fields = space.gradient @ normalized
     te_fields = -tm_fields @ (coupling @ x)
     te_fields[cotree] += x

@@ -12,17 +12,22 @@ from metalens import modal, rcwa
 from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import CellError
-from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
 from metalens.modal.engine import geometric_mean, solve_on_mesh
-from metalens.modal.homogeneous import homogeneous_modes
-from metalens.modal.mesh import X0, X1, MeshPlan, build_mesh
+from metalens.modal.mesh import (
+    X0,
+    X1,
+    MeshPlan,
+    assemble_disc,
+    build_mesh,
+    gradient_matrix,
+)
 from metalens.modal.shapes import polynomial_interval, rim_interval, square_basis
 from metalens.modal.solver import LEVELS
-from metalens.modal.spaces import build_symmetry_class
+from metalens.modal.spaces import homogeneous_modes
 
 WAVELENGTH = 0.85
-PLAN = MeshPlan(3, 3, 3, (0.7, 1.3))
+PLAN = MeshPlan(3, 3)
 COARSE = LEVELS[0]
 
 
@@ -71,21 +76,21 @@ def test_curl_of_gradient_vanishes():
 
 @pytest.mark.parametrize("rho", [0.025, 0.5, 0.975])
 def test_areas_of_disc_and_cell(rho):
-    geometry = assemble_disc(rho, PLAN)
+    whole, disc = assemble_disc(rho, PLAN)
     # constants are the sum of the vertex functions: those that the gradient sends to
     # zero together
-    _, _, right = np.linalg.svd(geometry.gradient)
+    _, _, right = np.linalg.svd(gradient_matrix(PLAN))
     one = right[-1] / right[-1][np.argmax(np.abs(right[-1]))]
-    assert abs(one @ geometry.cell.scalar @ one - 1) < 1e-10
-    assert abs(one @ geometry.disc.scalar @ one / (math.pi * rho**2 / 4) - 1) < 1e-10
+    assert abs(one @ whole.scalar @ one - 1) < 1e-10
+    assert abs(one @ disc.scalar @ one / (math.pi * rho**2 / 4) - 1) < 1e-10
 
 
 def test_every_edge_is_shared_with_one_direction():
     mesh = build_mesh(PLAN)
     keys = {
         pair
-        for patch in mesh.patches
-        for pair in zip(patch.vector.ravel(), patch.vector.ravel(), strict=True)
+        for element in mesh.elements
+        for pair in zip(element.vector.ravel(), element.vector.ravel(), strict=True)
     }
     assert len(keys) == len(mesh.vector_wall)
     walls = (mesh.vector_wall & (X0 | X1)) != 0
@@ -95,9 +100,7 @@ def test_every_edge_is_shared_with_one_direction():
 @pytest.mark.parametrize("half_phase", [None, 0.3, 1.2])
 def test_empty_cell_has_plane_waves_as_modes(half_phase):
     basis = homogeneous_modes(
-        build_symmetry_class(
-            assemble_disc(0.5, PLAN), electric=True, half_phase_rad=half_phase
-        )
+        assemble_disc(0.5, PLAN), PLAN, electric=True, half_phase_rad=half_phase
     )
     along = (
         range(1, 5)
@@ -113,11 +116,9 @@ def test_empty_cell_has_plane_waves_as_modes(half_phase):
 def test_plane_waves_converge_exponentially_with_the_degree():
     errors = []
     for degree in (3, 4, 5):
-        plan = MeshPlan(degree, degree, degree, (0.7,), core=0.5)
+        plan = MeshPlan(degree, degree, (), (0.7,), core=0.5)
         basis = homogeneous_modes(
-            build_symmetry_class(
-                assemble_disc(0.5, plan), electric=False, half_phase_rad=0.3
-            )
+            assemble_disc(0.5, plan), plan, electric=False, half_phase_rad=0.3
         )
         errors.append(abs(basis.tm[0] - 0.09) / 0.09)
     assert errors[1] < errors[0] / 5
@@ -245,31 +246,6 @@ def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
 def test_hard_tall_pillars_stay_unitary(height):
     s = solve_on_mesh(case_of(cell(height), 0.2, Incidence(WAVELENGTH)), COARSE).matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-10
-
-
-def test_hard_touching_pillars_on_a_mesh_of_their_own():
-    """Elements that shrink towards the point of contact, up to a gap of 4 pm; RCWA
-    takes the touching ones as they are.
-
-    t still moves by 7e-3 over the last two decades of the gap.
-    """
-    touching = rcwa.solve(cell(), 0.4, WAVELENGTH, harmonics=11)
-    plan = MeshPlan(3, 4, 3, (0.7, 1.45), sectors=(0.15, 1.0))
-    near, nearer = (
-        solve_on_mesh(case_of(cell(), 0.4 * (1 - gap), Incidence(WAVELENGTH)), plan)
-        for gap in (1e-4, 1e-5)
-    )
-    for solution in (near, nearer):
-        s = solution.matrix
-        assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
-        assert (
-            abs(s[1, 0] - touching.t) < 0.03
-        )  # 377 orders near a resonance that a gap of 0.4 nm moves by 0.6
-        assert (
-            touching.t_error < 0.3
-        )  # 4.2 (11 orders) x 6 (a cusp) x what the last four truncations moved t and r by
-        assert abs(s[0, 0] - touching.r) < touching.t_error > abs(s[1, 0] - touching.t)
-    assert abs(near.matrix[1, 0] - nearer.matrix[1, 0]) < 1e-2
 
 
 def test_hard_guided_mode_of_a_thin_layer_of_low_contrast():
