@@ -194,7 +194,7 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
                 solve_form(case, plan, magnetic=magnetic, loss=loss)
                 for magnetic in (False, True)
             )
-    except np.linalg.LinAlgError as singular:
+    except (np.linalg.LinAlgError, ValueError) as singular:
         raise CellError(
             f"a diameter of {case.rho:.3g} pitches: the elements that follow the disc "
             f"degenerate ({singular}); use metalens.rcwa for this pillar"

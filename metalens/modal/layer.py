@@ -149,7 +149,8 @@ class LayerPencil:
         a = self.te_count
         blocks = (slice(a), slice(a, None))
         turns = [(self.turn[block, block], diagonal[block]) for block in blocks]
-        return sl.block_diag(*(turn.T @ (d[:, None] * turn) for turn, d in turns))
+        parts = [turn.T @ (d[:, None] * turn) for turn, d in turns]
+        return np.asarray(sl.block_diag(*parts))
 
 
 def is_lossless(medium: LayerMedium) -> bool:
