@@ -2,6 +2,7 @@
 the spectrum.
 """
 
+import functools
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
@@ -88,20 +89,28 @@ class Imager:
         )
 
     def __call__(self, frames: Frames) -> Tensor:
-        """(frames, y, x) irradiance; see the module.
+        """(frames, y, x) irradiance of a near sheet over all that lies behind it.
+
+        Rays that miss the near sheet meet the far sheet, which is continued behind the
+        near one (:func:`occlude`), so that equal radiance of both leaves no edge.
 
         Raises:
             SceneError: frames of another size than the grid's with its margin.
         """
-        parts = (frames.radiance, frames.coverage, frames.depth_um)
-        if self.light.uniform:
-            return self._uniform_sheets(*self._continued(*parts))
-        if _far_alone(frames):
+        if not self.light.uniform and _far_alone(frames):
             return self.surface(frames.radiance[:, 1], frames.depth_um[:, 1])
-        light, cover, depth_um = self._continued(*parts)
+        near = frames.coverage[:, 0]
+        depth_um = torch.stack([frames.depth_um[:, 0], continue_depth(frames)], 1)
+        cover = torch.stack([near, 1 - near], 1)
+        light, cover, depth_um = self._continued(frames.radiance, cover, depth_um)
+        if self.light.uniform:
+            return self._uniform_sheets(light, cover, depth_um)
         both = self._blurred(light, depth_um, illuminated=True)
-        covered = self._blurred(cover, depth_um, illuminated=False)
-        return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
+        hidden = cover[:, :1].expand_as(cover)
+        covered, behind = self._blurred(hidden, depth_um, illuminated=False).unbind(1)
+        # of two sheets at one depth, the light is the sum of both
+        covered = torch.stack([covered.clamp(0, 1), 1 - behind], 1)
+        return self._returned(occlude(both, covered), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
         """(frames, y, x) image by uniform PSFs, which keep constant radiance constant.
@@ -115,7 +124,7 @@ class Imager:
         total, covered = (
             part.detach().sum((1, 2, 3), keepdim=True) for part in (light, cover)
         )
-        mean = total / covered.clamp_min(1e-30)
+        mean = total / covered
         pair = torch.stack([light - mean * cover, cover], 1)
         blurred = self._returned(self.cover.blur(pair, depth_um[:, None]), light)
         image = occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
@@ -305,19 +314,44 @@ def occlude(light: Tensor, cover: Tensor) -> Tensor:
     return (light[:, 0] + behind * light[:, 1]) / weight.clamp_min(FAINT)
 
 
+def continue_depth(frames: Frames) -> Tensor:
+    """(frames, y, x) depth of the far sheet, continued in 1/z where it covers nothing.
+
+    A pyramid of means (pull-push: Gortler et al., "The lumigraph", 1996).
+    """
+    known = frames.coverage[:, 1:] > 0
+    depth_um = frames.depth_um[:, 1]
+    if bool(known.all()):
+        return depth_um
+    vergence = torch.where(known, frames.depth_um[:, 1:], 1.0).reciprocal()
+    return torch.where(known[:, 0], depth_um, 1 / _filled(vergence, known)[:, 0])
+
+
+def _filled(value: Tensor, known: Tensor) -> Tensor:
+    """(n, 1, y, x) values with the unknown ones from the means of 2 x 2 samples."""
+    size = value.shape[-2:]
+    if max(size) == 1:
+        return torch.where(known, value, 0.0)
+    pool = functools.partial(
+        torch.nn.functional.adaptive_avg_pool2d, output_size=[-(-n // 2) for n in size]
+    )
+    count = pool(known.to(value))
+    mean = pool(torch.where(known, value, 0.0)) / torch.where(count > 0, count, 1.0)
+    coarse = torch.nn.functional.interpolate(
+        _filled(mean, count > 0), size=size, mode="bilinear"
+    )
+    return torch.where(known, value, coarse)
+
+
 def _far_alone(frames: Frames) -> bool:
-    """Whether the far sheet covers all and the near sheet is empty.
+    """Whether the near sheet is empty.
 
     False where coverage or radiance carries a gradient.
     """
     cover, light = frames.coverage, frames.radiance
     if not (has_no_gradient(cover) and has_no_gradient(light)):
         return False
-    return (
-        not bool(cover[:, 0].any())
-        and not bool(light[:, 0].any())
-        and bool((cover[:, 1] == 1).all())
-    )
+    return not bool(cover[:, 0].any()) and not bool(light[:, 0].any())
 
 
 def image_direct(radiance: Tensor, light: Tensor) -> Tensor:

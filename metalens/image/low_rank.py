@@ -262,7 +262,8 @@ def low_rank_psfs(
 
     Weights at the nodes are corrected so that the sum and centroid of every PSF are
     exact (:func:`match_moments`), then interpolated by splines. A flat-field factor
-    keeps uniformly illuminated planes uniform (:func:`correct_planes`).
+    keeps uniformly illuminated planes as the nodes' own PSFs image them, and full
+    coverage 1 (:func:`correct_planes`).
 
     Args:
         field: differentiable in its illumination, and in its PSFs where it is uniform.
@@ -288,9 +289,12 @@ def low_rank_psfs(
         weights = weights * field.illumination[..., None]
     maps = frame_maps(frame, psf.shape[:2], psf)
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
-    if illuminated:
-        factor = correct_planes(field, maps, kernels, values.detach())
-        values = values * factor[..., None]
+    targets = plane_images((field.light if illuminated else field.psf).detach(), maps)
+    if not illuminated:  # full coverage is 1 wherever all its light lies in the frame
+        rows, columns = (slice(n // 2, -(n // 2)) for n in kernels.shape[-2:])
+        targets[:, rows, columns] = 1
+    factor = correct_planes(kernels, values.detach(), targets)
+    values = values * factor[..., None]
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
     return LowRankPsfs(kernels, transfer, shape, table, vergence)
@@ -326,29 +330,25 @@ def frame_maps(
     ]
 
 
-def correct_planes(
-    field: PsfField, maps: list[Tensor], kernels: Tensor, weights: Tensor
-) -> Tensor:
+def correct_planes(kernels: Tensor, weights: Tensor, targets: Tensor) -> Tensor:
     """(y, x, depths) flat-field factor by which uniformly illuminated planes stay
     uniform.
 
-    E ← E · (1 + h* · (target / image - 1)), twice at every depth node. The target is
-    the plane's image by the nodes' own PSFs, and h the mean PSF of the depth. As
-    Landweber's iteration it does not amplify frequencies whose contrast defocus
+    E ← E · (1 + h* · (target / image - 1)), twice at every depth node. h is the mean
+    PSF of the depth. As Landweber's iteration it does not amplify frequencies whose contrast defocus
     inverts, as van Cittert's would.
 
     Args:
-        field: PSFs at the nodes and their illumination.
-        maps: spline matrices to the samples (:func:`frame_maps`).
         kernels: (rank, h, w) low-rank kernels.
         weights: (y, x, depths, rank) weights times illumination.
+        targets: (depths, y, x) images of the planes.
     """
     factor = torch.ones_like(weights[..., 0])
     size = factor.shape[:2]
     h, w = kernels.shape[-2:]
     shape = fast_shape((size[0] + h - 1, size[1] + w - 1))
     transfer = transfer_functions(kernels, shape)
-    for z, target in enumerate(plane_images(field.light.detach(), maps)):
+    for z, target in enumerate(targets):
         faint = FAINT * target.abs().max()
         mean_weights = weights[:, :, z].mean((0, 1)).to(transfer.dtype)
         adjoint = torch.einsum("r,ryx->yx", mean_weights, transfer).conj()

@@ -214,6 +214,80 @@ def test_two_sheets_of_one_depth_image_as_one_plane():
     assert float((both / _plane(made, 5.3e3) - 1).abs().max()) < 0.02
 
 
+class _PastAnEdge:
+    """The lens as a point beyond a near edge views it: dark where x > limit_um."""
+
+    radius_um = RADIUS
+    carrier_rad = staticmethod(WAVE.carrier_rad)
+
+    def __init__(self, limit_um):
+        self.limit_um = limit_um
+
+    def factor(self, x_um, y_um, wavelength_um, angle_rad):
+        share = (self.limit_um - x_um) / (x_um[0, 1] - x_um[0, 0]).abs() + 0.5
+        return share.clamp(0, 1).to(torch.complex64)
+
+
+def _behind_edge(near, far, edge, finer, rows):
+    """(rows, columns, h, w) light of a far plane past a near sheet of ``edge`` columns.
+
+    Of each point, by the part of the aperture that straight lines to it cross beside
+    the edge.
+    """
+    step, samples = STEP / finer, (WINDOW - 1) * finer + 1
+    place = (torch.arange(FRAME * finer) - (FRAME * finer - 1) / 2).double() * step
+    light = torch.zeros(len(place[rows]), len(place), samples, samples).double()
+    window = Window(samples, step, period=1.5)
+    for column, x in enumerate(place.tolist()):
+        limit = near / (1 - near / far) * (x / STEP - edge + FRAME / 2) * STEP
+        optics = Optics(_PastAnEdge(limit / DISTANCE), Layers(), DISTANCE)
+        if limit / DISTANCE < -RADIUS - 5:  # all of the lens lies behind the edge
+            continue
+        at = torch.stack([torch.full_like(place, x), place], -1)[rows]
+        cosine4 = (1 + at.square().sum(-1) / DISTANCE**2) ** -2
+        about = {"depths_um": torch.tensor([far]).double(), "window": window}
+        for wave, weight in zip(WAVES.wavelengths_um, WAVES.weights, strict=True):
+            with torch.no_grad():
+                psf = psfs(optics, at, wavelength_um=wave, **about)[:, 0].double()
+            light[:, column] += weight * psf * cosine4[:, None, None]
+    return light
+
+
+@pytest.mark.parametrize(("near", "far", "edge"), [(3e3, 12e3, 11), (3.5e3, 6e3, 9)])
+def test_occlusion_is_that_of_every_point_through_its_part_of_the_aperture(
+    near, far, edge
+):
+    """Equal radiance of two sheets leaves no edge. Points of half a step leave 2 %:
+    each is dark or bright past the edge as a whole.
+    """
+    made, finer = _made("axis", 0.01), 2
+    middle, high = FRAME // 2, (WINDOW - 1) * finer + 1
+    rows = slice(finer * middle - high // 2, finer * (middle + 1) + high // 2)
+    plain = _light("axis", (near, far), finer=finer, rows=rows)
+    past = _behind_edge(near, far, edge, finer, rows)
+    solid = (torch.arange(FRAME) < edge).double().expand(FRAME, FRAME)
+    fine = solid.repeat_interleave(finer, 1)[: len(past), :, None, None]
+    for opacity, levels in ((1, (1, 1)), (1, (0.9, 0.4)), (1, (0.3, 1)), (0.6, (1, 1))):
+        cover = torch.stack([opacity * solid, 1 - opacity * solid])
+        radiance = cover * torch.tensor(levels)[:, None, None]
+        depth = torch.tensor([near, far])[:, None, None].expand_as(cover)
+        depth = torch.where(cover > 0, depth, 1.0)  # no depth where nothing is
+        light = levels[0] * opacity * fine * plain[:, :, 0]
+        light = light + levels[1] * (1 - opacity) * plain[:, :, 1]
+        light = light + levels[1] * opacity * past
+
+        def image(light):
+            sums = image_direct(torch.ones(light.shape[:2]).double(), light)
+            return sums.reshape(finer, -1, finer).mean((0, 2))
+
+        want, even = image(light), image(plain[:, :, 1])
+        frames = Frames(*(a.float()[None] for a in (radiance, cover, depth)))
+        got = made(frames)[0, middle - MARGIN].double()
+        assert float((got - want).norm() / want.norm()) < 0.02
+        if levels == (1, 1):
+            assert float((got / even - 1).abs().max()) < 0.01
+
+
 @pytest.mark.parametrize("tolerance", [0.1, 0.02])
 def test_planes_before_a_lens_of_a_millimetre_are_even(tolerance):
     """±19 degrees and defocus from 12 to 50 mm on samples of 18 um, at depths that are
