@@ -107,9 +107,13 @@ class Imager:
             return self._uniform_sheets(light, cover, depth_um)
         both = self._blurred(light, depth_um, illuminated=True)
         hidden = cover[:, :1].expand_as(cover)
-        covered, behind = self._blurred(hidden, depth_um, illuminated=False).unbind(1)
+        hidden = self._blurred(hidden, depth_um, illuminated=False)
+        # away from borders, derivatives are those of the light alone
+        border = (hidden > FAINT) & (hidden < 1 - FAINT)
+        hidden = torch.where(border, hidden, hidden.detach())
+        covered, behind = hidden.clamp(0, 1).unbind(1)
         # of two sheets at one depth, the light is the sum of both
-        covered = torch.stack([covered.clamp(0, 1), 1 - behind], 1)
+        covered = torch.stack([covered, 1 - behind], 1)
         return self._returned(occlude(both, covered), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:

@@ -291,8 +291,11 @@ def low_rank_psfs(
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
     targets = plane_images((field.light if illuminated else field.psf).detach(), maps)
     if not illuminated:  # full coverage is 1 wherever all its light lies in the frame
-        rows, columns = (slice(n // 2, -(n // 2)) for n in kernels.shape[-2:])
-        targets[:, rows, columns] = 1
+        y, x = (n // 2 for n in kernels.shape[-2:])
+        inside = targets[:, y : frame[0] - y, x : frame[1] - x]
+        full = pad(inside, (x, x, y, y), mode="replicate")
+        targets = targets / full
+        values = values / full.movedim(0, -1)[..., None]
     factor = correct_planes(kernels, values.detach(), targets)
     values = values * factor[..., None]
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
