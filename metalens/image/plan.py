@@ -21,7 +21,7 @@ from metalens.image.left_out import (
 )
 from metalens.image.points import Optics, Window, psfs
 from metalens.image.splines import TAPS, spline_matrix
-from metalens.image.texture import scene_error, texture_error
+from metalens.image.texture import scene_error
 from metalens.image.waves import PillarWave
 from metalens.psf import Polarisation, Source, SpectralNodes
 from metalens.psf import spectrum as spectra
@@ -317,7 +317,7 @@ def waves_of(
 ) -> SpectralNodes:
     """The fewest Gauss wavelengths that image within the tolerance at three places.
 
-    Rules of 1, 2, … 16 wavelengths are compared, each with the next. Wavelengths that
+    Rules of 1, 2, … 16 wavelengths are compared, each with the last. Wavelengths that
     come with weights are returned as they are.
 
     Args:
@@ -338,11 +338,9 @@ def waves_of(
     for count in range(2, 17):
         rule = _coarse(optics, source, count)
         images = sum_over_spectrum(optics, at, depths, rule, window)
-        light = images.sum((-1, -2))
-        # of the image, where that is dark too
-        error = float((texture_error(last, images) * light / light.amax(0)).max())
-        if error + outside <= tolerance:  # of the rule before; this one is finer
-            return replace(_coarse(optics, source, count - 1), error=error + outside)
+        error = scene_error(last, images)
+        if error + outside <= tolerance:  # the change to this rule, which errs by less
+            return replace(rule, error=error + outside)
         last = images
     raise SceneError(
         f"16 wavelengths leave {error:.2g} of the image, above {tolerance:.2g}: raise the tolerance"
