@@ -261,24 +261,32 @@ def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
     )
 
 
-def _side(
-    name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
+def _unstated(
+    name: str,
+    meaning: str,
+    acts: ResponseError,
+    *,
+    scale: float,
+    sigma: float,
+    bound: float,
 ) -> Perturbation:
-    """Row of an error in nm of one side of all rectangles or ellipses.
+    """Row of an error in nm that no process has unless it is stated.
 
     Args:
         name: of the row.
         meaning: for reports.
-        numbers: rates of a cell's numbers by that side.
+        acts: its derivative.
+        scale: typical uncertainty, nm.
+        sigma: prior standard deviation, nm.
+        bound: largest amount of either sign, nm.
     """
-    acts = ResponseError(_side_rate, numbers)
     return Perturbation(
         name,
         meaning,
-        1.0,
-        2.0,
-        -12.0,
-        12.0,
+        scale,
+        sigma,
+        -bound,
+        bound,
         acts,
         1e-3,
         free=False,
@@ -286,29 +294,8 @@ def _side(
     )
 
 
-def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
-    """Row of an error in nm of the film heights under or on the pillar.
-
-    Args:
-        name: of the row.
-        meaning: for reports.
-        under: films under the pillar's own material in place of those on it.
-    """
-    acts = ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=under))
-    return Perturbation(
-        name,
-        meaning,
-        2.0,
-        5.0,
-        -30.0,
-        30.0,
-        acts,
-        1e-3,
-        free=False,
-        drawn=Drawn(name, 0.0),
-    )
-
-
+_SIDE = {"scale": 1.0, "sigma": 2.0, "bound": 12.0}
+_FILM = {"scale": 2.0, "sigma": 5.0, "bound": 30.0}
 DEG = math.pi / 180
 USUAL_UM = 0.85  # wavelength of the lenses that the sizes in nm below are of
 PERTURBATIONS: tuple[Perturbation, ...] = (
@@ -418,15 +405,17 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         probe=0.5,
         measured_by="a cross-section (SEM)",
     ),
-    _side(
+    _unstated(
         "width_nm",
         "side of a rectangle or ellipse along its x, minus design and bias",
-        _width_numbers,
+        ResponseError(_side_rate, _width_numbers),
+        **_SIDE,
     ),
-    _side(
+    _unstated(
         "length_nm",
         "side of a rectangle or ellipse along its y, minus design and bias",
-        _length_numbers,
+        ResponseError(_side_rate, _length_numbers),
+        **_SIDE,
     ),
     Perturbation(
         "turn_deg",
@@ -440,15 +429,17 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         free=False,
         drawn=Drawn("turn_deg", 0.0),
     ),
-    _film(
+    _unstated(
         "pedestal_nm",
         "height of the films under a layered pillar's own material, minus design",
-        under=True,
+        ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=True)),
+        **_FILM,
     ),
-    _film(
+    _unstated(
         "cap_nm",
         "height of the films on it (a residual mask), minus design",
-        under=False,
+        ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=False)),
+        **_FILM,
     ),
     _zernike("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _zernike("oblique_astigmatism", 6, ((2, 1, 1),)),
@@ -540,24 +531,13 @@ def inapplicable_names(cell: Cell) -> tuple[str, ...]:
     )
 
 
+@functools.cache
 def polynomial_coefficients(kind: type[CDError] | type[WavefrontError]) -> Array:
     """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each
     cause.
     """
-    return _polynomials(kind.__name__)
-
-
-@functools.cache
-def _polynomials(kind: str) -> Array:
-    """Coefficients as :func:`polynomial_coefficients`, by the name of the kind
-    (cached).
-    """
-    rows = [
-        row.acts.terms
-        for row in PERTURBATIONS
-        if type(row.acts).__name__ == kind and not isinstance(row.acts, ResponseError)
-    ]
-    size = 1 + max((max(i, j) for terms in rows for _, i, j in terms), default=0)
+    rows = [row.acts.terms for row in PERTURBATIONS if isinstance(row.acts, kind)]
+    size = 1 + max(max(i, j) for terms in rows for _, i, j in terms)
     coefficients = np.zeros((len(rows), size, size))
     for n, terms in enumerate(rows):
         for c, i, j in terms:

@@ -4,6 +4,7 @@ uncertain, lenses drawn from it, and what PROCESS.toml says of the fabricated le
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -167,32 +168,22 @@ class Draw:
     turn_rad: float = 0.0
 
     def state(self) -> State:
-        """State of a lens: amount of each entry × share × direction cosine or sine."""
-        amounts: dict[str, float] = {}
-        for row in PERTURBATIONS:
-            if row.drawn and row.drawn.name in self.amounts:
-                amounts[row.name] = (
-                    self.amounts[row.drawn.name]
-                    * row.drawn.share
-                    * self._direction(row.name)
-                )
-        return State.of(amounts)
+        """State of a lens: amount of each entry × share × direction cosine or sine.
 
-    def _direction(self, cause: str) -> float:
-        """Factor of a cause by the direction of the lens's gradients.
-
-        cos and sin of ``turn_rad`` for the first and second cause of one entry; 1 where
-        the entry has one cause.
+        The latter are of the first and second cause of one entry, 1 where it has one.
         """
-        entry = next(
-            row.drawn.name for row in PERTURBATIONS if row.name == cause and row.drawn
-        )
-        causes = [
-            row.name for row in PERTURBATIONS if row.drawn and row.drawn.name == entry
-        ]
-        if len(causes) == 1:
-            return 1.0
-        return (math.cos, math.sin)[causes.index(cause)](self.turn_rad)
+        rows = [row for row in PERTURBATIONS if row.drawn]
+        causes = Counter(row.drawn.name for row in rows if row.drawn)
+        components = (math.cos(self.turn_rad), math.sin(self.turn_rad))
+        before = Counter[str]()
+        amounts: dict[str, float] = {}
+        for row in rows:
+            if row.drawn and row.drawn.name in self.amounts:
+                entry = row.drawn.name
+                direction = components[before[entry]] if causes[entry] > 1 else 1.0
+                before[entry] += 1
+                amounts[row.name] = self.amounts[entry] * row.drawn.share * direction
+        return State.of(amounts)
 
 
 def draw_lenses(spread: Spread, count: int, *, seed: int) -> list[Draw]:

@@ -583,7 +583,7 @@ def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
     if upper_bound > 1 - HEADROOM:
         level = level * ((1 - HEADROOM) / upper_bound)
     errors = [
-        float(np.abs(_evaluate(axes, coefficients) - values).max())
+        float(np.abs(chebyshev.chebgrid3d(*axes, coefficients) - values).max())
         for coefficients, values in ((phase, data.phase), (level, data.level))
     ]
     one_angle = len(data.angle_rad) == 1
@@ -605,35 +605,19 @@ def _axes(branch: MonotonicBranch, power: int) -> tuple[Array, Array, Array]:
     """
     sine_squared = np.sin(branch.angle_rad) ** 2
     return (
-        2 * sine_squared / sine_squared[-1] - 1
-        if len(sine_squared) > 1
-        else np.zeros(1),
-        _unit(branch.wavelength_um) if len(branch.wavelength_um) > 1 else np.zeros(1),
-        _unit(branch.diameter_um**power),
+        _map_to_unit(sine_squared, 0.0),
+        _map_to_unit(branch.wavelength_um, branch.wavelength_um[0]),
+        _map_to_unit(branch.diameter_um**power, branch.diameter_um[0] ** power),
     )
 
 
-def _unit(values: Array) -> Array:
-    """Rising values mapped linearly to [-1, 1]."""
-    return np.asarray((2 * values - values[0] - values[-1]) / (values[-1] - values[0]))
-
-
-def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
-    """(angle, wavelength, diameter) values of a tensor Chebyshev sum on three axes."""
-    angle_basis, wavelength_basis, diameter_basis = (
-        chebyshev.chebvander(x, n - 1)
-        for x, n in zip(axes, coefficients.shape, strict=True)
-    )
-    return np.asarray(
-        np.einsum(
-            "ai,wj,dk,ijk->awd",
-            angle_basis,
-            wavelength_basis,
-            diameter_basis,
-            coefficients,
-            optimize=True,
-        )
-    )
+def _map_to_unit(values: Array, least: float) -> Array:
+    """Rising values mapped linearly from [least, largest] to [-1, 1]; 0 where there is
+    one value alone.
+    """
+    if len(values) == 1:
+        return np.zeros(1)
+    return np.asarray((2 * values - least - values[-1]) / (values[-1] - least))
 
 
 def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
