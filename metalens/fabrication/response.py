@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import chebyshev, polynomial
+from numpy.polynomial import polynomial
 
-from metalens.cell import Cell, Index
+from metalens.cell import Cell, index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.fabrication.own import ResponseRates, own_rates
@@ -90,7 +90,7 @@ class Sensitivity:
             raise LensError(
                 "pillars of two sizes: their derivatives are no function of one size"
             )
-        return with_missing(self._series(self.coefficients, diameter_um))
+        return with_missing(list(self._series(self.coefficients, diameter_um)))
 
     def by_edges(self, diameter_um: Array) -> Array | None:
         """(*shape) change of ln t per um of a bias of all edges, beyond that of the
@@ -100,9 +100,8 @@ class Sensitivity:
         """
         return None if self.edges is None else self._series(self.edges, diameter_um)[0]
 
-    def _series(self, coefficients: Array, diameter_um: Array) -> list[Array]:
-        """Polynomials at diameters, one value of (*shape) for every row of
-        coefficients.
+    def _series(self, coefficients: Array, diameter_um: Array) -> Array:
+        """(rows, *shape) polynomials at diameters.
 
         Beyond ``low_um`` and ``high_um`` they continue along their tangents.
 
@@ -112,18 +111,10 @@ class Sensitivity:
         """
         inside = np.clip(diameter_um, self.low_um, self.high_um)
         offset = inside - self.center_um
-        beyond = np.asarray(diameter_um - inside)
-        values = [polynomial.polyval(offset, row) for row in coefficients]
-        if beyond.any():
-            slopes = [
-                polynomial.polyval(offset, polynomial.polyder(row))
-                for row in coefficients
-            ]
-            values = [
-                value + beyond * slope
-                for value, slope in zip(values, slopes, strict=True)
-            ]
-        return values
+        slopes = polynomial.polyval(offset, polynomial.polyder(coefficients.T))
+        return polynomial.polyval(offset, coefficients.T) + slopes * (
+            diameter_um - inside
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -209,43 +200,34 @@ def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
         degree=degree,
     )
     center = float(guide.diameter_um.mean())
-    rows = [
-        polynomial.polyfit(guide.diameter_um - center, acts.quick(guide), degree)
-        for _, acts in response_errors()
-    ]
-    return Sensitivity(np.array(rows), center, 0.5, low, high)
+    rows = np.stack([acts.quick(guide) for _, acts in response_errors()])
+    coefficients = polynomial.polyfit(guide.diameter_um - center, rows.T, degree).T
+    return Sensitivity(coefficients, center, 0.5, low, high)
 
 
 def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
     """Derivatives of ln t of a lens's own pillar shape, as polynomials of degree 5.
 
     RCWA rates (:func:`metalens.fabrication.own.own_rates`) at the 9 Chebyshev sizes of
-    the proxy's domain are fitted by Chebyshev polynomials. These become power series in
-    size - centre. ``error``: truncation of the solver plus the largest relative
-    residual of the fit.
+    the proxy's domain are fitted by least squares. ``error``: truncation of the solver
+    plus the largest relative residual of the fit.
     """
     low, high = lens.proxy.domain_um
-    unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    solved = own_rates(lens, (low + high) / 2 + (high - low) / 2 * unit)
+    center = (low + high) / 2
+    offset = (high - low) / 2 * np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    solved = own_rates(lens, center + offset)
     rows = np.vstack([solved.rates, solved.edges])
-    series = chebyshev.chebfit(unit, rows.T, _DEGREE)
-    residual = np.linalg.norm(chebyshev.chebval(unit, series) - rows, axis=1)
+    series = polynomial.polyfit(offset, rows.T, _DEGREE)
+    residual = np.linalg.norm(polynomial.polyval(offset, series) - rows, axis=1)
     fit_error = residual / np.maximum(np.linalg.norm(rows, axis=1), 1e-9)
     nonzero = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
-    scale = (2 / (high - low)) ** np.arange(_DEGREE + 1)
-    powers = [
-        np.pad(c, (0, _DEGREE + 1 - len(c))) for c in map(chebyshev.cheb2poly, series.T)
-    ]
-    coefficients = np.array(powers) * scale
-    error = solved.error + float((fit_error * nonzero).max())
     return Sensitivity(
-        coefficients[:-1],
-        (low + high) / 2,
-        error,
+        series.T[:-1],
+        center,
+        solved.error + float((fit_error * nonzero).max()),
         low,
         high,
-        None,
-        coefficients[-1:] if nonzero[-1] else None,
+        edges=series.T[-1:] if nonzero[-1] else None,
     )
 
 
@@ -270,13 +252,8 @@ def effective_indices(
         diameter_um: (n,) rising diameters, um.
         degree: of the polynomials over the diameter.
     """
-    from metalens.cell import materials
-
     n_pillar, n_around = (
-        material.n
-        if isinstance(material, Index)
-        else materials.index(material, wavelength_um).real
-        for material in (cell.pillar, cell.fill)
+        index(material, wavelength_um).real for material in (cell.pillar, cell.fill)
     )
     k = 2 * math.pi / wavelength_um
     h = cell.height_um

@@ -105,19 +105,13 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     column = min(nx * 3 // 4, max(nx - side, 0))
     rows = slice(max(row, 0), row + side)
     columns = slice(column, column + side)
-    part = d.diameter_um[rows, columns]
     x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
-    has_pillar = part > 0
-    size = part[has_pillar]
-    turn = (
-        np.zeros(len(size))
-        if d.angle_rad is None
-        else d.angle_rad[rows, columns][has_pillar]
-    )
-    length = (
-        np.zeros(len(size))
-        if d.length_um is None
-        else d.length_um[rows, columns][has_pillar]
+    has_pillar = d.diameter_um[rows, columns] > 0
+    size, length, turn = (
+        np.zeros(np.count_nonzero(has_pillar))
+        if values is None
+        else values[rows, columns][has_pillar]
+        for values in (d.diameter_um, d.length_um, d.angle_rad)
     )
     outlines = [
         _outline(lens, *pillar)
@@ -133,13 +127,8 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
         aspect="equal",
     )
     axes.set(title="single pillars", xlabel="x / µm", ylabel="y / µm")
-    size_name = "size / nm" if d.length_um is None else "size along x / nm"
-    figure.colorbar(
-        collection,
-        ax=axes,
-        label=size_name if d.angle_rad is None else "turn / deg",
-        shrink=0.85,
-    )
+    label = "size along x / nm" if d.angle_rad is None else "turn / deg"
+    figure.colorbar(collection, ax=axes, label=label, shrink=0.85)
     axes.grid(visible=False)
 
 
