@@ -692,26 +692,18 @@ def fields_wide(
     fields = (
         plan.fields if mixture is None else torch.tensordot(mixture, plan.fields, 1)
     )
-    count = len(fields)
-    out = None if gathered.requires_grad else gathered.new_empty((count, my, mx))
-    for start in range(0, count, step):
-        chunk = slice(start, start + step)
+    for chunk in fields.split(step):
         # every transform is along the last axis
-        light = torch.fft.fft(fields[chunk] * gathered, n=x.first)[..., : x.size].mT
+        light = torch.fft.fft(chunk * gathered, n=x.first)[..., : x.size].mT
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
         light = torch.fft.fft2(light)
         light *= plan.transfer
         light = torch.fft.ifft(light, n=y.fine, norm="forward")[
             ..., : my * y.every : y.every
         ].mT
-        field = torch.fft.ifft(light, n=x.fine, norm="forward")[
-            ..., : mx * x.every : x.every
-        ]
-        if out is None:
-            parts.append(field)
-        else:
-            out[chunk] = field
-    return torch.cat(parts) if out is None else out
+        field = torch.fft.ifft(light, n=x.fine, norm="forward")
+        parts.append(field[..., : mx * x.every : x.every])
+    return torch.cat(parts)
 
 
 def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:

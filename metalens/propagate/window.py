@@ -274,23 +274,6 @@ class DepthBasis:
     strength: Array
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class TileOperators:
-    """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column
-    nodes, p = directions.
-
-    to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
-    lens_terms: (p, e, r), window_terms: (X, Y, r) of the correction; strength: (r,).
-    """
-
-    to_directions: Array
-    along_y: Array
-    along_x: Array
-    lens_terms: Array
-    window_terms: Array
-    strength: Array
-
-
 def depth_factors(
     case: PropagationCase, e: Any, x: Any, tangents: Any, inverse: Any
 ) -> Any:
@@ -378,15 +361,21 @@ def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
     return np.stack(np.unravel_index(significant, (len(strength), len(size))))
 
 
-def build_operators(
+def _operators(
     case: PropagationCase, chosen: NodeCounts, tolerance: float
-) -> TileOperators:
+) -> dict[str, Array]:
     """Operators of a tile: lens nodes to directions, and directions to the window.
 
     Args:
         case: geometry of the tile.
         chosen: counts of nodes and directions.
         tolerance: relative error of the field.
+
+    Returns:
+        ``to_directions`` (e, x, p) from lens row and column nodes to directions;
+        ``along_y`` (p, Y, e) and ``along_x`` (X, p) plane waves; ``lens_terms``
+        (p, e, r) and ``window_terms`` (X, Y, r) of the correction, and their
+        ``strength`` (r,).
     """
     ny, nx = chosen.nodes
     directions = chosen.directions
@@ -403,16 +392,16 @@ def build_operators(
     lens_terms, window_terms, strength = _low_rank(
         case, chosen, tolerance / 2, (low, high)
     )
-    return TileOperators(
-        to_directions=legendre.interpolation_matrix(
+    return {
+        "to_directions": legendre.interpolation_matrix(
             directions, (2 * cosines - low - high) / (high - low)
         ),
-        along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
-        along_x=np.exp(-1j * k * x_um[:, None] * p),
-        lens_terms=lens_terms,
-        window_terms=window_terms * np.exp(1j * k * chief_path(case)),
-        strength=strength,
-    )
+        "along_y": np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
+        "along_x": np.exp(-1j * k * x_um[:, None] * p),
+        "lens_terms": lens_terms,
+        "window_terms": window_terms * np.exp(1j * k * chief_path(case)),
+        "strength": strength,
+    }
 
 
 def _low_rank(
@@ -563,7 +552,10 @@ def plan_window(
         pillars = plan_moments(
             case,
             reference,
-            legendre_bases(case, (ny + MORE, nx + MORE)),
+            tuple(
+                functools.partial(_legendre_basis, n + MORE, half_um)
+                for n, half_um in zip((ny, nx), case.half_size_um, strict=True)
+            ),
             over_blocks(case),
             tolerance=tolerance,
             dtype=dtype,
@@ -576,21 +568,9 @@ def plan_window(
     return WindowPlan(case, tolerance, layout, depths, pillars, tensors)
 
 
-def legendre_bases(
-    case: PropagationCase, counts: tuple[int, int]
-) -> tuple[Callable[[Array], Array], ...]:
-    """Legendre polynomials over the rows and over the columns of the lens, as weights
-    of :func:`moments`.
-
-    Args:
-        case: geometry of the propagation.
-        counts: (y, x) numbers of polynomials.
-    """
-
-    def over(count: int, half_um: float) -> Callable[[Array], Array]:
-        return lambda places_um: legendre.legendre_values(count, places_um / half_um)
-
-    return tuple(over(n, h) for n, h in zip(counts, case.half_size_um, strict=True))
+def _legendre_basis(count: int, half_um: float, places_um: Array) -> Array:
+    """(place, count) Legendre polynomials over an axis of the lens."""
+    return legendre.legendre_values(count, places_um / half_um)
 
 
 def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Array]:
@@ -641,28 +621,21 @@ def _tile_tensors(
         tolerance: relative error of the field.
     """
     tiles = [tile for row in window_tiles(case, layout.parts)[1] for tile in row]
-    operators = [build_operators(tile, layout.sizes, tolerance) for tile in tiles]
-    terms = max(len(operator.strength) for operator in operators)
-    strength = np.max(
-        [_padded(operator.strength, terms) for operator in operators], axis=0
-    )
+    of_tiles = [_operators(tile, layout.sizes, tolerance) for tile in tiles]
+    terms = max(len(operators["strength"]) for operators in of_tiles)
+    for operators in of_tiles:
+        for name in ("strength", "lens_terms", "window_terms"):
+            operators[name] = _padded(operators[name], terms)
+    arrays = {n: np.stack([tile[n] for tile in of_tiles]) for n in of_tiles[0]}
+    strength = arrays.pop("strength").max(0)
     pairs = significant_pairs(strength, depths.strength, tolerance / 2)
-    arrays = {
-        name: np.stack([getattr(operator, name) for operator in operators])
-        for name in ("along_y", "along_x")
-    }
     for name in ("lens_terms", "window_terms"):
-        arrays[name] = np.stack(
-            [
-                _padded(getattr(operator, name), terms)[..., pairs[0]]
-                for operator in operators
-            ]
-        )
+        arrays[name] = np.ascontiguousarray(arrays[name][..., pairs[0]])
+    to_directions = arrays.pop("to_directions")
     tensors = {
         name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
     }
-    to_directions = np.concatenate([operator.to_directions for operator in operators])
-    tensors["to_directions"] = torch.tensor(to_directions)
+    tensors["to_directions"] = torch.tensor(to_directions).flatten(0, 1)
     tensors["fields"] = torch.tensor(pairs[1])
     return tensors
 

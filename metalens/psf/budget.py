@@ -104,9 +104,14 @@ class Budget:
         return math.hypot(self.numerical, self.sampling, self.spectrum, self.source)
 
     @property
+    def largest(self) -> str:
+        """Cause of the largest part of what is computed."""
+        return max(CURES, key=lambda cause: getattr(self, cause))
+
+    @property
     def cure(self) -> str:
         """What to do about the largest part of what is computed."""
-        return CURES[max(CURES, key=lambda cause: getattr(self, cause))]
+        return CURES[self.largest]
 
     @property
     def model(self) -> float:

@@ -251,11 +251,13 @@ def _record(
     share = share / (power * cases[0].area_um2)
     worst = max(results, key=lambda result: result.budget.computed)
     error = worst.budget.computed
-    dtype = light.dtype
     divide = torch.div if light.requires_grad else torch.Tensor.div_  # in place
     reason = worst.reason
     if error > tolerance:
-        reason += f"; {_above(worst, tolerance, dtype)}"
+        reason += f"; above the tolerance by its {worst.budget.largest}"
+    if tolerance < (least := torch.finfo(light.dtype).eps):
+        name = str(light.dtype).removeprefix("torch.")
+        reason += f"; {name} holds {least:.2g}, give float64 maps"
     light = divide(light, energy[..., None, None])
     budget = replace(worst.budget, outside=max(0.0, 1 - float(share.min())))
     if layers is not None and layers.stop is not None:
@@ -304,20 +306,6 @@ def _stop_error(
         for z, blur, part in zip(axes[0].tolist(), blurs, parts, strict=True)
         for wave in axes[1].tolist()
     )
-
-
-def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
-    """Words that name the largest term of an error above the tolerance."""
-    least = torch.finfo(dtype).eps
-    if tolerance < least:
-        more = ", give float64 maps" if dtype != torch.float64 else ""
-        return f"above the tolerance: {str(dtype).removeprefix('torch.')} holds {least:.2g}{more}"
-    terms = {
-        "sums": worst.budget.numerical,
-        "integration over cells": worst.budget.sampling,
-        "size of the source": worst.budget.source,
-    }
-    return f"above the tolerance by its {max(terms, key=lambda name: terms[name])}"
 
 
 def _value(argument: Any) -> Any:
