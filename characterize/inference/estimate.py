@@ -151,10 +151,10 @@ def _fit(
     task, ends = _ends(task, frames.gain, cautions)
     task, ends = multistart.place_windows(task, ends)
     task, ends = _unrounded(task, ends, frames.gain)
-    task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
+    task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
-    _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
-    posterior = uncertainty.explore_posterior(task, ends)
+    _refuse(_problems(task, ends[0], frames.gain), options, leans)
+    posterior = uncertainty.explore_posterior(task, ends, frames.gain)
     doubts = looked[2] if looked else []
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.run_score_tests(task, posterior.best), doubts
@@ -224,7 +224,7 @@ def _unrounded(
     return task, ends
 
 
-def _with_what_is_there(
+def _with_likely_causes(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
 ) -> tuple[SearchTask, list[FitSolution], Looked | None]:
     """The task with the parameters of likely causes (:func:`missing.to_fit`) freed.
@@ -237,12 +237,12 @@ def _with_what_is_there(
     """
     if not gain.known:
         return task, ends, None
-    looked = missing.run_score_tests(task, ends[0])
+    tests = missing.run_score_tests(task, ends[0])
     doubts = list[ResidualFinding]()
     for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
             break
-        falls = _falls(task, ends[0], looked.leans)
+        falls = _falls(task, ends[0], tests.leans)
         cause = next((test for _, test in falls if not test.stated), None)
         if cause is None:
             break
@@ -257,8 +257,8 @@ def _with_what_is_there(
         )
         doubts += _contradicted(cause, falls)
         task, ends = wider
-        looked = missing.run_score_tests(task, ends[0])
-    return task, ends, (ends[0], looked, doubts)
+        tests = missing.run_score_tests(task, ends[0])
+    return task, ends, (ends[0], tests, doubts)
 
 
 def _falls(
@@ -346,26 +346,30 @@ def _result(
         looked: (solution, its score tests, contradicted statements).
     """
     _, tests, doubts = looked
-    model = task.model
-    data = task.data
-    solution = posterior.best
-    names = task.names
-    fitted = dict(zip(names, solution.value.tolist(), strict=True))
+    model, data, names = task.model, task.data, task.names
+    solution, value = posterior.best, posterior.best.value
+    fitted = dict(zip(names, value.tolist(), strict=True))
     unseen = verdict.left_out(task, solution)
-    covariance = _with_gain(names, posterior, gain)
     unstated = tests.shifts()
-    within = _within(posterior, covariance, names)
     findings = [*_findings(task, solution, tests), *doubts]
-    value = solution.value
     # intervals about the value less the expected shift, widened by its spread
     centre = value - unstated.mean
     more = uncertainty.REACH * unstated.spread
+    low = np.minimum(centre - np.hypot(value - posterior.low, more), posterior.low)
+    high = np.maximum(centre + np.hypot(posterior.high - value, more), posterior.high)
+    prior_share = (posterior.high - posterior.low) / (2 * uncertainty.REACH)
+    cautions = [*cautions, *(finding.words for finding in findings)]
+    if gain.known and unseen > _LEFT_OUT:
+        cautions.append(
+            f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not "
+            "1: do not extrapolate"
+        )
     return AsBuilt(
         design=model.lens,
         response=model.response,
         names=names,
         value=value,
-        covariance=covariance + unstated.covariance,
+        covariance=posterior.covariance + unstated.covariance,
         information=solution.information,
         held={
             name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted
@@ -385,44 +389,39 @@ def _result(
                 names, solution.information, task.prior.sigma
             )
         ),
-        degeneracies=_open(task, posterior, covariance, tests if gain.known else None),
-        cautions=(
-            *cautions,
-            *(finding.words for finding in findings),
-            *(_extrapolation(unseen) if gain.known else ()),
+        degeneracies=(
+            *uncertainty.posterior_text(names, posterior),
+            *knowable.correlated_pairs(names, posterior.covariance, task.prior.sigma),
         ),
+        cautions=tuple(cautions),
         problems=(
-            *_problems(task, solution, gain, tests.leans),
+            *_problems(task, solution, gain),
             *verdict.held_back(names, solution, task.prior),
             *missing.decisive_findings(findings),
         ),
-        low=np.minimum(centre - np.hypot(value - within.low, more), within.low),
-        high=np.maximum(centre + np.hypot(within.high - value, more), within.high),
+        low=low,
+        high=high,
         draws=_drawn(task, posterior.draws, unstated),
-        within=within,
+        within=WithinModel(
+            posterior.covariance, posterior.low, posterior.high, posterior.draws
+        ),
         curves={
             name: np.stack([profile.value, profile.rise])
             for name, profile in posterior.profiles.items()
         },
-        verdicts=_verdicts(task, posterior, unseen, unstated),
+        verdicts=(
+            verdict.psf_verdict(task, posterior, unseen),
+            verdict.process_verdict(
+                usual_parameters(names, model.lens),
+                low,
+                high,
+                prior_share / task.prior.sigma,
+            ),
+        ),
         causes=unstated.causes,
         by_cause=unstated.by_cause,
         bench=unstated.bench,
     )
-
-
-def _within(
-    posterior: FitPosterior, covariance: Array, names: tuple[str, ...]
-) -> WithinModel:
-    """Intervals and covariance within the model, with the error of the gain.
-
-    The gain scales what is counted in electrons.
-    """
-    value = posterior.best.value
-    by_gain = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
-    low = np.minimum(posterior.low, value - by_gain)
-    high = np.maximum(posterior.high, value + by_gain)
-    return WithinModel(covariance, low, high, posterior.draws)
 
 
 def _drawn(task: SearchTask, draws: Array, unstated: UnmodelledShifts) -> Array:
@@ -447,21 +446,6 @@ def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
     return task.model.images(with_values(task.start, bench))[0]
 
 
-def _verdicts(
-    task: SearchTask, posterior: FitPosterior, unseen: float, unstated: UnmodelledShifts
-) -> tuple[str, str]:
-    """Texts on the accuracy of the PSF and of the process parameters."""
-    rows = usual_parameters(task.names, task.model.lens)
-    process = verdict.process_verdict(
-        rows, posterior.low, posterior.high, _prior_share(task, posterior), unstated
-    )
-    errors = (
-        verdict.predicted_error(task, posterior),
-        verdict.predicted_aside(task, posterior),
-    )
-    return _psf_verdict(*errors, unseen, len(task.model.groups)), process
-
-
 def _findings(
     task: SearchTask, solution: FitSolution, looked: ScoreTests
 ) -> list[ResidualFinding]:
@@ -479,76 +463,11 @@ def _findings(
     return [*structure, *missing.score_test_text(looked.leans)]
 
 
-def _extrapolation(unseen: float) -> list[str]:
-    """That frames left out are not predicted within their noise, in words."""
-    if not unseen > _LEFT_OUT:
-        return []
-    return [
-        f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do "
-        "not extrapolate"
-    ]
-
-
-def _open(
-    task: SearchTask,
-    posterior: FitPosterior,
-    covariance: Array,
-    looked: ScoreTests | None,
-) -> tuple[str, ...]:
-    """What cannot be distinguished: bent and double posteriors, pairs, and causes that
-    nobody fitted.
-    """
-    pairs = knowable.correlated_pairs(task.names, covariance, task.prior.sigma)
-    return (
-        *uncertainty.posterior_text(task.names, posterior),
-        *pairs,
-        *(missing.undetectable_effects(looked.leans) if looked else ()),
-    )
-
-
-def _named(names: tuple[str, ...]) -> Array:
-    return np.array([not name.startswith(("log_gain", "background")) for name in names])
-
-
-def _prior_share(task: SearchTask, posterior: FitPosterior) -> Array:
-    """(p,) width of the intervals over that of the prior."""
-    return np.asarray(
-        (posterior.high - posterior.low) / (2 * uncertainty.REACH) / task.prior.sigma
-    )
-
-
-def _psf_verdict(
-    at_depths: tuple[float, float],
-    at_angles: tuple[float, float] | None,
-    unseen: float,
-    angles: int,
-) -> str:
-    """Sentence on the relative error of the PSF.
-
-    Args:
-        at_depths: errors at the captured depths and between them.
-        at_angles: errors between the captured angles and half a step beyond; or None.
-        unseen: reduced chi-square of frames left out; nan without such.
-        angles: number of captured angles.
-    """
-    captured, between = at_depths
-    tested = ""
-    if not np.isnan(unseen):
-        tested = f"; frames left out agree within {unseen:.2f} times their noise"
-    at = "at one angle" if angles == 1 else f"at the {angles} captured angles"
-    if at_angles is not None:
-        at += f" ({at_angles[0]:.1%} between these, {at_angles[1]:.1%} half a step beyond)"
-    return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
-
-
-def _problems(
-    task: SearchTask, solution: FitSolution, gain: SensorNoise, leans: list[ScoreTest]
-) -> list[str]:
+def _problems(task: SearchTask, solution: FitSolution, gain: SensorNoise) -> list[str]:
     """Reasons to refuse a solution, in words; empty where it passes."""
     problems = [
         *verdict.fit_problems(task.names, solution, gain),
         *verdict.too_quiet(solution, gain),
-        *(missing.misplaced_windows_text(leans) if gain.known else ()),
     ]
     clipped = float(task.data.saturated.mean())
     if problems and clipped > 0.1:
@@ -557,20 +476,3 @@ def _problems(
             f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter",
         )
     return problems
-
-
-def _with_gain(
-    names: tuple[str, ...], posterior: FitPosterior, gain: SensorNoise
-) -> Array:
-    """(p, p) covariance with the error of the sensor's gain.
-
-    The gain scales everything that is counted in electrons: background and brightness.
-    """
-    relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
-    by_gain = np.zeros(len(names))
-    for i, name in enumerate(names):
-        if name.startswith("background"):
-            by_gain[i] = posterior.best.value[i] * relative
-        elif name == "log_gain":
-            by_gain[i] = relative
-    return np.asarray(posterior.covariance + np.outer(by_gain, by_gain))

@@ -3,7 +3,6 @@ for along that (score test).
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from scipy import stats
 
 from characterize.captures import shift_frames
 from characterize.inference import causes
+from characterize.inference.causes import ImageChange
 from characterize.inference.leastsquares import FitSolution
 from characterize.inference.multistart import SearchTask
 from characterize.model import PLACE, background_planes
@@ -22,10 +22,16 @@ from metalens.core.arrays import Array
 CHANCE = 1e-4
 # Bayes factor above which a cause is fitted: by chance in one fit of 100 or fewer
 ODDS = 10.0
-_SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it is detected
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost: number and range
 # sigma of chi-square above which dark spots are tested; their spacing over the radius
 _PATCHY, _SPOT = 3.0, 0.2
+
+_CURES = {
+    causes.LAMP: "state the light of every frame, by a monitor diode, in proportion as "
+    "exposure_s of stage.csv",
+    causes.WINDOWS: "cut the frames of every angle about its chief ray, distance times "
+    "tan(angle) off that on the axis",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +55,9 @@ def decisive_findings(
 
 @dataclass(frozen=True, slots=True)
 class ScoreTest:
-    """One cause: its words, chi-square by which the residuals lean along it, its
-    degrees, and the chance of that.
+    """Score test of one cause: its words, chi-square by which the residuals lean along
+    it, degrees of freedom, and the chance of that.
 
-    taken: what takes it up, in words, where the fit cannot tell it from what is fitted;
-    empty where it can.
     frees: parameters that describe it. stated: whether one is stated without an error:
     it is not fitted then. odds: for it, as large as is assumed, against its absence; 0
     where no size is known.
@@ -63,7 +67,6 @@ class ScoreTest:
     chi2: float
     degrees: int
     chance: float
-    taken: str = ""
     frees: tuple[str, ...] = ()
     odds: float = 0.0
     stated: bool = False
@@ -71,68 +74,47 @@ class ScoreTest:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ScoreTests:
-    """What was looked for beside the fit: leans, the most telling first, of every cause
-    that can be distinguished or is
-    taken for something else; the fit, and the causes that are assumed as changes
-    (k, pixels) over the noise, of
-    one standard deviation each. roughly: those whose change is known too roughly for
-    the frames to bound them.
-    of_mask: those that stay with the lens when it leaves the bench."""
+    """Score tests, the least probable by chance first, at a fit, and the causes of
+    assumed size as changes (k, pixels) over the noise, of one standard deviation each.
+    """
 
     leans: list[ScoreTest]
     fit: "FitAtMode"
-    unstated: dict[str, Array]
-    roughly: frozenset[str] = frozenset()
-    of_mask: frozenset[str] = frozenset()
+    unstated: tuple[ImageChange, ...]
 
     def shifts(self) -> "UnmodelledShifts":
-        """Shifts of the parameters that unfitted causes may have caused.
+        """Shifts of the parameters by causes that nobody stated: the marginal less the
+        conditional covariance of one joint Gaussian posterior.
 
-        A cause has factors c of its changes, N(0, 1) or their posterior
-        (:meth:`FitAtMode.amounts`) where the change is well known. The parameters shift
-        by M c; summed are second moments over causes.
+        Causes have factors c of their changes, N(0, 1) or, where the change is well
+        known, their posterior (:meth:`FitAtMode.amounts`). The parameters shift by M c
+        with M = K⁻¹ A Gᵀ; second moments are summed over the causes.
         """
-        names = tuple(self.unstated)
         p = len(self.fit.names)
-        if not names:
-            return UnmodelledShifts.none(p)
-        every = np.concatenate([self.unstated[name] for name in names])
+        sizes = [len(cause.images) for cause in self.unstated]
+        changes = [cause.images for cause in self.unstated]
+        every = np.concatenate([np.empty((0, len(self.fit.rest))), *changes])
+        number = np.repeat(np.arange(len(sizes)), sizes)
+        exact = np.array([not cause.roughly for cause in self.unstated], bool)[number]
+        bench = np.array([not cause.of_mask for cause in self.unstated], bool)[number]
+        # of a change of 0 the posterior is the prior
+        covariance, pull = self.fit.amounts(every * exact[:, None])
+        amount = covariance @ pull
+        second = covariance + np.outer(amount, amount)
         moved = self.fit.moved_by(every)
-        # posterior of the factors: covariance and mean, that of the prior at first
-        covariance = np.eye(len(every))
-        amount = np.zeros(len(every))
-        exact = np.concatenate(
-            [
-                np.full(len(part), name not in self.roughly)
-                for name, part in self.unstated.items()
-            ]
-        )
-        if exact.any():
-            part, pull = self.fit.amounts(every[exact])
-            covariance[np.ix_(exact, exact)] = part
-            amount[exact] = part @ pull
-        second = covariance + np.outer(amount, amount)  # second moment
-        first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
-        own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
-        by_cause = [
-            np.einsum("pi,ij,pj->p", moved[:, part], second[part, part], moved[:, part])
-            for part in own
-        ]
-        off = np.concatenate(
-            [
-                np.full(len(part), name not in self.of_mask)
-                for name, part in self.unstated.items()
-            ]
-        )
-        bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
-        spread = np.einsum("pi,ij,pj->p", moved, covariance, moved)
+
+        def moment(some: Array) -> Array:
+            part = moved[:, some]
+            return np.asarray(part @ second[np.ix_(some, some)] @ part.T)
+
+        by_cause = [np.diag(moment(number == k)) for k in range(len(sizes))]
         return UnmodelledShifts(
-            names,
-            np.sqrt(np.maximum(by_cause, 0)),
-            moved @ second @ moved.T,
-            bench,
+            tuple(cause.cause for cause in self.unstated),
+            np.sqrt(np.maximum(by_cause, 0)).reshape(-1, p),
+            moment(np.ones(len(every), bool)),
+            moment(bench),
             moved @ amount,
-            np.sqrt(np.maximum(spread, 0)),
+            np.sqrt(np.maximum(np.diag(moved @ covariance @ moved.T), 0)),
         )
 
 
@@ -155,12 +137,6 @@ class UnmodelledShifts:
     mean: Array
     spread: Array
 
-    @classmethod
-    def none(cls, p: int) -> "UnmodelledShifts":
-        """Every cause stated."""
-        nothing = np.zeros((0, p)), np.zeros((p, p)), np.zeros((p, p))
-        return cls((), *nothing, np.zeros(p), np.zeros(p))
-
     @property
     def sigma(self) -> Array:
         """(p,) standard deviation of the shifts by all causes."""
@@ -177,72 +153,42 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     Args:
         task: model, frames, priors and arrangement of the search.
         mode: the fit it is judged at.
-
-    Returns:
-        Tests, least probable by chance first, with causes of assumed size.
     """
     x = task.all_of(mode.value)
-    image = mode.image
-    slopes = mode.slopes
     # 1 / sigma of every pixel, 0 where it is not counted
-    root = np.where(
-        task.data.usable & ~task.data.saturated,
-        1 / np.sqrt(task.data.variance(image)),
-        0.0,
-    )
-    residual = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
-    fitted = (slopes * root).reshape(len(task.names), -1)
-    known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
-    spread = max(1.0, mode.chi2_per_dof)
-    pull = (mode.value - task.prior.mean) * task.prior.sigma**-2.0
-    over = math.sqrt(spread)
+    counted = task.data.usable & ~task.data.saturated
+    root = np.where(counted, 1 / np.sqrt(task.data.variance(mode.image)), 0.0)
+    fitted = (mode.slopes * root).reshape(len(task.names), -1)
+    weight = task.prior.sigma**-2.0
+    over = math.sqrt(max(1.0, mode.chi2_per_dof))
     fit = FitAtMode(
         task.names,
         fitted,
-        known,
-        residual / over,
-        task.data.shared(image) * root,
-        pull / over,
+        fitted @ fitted.T + np.diag(weight),
+        (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel() / over,
+        task.data.shared(mode.image) * root,
+        (mode.value - task.prior.mean) * weight / over,
     )
-    tests = []
-    unstated = {}
-    roughly: set[str] = set()
-    of_mask: set[str] = set()
-    by_name = dict(zip(task.names, slopes, strict=True))
+    tests, unstated = list[ScoreTest](), list[ImageChange]()
+    by_name = dict(zip(task.names, mode.slopes, strict=True))
     for effect in causes.systematic_changes(task, x, by_name):
-        cause = effect.cause
         change = (effect.images * root).reshape(len(effect.images), -1)
-        if np.any(effect.sigma):
-            unstated[cause] = np.reshape(effect.sigma, (-1, 1)) * change
-            if effect.roughly:
-                roughly.add(cause)
-            if effect.of_mask:
-                of_mask.add(cause)
-        if not effect.sought:
-            continue
-        taken = ""
-        if effect.amount_text:
-            taken = fit.taken(change[0], effect.amount, effect.amount_text)
-        odds = 0.0
-        if cause in unstated and effect.frees and not effect.stated:
-            odds = fit.odds(unstated[cause])
         test = dataclasses.replace(
-            fit.lean(cause, change),
-            taken=taken,
-            frees=effect.frees,
-            odds=odds,
-            stated=effect.stated,
+            fit.lean(effect.cause, change), frees=effect.frees, stated=effect.stated
         )
+        if np.any(effect.sigma):
+            assumed = np.reshape(effect.sigma, (-1, 1)) * change
+            unstated.append(dataclasses.replace(effect, images=assumed))
+            if effect.frees and not effect.stated:
+                test = dataclasses.replace(test, odds=fit.odds(assumed))
         tests.append(test)
-    tests.append(_ghost(task, x, image, root, fit))
+    tests.append(_ghost(task, x, mode.image, root, fit))
     pixels = max(float((root > 0).sum()), 1.0)
     if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / pixels):
         tests.append(_patch(task, x, root, fit))
-    named = sorted(
-        (test for test in tests if test.degrees or test.taken),
-        key=lambda test: (test.chance, -test.chi2),
-    )
-    return ScoreTests(named, fit, unstated, frozenset(roughly), frozenset(of_mask))
+    tests = [test for test in tests if test.degrees]
+    tests.sort(key=lambda test: (test.chance, -test.chi2))
+    return ScoreTests(tests, fit, tuple(unstated))
 
 
 def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
@@ -309,12 +255,7 @@ def score_test_text(score_tests: list[ScoreTest]) -> list[ResidualFinding]:
     first = clear[0]
     others = [test.cause for test in clear[1:4]]
     more = f"; {', '.join(others)} would explain much of it too" if others else ""
-    cure = "state it, free it, or mend the bench"
-    if first.cause == causes.LAMP:
-        cure = (
-            "state the light of every frame, by a monitor diode, in proportion as "
-            "exposure_s of stage.csv"
-        )
+    cure = _CURES.get(first.cause, "state it, free it, or mend the bench")
     sigma = float(stats.norm.isf(max(first.chance, 1e-300) / 2))
     why = "as stated" if first.stated else "not fitted"
     said = (
@@ -323,41 +264,6 @@ def score_test_text(score_tests: list[ScoreTest]) -> list[ResidualFinding]:
         f"intervals hold only if it is absent; {cure}"
     )
     return [ResidualFinding(said, sigma)]
-
-
-def misplaced_windows_text(score_tests: list[ScoreTest]) -> list[str]:
-    """Sentence on misplaced windows at single field angles, if they explain most.
-
-    They must explain half of what any cause does. The fit would otherwise bend the
-    lens, or turn the frames, until the spots of all angles fit their windows.
-
-    Args:
-        score_tests: score tests.
-    """
-    most = max((test.chi2 - test.degrees for test in score_tests), default=0.0)
-    return [
-        f"{test.cause} explains what is left (chi-square {test.chi2:.0f} with {test.degrees} degrees): one decentre is "
-        "fitted for all angles; cut the frames of every angle about its chief ray, distance times tan(angle) off that "
-        "on the axis, or fit the angles one by one"
-        for test in score_tests
-        if test.cause == causes.WINDOWS
-        and test.chance < CHANCE
-        and test.chi2 - test.degrees >= most / 2
-    ]
-
-
-def undetectable_effects(score_tests: list[ScoreTest]) -> list[str]:
-    """Unfitted effects that the frames cannot distinguish from fitted parameters, with
-    those parameters.
-
-    Args:
-        score_tests: score tests.
-    """
-    return [
-        f"{test.cause} is not fitted: {test.taken}"
-        for test in score_tests
-        if test.taken
-    ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -454,31 +360,6 @@ class FitAtMode:
         counted = left * self.shared[0].ravel()
         return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
-    def taken(self, change: Array, amount: float, amount_text: str) -> str:
-        """Sentence on the parameters that would take up a change of the images.
-
-        For ``amount`` of the cause, or as much of it as leaves ``_SEEN`` sigma in the
-        residuals, more of which would be detected. Empty where no
-        parameter moves by one sigma.
-
-        Args:
-            change: (pixels,) over the noise.
-            amount_text: the cause's amount in words, with a place for the number.
-        """
-        moved = np.linalg.solve(self.known, self.slopes @ change)
-        remainder = float(change @ change - (self.slopes @ change) @ moved)
-        left = math.sqrt(max(remainder, 0.0))
-        share = min(1.0, _SEEN / max(left, 1e-12))
-        step = share * moved / np.sqrt(np.diag(np.linalg.inv(self.known)))
-        most = [i for i in np.argsort(-np.abs(step))[:3] if abs(step[i]) > 1]
-        parts = ", ".join(
-            f"{self.names[i]} {share * moved[i]:+.2g} ({abs(step[i]):.1f} sigma)"
-            for i in most
-        )
-        if not most:
-            return ""
-        return f"{amount_text.format(share * amount)} would be taken for {parts}; state it if there is any"
-
 
 def _strongest(
     changes: Iterable[Array], root: Array, fit: FitAtMode
@@ -531,8 +412,7 @@ def _patch(task: SearchTask, x: Array, root: Array, fit: FitAtMode) -> ScoreTest
     """
     u, v = _places()
     names = [f"residual_{k}" for k in range(len(u))]
-    model = task.model.with_residual(np.zeros(len(u)), _spots)
-    dark = np.asarray(model.images(x, names)[1])
+    dark = np.asarray(task.model.with_residual(_spots).images(x, names)[1])
     best, place, chance = _strongest(dark, root, fit)
     x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
     words = (
@@ -550,8 +430,8 @@ def _places() -> tuple[Array, Array]:
     return u[inside], v[inside]
 
 
-def _spots(u: Array, v: Array, count: int) -> Array:
-    """(count, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1)
+def _spots(u: Array, v: Array) -> Array:
+    """(spots, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1)
     of its amplitude there.
     """
     places = zip(*_places(), strict=True)
@@ -559,5 +439,5 @@ def _spots(u: Array, v: Array, count: int) -> Array:
         [
             1j * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (_SPOT / 1.5) ** 2)
             for a, b in places
-        ][:count]
+        ]
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from characterize.captures import SensorNoise
 from characterize.inference.leastsquares import (
     FitProblem,
     FitSolution,
@@ -86,16 +87,19 @@ class FitPosterior:
         return self.modes[0]
 
 
-def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPosterior:
+def explore_posterior(
+    task: SearchTask, ends: Sequence[FitSolution], gain: SensorNoise
+) -> FitPosterior:
     """Intervals, profiles, covariance and draws about the modes of a fit.
 
     Where a profile falls below the best mode, its lowest place is fitted and the
-    profiles are repeated. Errors of dark and flat, which all frames share, are
-    included.
+    profiles are repeated. Errors of dark and flat, which all frames share, and of the
+    gain are included.
 
     Args:
         task: model, frames and priors.
         ends: the modes, best first.
+        gain: noise model of the sensor, with the error of its gain.
     """
     task = correct_surrogate(task, ends[0])
     modes = list(ends)
@@ -116,7 +120,16 @@ def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPoste
         if lowest.merit > modes[0].merit - _LOWER:
             break
         modes = distinct_modes([*modes, refine_fit(task, lowest.value)])
-    return _joined(task, problem, modes, profiles)
+    best = modes[0]
+    calibration = shared_calibration(problem, best)
+    # the gain scales what is counted in electrons
+    relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
+    by_gain = [
+        relative * (1.0 if name == "log_gain" else value) * (i not in named)
+        for i, (name, value) in enumerate(zip(task.names, best.value, strict=True))
+    ]
+    calibration += np.outer(by_gain, by_gain)
+    return _joined(task, problem, modes, profiles, calibration)
 
 
 def profile_parameters(
@@ -332,8 +345,9 @@ def _joined(
     problem: FitProblem,
     modes: list[FitSolution],
     profiles: dict[int, ProfileLikelihood],
+    calibration: Array,
 ) -> FitPosterior:
-    """The posterior over all modes, with the errors of dark and flat.
+    """The posterior over all modes, with the errors of the camera's calibration.
 
     Draws are made only where a parabola does not describe it; the covariance is then
     scaled to the widths of the intervals.
@@ -341,6 +355,7 @@ def _joined(
     Args:
         problem: the least-squares problem of the modes.
         profiles: by index of the parameter.
+        calibration: (p, p) covariance by errors of dark, flat and gain.
     """
     best = modes[0]
     names = task.names
@@ -363,8 +378,7 @@ def _joined(
         high = np.maximum(high, np.where(root > 0, mode.value + reach, high))
     ratio = np.maximum(high - best.value, best.value - low) / (REACH * sigma)
     parabolic &= ratio < _PARABOLIC[1]
-    # errors that all frames share, added in quadrature
-    calibration = shared_calibration(problem, best)
+    # errors of the calibration, added in quadrature
     common = REACH * np.sqrt(np.maximum(np.diag(calibration), 0.0))
     low = np.maximum(best.value - np.hypot(best.value - low, common), prior.low)
     high = np.minimum(best.value + np.hypot(high - best.value, common), prior.high)

@@ -2,8 +2,6 @@
 and two verdicts in words.
 """
 
-import copy
-import dataclasses
 import functools
 import itertools
 import math
@@ -18,10 +16,10 @@ from characterize.inference.leastsquares import (
     GaussianPrior,
     SolverSettings,
 )
-from characterize.inference.missing import ResidualFinding, UnmodelledShifts
+from characterize.inference.missing import ResidualFinding
 from characterize.inference.multistart import WAVES_RAD, SearchTask, named_images
 from characterize.inference.uncertainty import FitPosterior
-from characterize.model import FitParameter, ForwardModel, KnownValue
+from characterize.model import FitParameter, KnownValue, background_planes
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import wavelength_scale
@@ -29,7 +27,6 @@ from metalens.lens import Lens
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
-_SHOWN = 24  # draws whose images give the predicted error at depths in between
 # wavelength range over which phases of pillars change by 0.02 rad
 _ONE_COLOUR_NM = 2.0
 # significance of correlated residuals; a thousand frames of noise reach 4
@@ -226,8 +223,8 @@ def correlated_residuals_text(
             :meth:`characterize.inference.leastsquares.FitImages.shared`.
     """
     r = np.clip(residual_sigma, -6, 6)
-    dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
-    total = np.sqrt(1 + flat**2)
+    shared = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
+    total = np.sqrt(1 + shared[1] ** 2)
     r = r / total
     found = []
     sides = np.array(
@@ -242,7 +239,7 @@ def correlated_residuals_text(
         )
         found.append(ResidualFinding(words, float(sides.max())))
     if len(r) > 1:
-        frames = _from_frame_to_frame(r, dark / total, flat / total)
+        frames = _from_frame_to_frame(r, shared / total)
         if frames > _STRUCTURE:
             words = (
                 f"residuals go together from frame to frame ({frames:.1f} sigma): the "
@@ -260,7 +257,7 @@ def correlated_residuals_text(
     return found
 
 
-def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
+def _from_frame_to_frame(r: Array, shared: Array) -> float:
     """Correlation of residuals in neighbouring frames, in standard deviations.
 
     T = rᵀ A r, A = 1/2 next to the diagonal, less its expectation tr AK and over the
@@ -268,20 +265,15 @@ def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
 
     Args:
         r: (n, y, x) residuals.
-        dark: (n, y, x) shared error of the dark over the noise.
-        flat: (n, y, x) the same of the flat.
+        shared: (2, n, y, x) errors of dark and of flat over the noise, which all frames
+            share.
     """
-    expected, variance = 0.0, 0.0
-    for row in range(r.shape[1]):
-        shared = [part[:, row].T for part in (dark, flat)]
-        # covariance K of the frames in every pixel, of unit variance
-        k = sum(np.einsum("pi,pj->pij", error, error) for error in shared)
-        np.einsum("pii->pi", k)[:] = r[:, row].T != 0
-        ak = np.zeros_like(k)
-        ak[:, 1:] += k[:, :-1] / 2
-        ak[:, :-1] += k[:, 1:] / 2
-        expected += float(np.einsum("pii->", ak))
-        variance += 2 * float(np.einsum("pij,pji->", ak, ak))
+    n = len(r)
+    k = np.einsum("ciyx,cjyx->yxij", shared, shared)
+    np.einsum("yxii->yxi", k)[:] = np.moveaxis(r != 0, 0, -1)
+    ak = (np.eye(n, k=1) + np.eye(n, k=-1)) / 2 @ k
+    expected = float(np.einsum("yxii->", ak))
+    variance = 2 * float(np.einsum("yxij,yxji->", ak, ak))
     return (float((r[1:] * r[:-1]).sum()) - expected) / math.sqrt(max(variance, 1.0))
 
 
@@ -294,185 +286,57 @@ def _together(first: Array, second: Array) -> Array:
 
 
 def process_verdict(
-    rows: Sequence[FitParameter],
-    low: Array,
-    high: Array,
-    prior_share: Array,
-    unstated: UnmodelledShifts,
+    rows: Sequence[FitParameter], low: Array, high: Array, prior_share: Array
 ) -> str:
-    """Sentence on which causes the frames determine.
-
-    The others come from prior knowledge, or are determined only within the model, where
-    unstated causes may have shifted them too much, or loosely.
+    """Sentence on which process parameters are known to their typical uncertainty,
+    which loosely, and which from prior knowledge only.
 
     Args:
         rows: (p,) of the fitted parameters, for this lens.
-        low: (p,) lower ends of statistical 95 %.
-        high: (p,) upper ends of statistical 95 %.
-        prior_share: (p,) interval over that of the prior alone; 1 where the frames add
-            nothing.
-        unstated: shifts by causes that nobody stated.
+        low: (p,) lower ends of the total 95 % intervals.
+        high: (p,) upper ends.
+        prior_share: (p,) statistical interval over that of the prior alone; 1 where the
+            frames add nothing.
     """
-    names = [row.name for row in rows]
-    causes = [
-        i
-        for i, n in enumerate(names)
-        if n.endswith(("_nm", "_rad", "_deg")) or n == "index"
-    ]
-    # standard deviations: statistical, and with the shifts by unstated causes
-    own = (high - low) / 3.92
-    close = [i for i in causes if own[i] <= rows[i].scale]
-    whole = np.hypot(own, unstated.sigma)
-    good = [i for i in close if whole[i] <= rows[i].scale]
-    known = ", ".join(f"{names[i]} +- {whole[i]:.2g}" for i in good) or "no cause alone"
-    prior = [names[i] for i in causes if prior_share[i] > 0.7]
-    more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""
-    moved = [i for i in close if i not in good]
-    if moved:
-        worst = np.argsort(-(unstated.by_cause[:, moved] / own[moved]).max(1))[:3]
-        parts = ", ".join(
-            f"{names[i]} +- {own[i]:.2g} (else +- {whole[i]:.2g})" for i in moved
-        )
-        without = ", ".join(
-            unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst
-        )
-        more = f"; within the model only, that is without {without}: {parts}" + more
-    open_ = [i for i in causes if i not in close and prior_share[i] <= 0.7]
-    middle = (low + high) / 2
-    reach = 1.96 * whole
-    wide = ", ".join(
-        f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}"
-        for i in open_
-    )
-    loosely = f"; loosely: {wide}" if wide else ""
-    return f"the process is known to {known}" + loosely + more
+    known, loosely, prior = list[str](), list[str](), list[str]()
+    for row, a, b, share in zip(rows, low, high, prior_share, strict=True):
+        sigma = (b - a) / 3.92
+        if not (row.name.endswith(("_nm", "_rad", "_deg")) or row.name == "index"):
+            continue
+        if share > 0.7:
+            prior.append(row.name)
+        elif sigma <= row.scale:
+            known.append(f"{row.name} +- {sigma:.2g}")
+        else:
+            loosely.append(f"{row.name} {a:.3g} to {b:.3g}")
+    words = [f"the process is known to {', '.join(known) or 'no cause alone'}"]
+    words += [f"loosely: {', '.join(loosely)}"] if loosely else []
+    words += [f"from prior knowledge only: {', '.join(prior)}"] if prior else []
+    return "; ".join(words)
 
 
-def predicted_error(task: SearchTask, posterior: FitPosterior) -> tuple[float, float]:
-    """Expected NRMSE of the as-built images: at the captured depths, and half-way
-    between them.
+def psf_verdict(task: SearchTask, posterior: FitPosterior, unseen: float) -> str:
+    """Sentence on the expected relative L2 error of the images at the captured depths
+    and angles, √(tr(C JJᵀ) / |I|²), without background and at the brightness of the best.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        posterior: the posterior.
+        posterior: the posterior, with its covariance C.
+        unseen: reduced chi-square of frames left out; nan without such.
     """
-    values = _shown(task, posterior)
-    best = posterior.best.value
-    model = task.model.quick()  # accurate to a few percent of the differences
-    between = models_between_depths(model)
-    return _spread(task, model, best, values), _spread(task, between, best, values)
-
-
-def predicted_aside(
-    task: SearchTask, posterior: FitPosterior
-) -> tuple[float, float] | None:
-    """Expected NRMSE of as-built images off the captured field angles.
-
-    At the captured depths, as :func:`predicted_error`.
-
-    Args:
-        task: model, frames, priors and arrangement of the search.
-        posterior: the posterior.
-
-    Returns:
-        (half-way between neighbouring angles, half a step beyond the outermost); None
-        of frames at one angle.
-    """
-    angles = largest_angle_gap(task.model.setting.angle_rad)
-    if angles is None:
-        return None
-    values = _shown(task, posterior)
-    models = [_at_angle(task.model, angle).quick() for angle in angles]
-    between_them, beyond = (
-        _spread(task, model, posterior.best.value, values) for model in models
-    )
-    return between_them, beyond
-
-
-def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
-    """(x, y) middle of the widest gap between neighbouring field angles (n, 2), and
-    half a step beyond the outermost; None for one angle.
-
-    Args:
-        angle_rad: (n, 2) field angles, rad.
-    """
-    angles = np.unique(angle_rad, axis=0)
-    if len(angles) < 2:
-        return None
-    distances = np.hypot(*(angles[:, None] - angles).T)
-    np.fill_diagonal(distances, np.inf)
-    nearest = angles[distances.argmin(1)]
-    wide = int(distances.min(1).argmax())
-    outer = int(np.hypot(*(angles - angles.mean(0)).T).argmax())
-    middle = (angles[wide] + nearest[wide]) / 2
-    return middle, angles[outer] + (angles[outer] - nearest[outer]) / 2
-
-
-def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
-    """The model of all its depths at one field angle."""
-    s = model.setting
-    angles_rad = np.broadcast_to(angle_rad, s.angle_rad.shape)
-    setting = dataclasses.replace(s, angle_rad=angles_rad)
-    return ForwardModel(model.lens, setting, model.response).about(model.grid.middle_um)
-
-
-def _shown(task: SearchTask, posterior: FitPosterior) -> Array:
-    """(draws, p) parameters of the posterior, within the bounds.
-
-    Its own draws, or Gaussian ones where there are none.
-    """
-    if len(posterior.draws):
-        values = posterior.draws[:_SHOWN]
-    else:
-        size, vectors = np.linalg.eigh(posterior.covariance)
-        normal = np.random.default_rng(0).standard_normal((_SHOWN, len(size)))
-        normal = normal * np.sqrt(np.maximum(size, 0))
-        values = posterior.best.value + normal @ vectors.T
-    return np.clip(values, task.prior.low, task.prior.high)
-
-
-def _spread(task: SearchTask, model: ForwardModel, best: Array, values: Array) -> float:
-    """Relative rms error of the images over draws of the parameters (draws, p).
-
-    Root of the mean of |image - best|² / |best|², without background and at the
-    brightness of the best.
-    """
-    images = named_images(model, task.names, task.start)
-    dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
-
-    def light(x: Array) -> Array:
-        x = x.copy()
-        x[dark] = 0.0
-        return np.asarray(images(x, False)[0])
-
-    mean = light(best)
-
-    def squared_error(x: Array) -> float:
-        image = light(x)
-        # least-squares brightness
-        image *= (image * mean).sum() / max(float((image**2).sum()), 1e-300)
-        return float(((image - mean) ** 2).sum())
-
-    total = sum(threads.run_each(squared_error, values))
-    return float(np.sqrt(total / len(values) / (mean**2).sum()))
-
-
-def models_between_depths(model: ForwardModel) -> ForwardModel:
-    """The model half-way, in 1/z, between neighbouring depths at each angle.
-
-    The farthest frame takes the last of these depths too.
-    """
-    part = copy.copy(model)
-    s = model.setting
-    depth = s.depth_um.copy()
-    for group in model.groups:
-        order = group.index[np.argsort(s.depth_um[group.index], kind="stable")]
-        if len(order) > 1:
-            inverse = 1 / s.depth_um[order]
-            middle = (inverse[1:] + inverse[:-1]) / 2
-            depth[order] = 1 / np.append(middle, middle[-1])
-    part.setting = dataclasses.replace(s, depth_um=depth)
-    return part
+    best = posterior.best
+    background = background_planes(task.all_of(best.value), task.model.setting)
+    light = (best.image - background).ravel()
+    power = float(light @ light)
+    lens = [i for i, name in enumerate(task.names) if not name.startswith("background")]
+    slopes = best.slopes[lens].reshape(len(lens), -1)
+    slopes = slopes - np.outer(slopes @ light / power, light)
+    square = posterior.covariance[np.ix_(lens, lens)] * (slopes @ slopes.T)
+    tested = ""
+    if not math.isnan(unseen):
+        tested = f"; frames left out agree within {unseen:.2f} times their noise"
+    error = math.sqrt(max(float(square.sum()), 0.0) / power)
+    return f"the PSF is known to {error:.1%} at the captured depths and angles{tested}"
 
 
 def left_out(task: SearchTask, mode: FitSolution) -> float:

@@ -23,6 +23,3 @@ from .setting import SpectralLine as SpectralLine
 from .setting import background_planes as background_planes
 from .setting import light_maps as light_maps
 from .setting import true_depth as true_depth
-from .thinplate import MODES as MODES
-from .thinplate import prior_rad as prior_rad
-from .thinplate import thin_plate_basis as thin_plate_basis

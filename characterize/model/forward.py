@@ -111,12 +111,7 @@ class ForwardModel:
         self._span = span
         self.cut = 0.0
         self._lean_um = 0.0
-        self.modes = np.empty(0)
         self._lit = EVERY, EVERY
-        # residual shapes on the nodes, by (reduced lens, basis, count)
-        self._kept: dict[
-            tuple[CompressedLens, Callable[[Array, Array, int], Array], int], Array
-        ] = {}
         self._pillars: dict[float, PillarResponse] = {}  # by angle of incidence
         self.films = FilmStack.of(lens.layers, lens.wavelength_um)
         self.area_um2 = (
@@ -203,7 +198,6 @@ class ForwardModel:
         )
         if max(abs(v) for v in middle_um) > reach:  # needs more directions
             angles_rad = np.unique(self.setting.angle_rad, axis=0)
-            part._kept = {}
             part.groups = [part._group(angle_rad) for angle_rad in angles_rad]
         return part
 
@@ -263,33 +257,20 @@ class ForwardModel:
         part._lean_um = math.tan(angle_rad) * self.lens.cell.height_um
         return part
 
-    def with_residual(
-        self, modes: Array, basis: Callable[[Array, Array, int], Array]
-    ) -> "ForwardModel":
-        """The same lens with an additional phase: ``modes`` (m,) times ``basis``.
-
-        Their derivatives are named ``residual_0``, ``residual_1`` and so on.
+    def with_residual(self, shapes: Callable[[Array, Array], Array]) -> "ForwardModel":
+        """The same model with derivatives by further phases ``residual_0``,
+        ``residual_1`` and so on.
 
         Args:
-            modes: (m,) amplitudes.
-            basis: (u, v, m) -> (m, *shape) phases in rad; see :mod:`thinplate`.
+            shapes: (u, v) of places on the lens over its radius to (m, *shape) phases
+                in rad; imaginary parts attenuate.
         """
         part = copy.copy(self)
-        part.modes = np.asarray(modes)
-        if len(modes):
-            part.groups = [
-                g.bent(self._shapes(g, len(modes), basis)) for g in self.groups
-            ]
+        part.groups = [
+            group.bent(shapes(group.reduced.u, group.reduced.v))
+            for group in self.groups
+        ]
         return part
-
-    def _shapes(
-        self, group: AngleGroup, count: int, basis: Callable[[Array, Array, int], Array]
-    ) -> Array:
-        """(count, q, p) of a basis on the lens nodes of a group, cached."""
-        key = group.reduced, basis, count
-        if key not in self._kept:
-            self._kept[key] = basis(group.reduced.u, group.reduced.v, count)
-        return self._kept[key]
 
     def images(
         self, x: Array, names: Sequence[str] | None = None
@@ -532,8 +513,8 @@ class ForwardModel:
     def _phase(self, x: Array, group: AngleGroup) -> Array:
         """(frames, q, p) smooth phase on the lens nodes, rad.
 
-        k (source path + sensor path) less the phase taken off before, plus aberrations,
-        residual modes and, as an imaginary part, the unevenness of the illumination.
+        k (source path + sensor path) less the phase taken off before, plus aberrations
+        and, as an imaginary part, the unevenness of the illumination.
         """
         reduced = group.reduced
         index = group.index
@@ -567,10 +548,7 @@ class ForwardModel:
             if uneven.any()
             else 0.0
         )
-        residual = (
-            np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0
-        )
-        return phase + light + residual
+        return phase + light
 
     def _phase_slope(self, x: Array, group: AngleGroup, name: str) -> Array:
         """(frames, q, p) derivative of i times :meth:`_phase` by a geometric parameter.

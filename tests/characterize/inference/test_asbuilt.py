@@ -226,13 +226,9 @@ def test_degeneracies_are_named(fitted):
     assert fitted.identifiable
 
 
-def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fitted):
+def test_nothing_is_found_where_nothing_is(fitted):
     assert "residuals lean" not in " ".join(fitted.cautions)
     assert "slopes of the pillars" not in " ".join(fitted.cautions)  # known to 8 %
-    assert any(
-        "glass" in words and "would be taken for" in words
-        for words in fitted.degeneracies
-    )
 
 
 def test_orientation_of_a_symmetric_design_is_declared_unobservable(fitted):

@@ -4,7 +4,6 @@ parameter.
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.captures import SensorNoise
-from characterize.inference import estimate, knowable
+from characterize.inference import knowable
 from characterize.inference.asbuilt import AsBuilt
 from characterize.model import PARAMETERS, PLACE
 
@@ -117,20 +115,6 @@ def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
     assert words[1].startswith(
         "bias_nm comes from prior knowledge (0.37)"
     )  # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
-
-
-def test_the_gain_s_error_is_shared_by_all_that_is_counted_in_electrons():
-    names = ("bias_nm", "log_gain", "background_e", "background_x_e")
-    own = np.diag([0.1, 2e-4, 0.5, 0.3])
-    best = SimpleNamespace(value=np.array([1.3, 9.1, 21.0, -4.0]))
-    found = SimpleNamespace(best=best, covariance=own)
-    for gain, relative in (
-        (SensorNoise(2.5, 0.1, 3.0), 0.04),
-        (SensorNoise(1.0, np.inf, 3.0, known=False), 1.0),
-    ):
-        by_gain = relative * np.array([0.0, 1.0, 21.0, -4.0])
-        want = own + by_gain[:, None] * by_gain
-        assert estimate._with_gain(names, found, gain) == pytest.approx(want, rel=1e-12)
 
 
 def asbuilt(**more):
