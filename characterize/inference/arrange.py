@@ -130,7 +130,7 @@ def find_arrangement(
     )
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     plain, score = frames.scanned(start, zeros)
-    arrangement = _laid(frames, plain, score)
+    arrangement = _arrange(frames, plain, score)
     doubtful = arrangement.reordered or arrangement.clearly or score < _SURE
     if reach_um > 0 and doubtful:
         distances = start[PLACE["distance_um"]] + reach_um * np.linspace(
@@ -140,7 +140,7 @@ def find_arrangement(
             start, zeros[:: _ZEROS // 4], distances
         )
         place, better = frames.scanned(place, zeros)
-        refocused = _laid(frames, place, better)
+        refocused = _arrange(frames, place, better)
         simpler = (refocused.reordered, refocused.clearly) < (
             arrangement.reordered,
             arrangement.clearly,
@@ -174,7 +174,7 @@ class _Frames:
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
         return cls(
             model,
-            model.quick(),
+            model.rough(),
             light,
             noise,
             data.saturated.mean((1, 2)),
@@ -258,7 +258,7 @@ def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
     return 0, True
 
 
-def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
+def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     """Arrangement of the frames: their order and orientation at parameters ``x``.
 
     Every order and orientation is compared with the nominal images. Where frames seem
@@ -281,7 +281,7 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
         way = next(way for way in twins if likeness_of[way] > best - _TWINS)
         reordered, clearly = way[0], way[1] > 0
     chosen = reordered, orientation if clearly else 0
-    chi2 = {k: _apart(k, expected, light, noise) for k in _EVERY}
+    chi2 = {k: _chi_square_of_turn(k, expected, light, noise) for k in _EVERY}
     arrangement = FrameArrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
@@ -340,7 +340,7 @@ def _ways(
     return likeness, shifts
 
 
-def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
+def _chi_square_of_turn(k: int, expected: Both, light: Array, noise: Array) -> float:
     """Chi-square between the nominal images and the same in orientation ``k``.
 
     At the brightness of the measured frames: how well fits can distinguish the two.
@@ -468,7 +468,7 @@ def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
     return np.asarray(out[arrangement.order] if arrangement.reordered else out)
 
 
-def laid_words(arrangement: FrameArrangement) -> list[str]:
+def arrangement_text(arrangement: FrameArrangement) -> list[str]:
     """Sentences on the orientation and order of the frames, and on what of it is
     ambiguous.
 

@@ -37,7 +37,7 @@ WINDOWS = "a window off the chief ray at a field angle"
 # share below which a turn of light is the error of its slopes: that light is round
 _ROUND = 0.02
 _GRID = 41  # places across the lens at which write fields are sampled
-_SMOOTH = 6  # degree of the polynomials that represent displaced write fields
+_SMOOTH = 7  # degree of the polynomials that represent displaced write fields
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size

@@ -13,8 +13,8 @@ from characterize.captures import Capture, SensorNoise, to_electrons
 from characterize.inference import knowable, missing, multistart, uncertainty, verdict
 from characterize.inference.arrange import (
     FrameArrangement,
+    arrangement_text,
     find_arrangement,
-    laid_words,
     rearrange_frames,
 )
 from characterize.inference.asbuilt import AsBuilt, WithinModel
@@ -40,7 +40,6 @@ from characterize.inference.prepare import (
 from characterize.inference.uncertainty import FitPosterior
 from characterize.model import (
     NAMES,
-    PARAMETERS,
     PLACE,
     ForwardModel,
     KnownValue,
@@ -56,14 +55,12 @@ from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 LIKENESS = 0.45
-# fitted too where the usual parameters do not explain the frames
-EXTRA = tuple(row.name for row in PARAMETERS if row.extra)
 # fits with rounded counts: at most so many, until none moves by more sigma
 _ROUNDS, _STAYS = 5, 0.1
 # a solution, its score tests, and stated values that it contradicts
 Looked = tuple[FitSolution, ScoreTests, list[ResidualFinding]]
 # chi-square a pixel of frames left out, over noise and uncertainty of the prediction
-_LEFT_OUT = 1.25
+_HELD_OUT = 1.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,30 +134,33 @@ def _fit(
     _check_likeness(arrangement, lens)
     whole = SearchTask(model, data, start, known, arrangement, options.free, sizes)
     task = multistart.choose_orientation(
-        [_as_laid(whole, candidate) for candidate in (arrangement, *arrangement.others)]
+        [
+            _arranged(whole, candidate)
+            for candidate in (arrangement, *arrangement.others)
+        ]
     )
     cautions = [
         *frames.corrections,
-        *laid_words(task.found or arrangement),
+        *arrangement_text(task.arrangement or arrangement),
         *verdict.spectrum_text(lens, known),
     ]
     cautions += roughly_known(lens, model.response)
     unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
     fast = quick_enough(task.model, task.data, unbiased)
     task = dataclasses.replace(task, model=fast)
-    task, ends = _ends(task, frames.gain, cautions)
+    task, ends = multistart.search_modes(task)
     task, ends = multistart.place_windows(task, ends)
     task, ends = _unrounded(task, ends, frames.gain)
     task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
-    leans = looked[1].leans if looked else []
-    _refuse(_problems(task, ends[0], frames.gain), options, leans)
+    score_tests = looked[1].tests if looked else []
+    _refuse(_problems(task, ends[0], frames.gain), options, score_tests)
     posterior = uncertainty.explore_posterior(task, ends, frames.gain)
     doubts = looked[2] if looked else []
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.run_score_tests(task, posterior.best), doubts
     cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
     result = _result(capture, task, posterior, cautions, frames.gain, looked)
-    _refuse(result.problems, options, leans)
+    _refuse(result.problems, options, score_tests)
     return result
 
 
@@ -171,33 +171,13 @@ def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
 
 
 def _refuse(
-    problems: Sequence[str], options: FitOptions, leans: list[ScoreTest]
+    problems: Sequence[str], options: FitOptions, score_tests: list[ScoreTest]
 ) -> None:
     """Raise FitRefused with the problems and the causes the residuals lean to."""
     if problems and not options.insist:
-        leaning = (finding.words for finding in missing.score_test_text(leans))
+        leaning = (finding.words for finding in missing.score_test_text(score_tests))
         reasons = dict.fromkeys([*problems, *leaning])  # each once
         raise FitRefused("fit refused: " + "; ".join(reasons))
-
-
-def _ends(
-    task: SearchTask, gain: SensorNoise, cautions: list[str]
-) -> tuple[SearchTask, list[FitSolution]]:
-    """Modes of the usual parameters, or with ``EXTRA`` where these do not fit.
-
-    The extra parameters stay only where chi-square falls by 3 % or more.
-    """
-    task, ends = multistart.search_modes(task)
-    if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
-        return task, ends
-    extended = dataclasses.replace(task, free=(*task.free, *EXTRA))
-    wider = multistart.widen_search(extended, task.all_of(ends[0].value))
-    if wider is None or wider[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
-        return task, ends
-    cautions.append(
-        f"the usual parameters did not explain the frames: {', '.join(EXTRA)} fitted too"
-    )
-    return wider
 
 
 def _unrounded(
@@ -242,21 +222,21 @@ def _with_likely_causes(
     for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
             break
-        falls = _falls(task, ends[0], tests.leans)
+        falls = _falls(task, ends[0], tests.tests)
         cause = next((test for _, test in falls if not test.stated), None)
         if cause is None:
             break
         extended = dataclasses.replace(task, free=(*task.free, *cause.frees))
         wider = multistart.widen_search(extended, task.all_of(ends[0].value))
-        if wider is None or wider[1][0].merit > ends[0].merit:
+        if not wider or wider[0].merit > ends[0].merit:
             break
-        fall = ends[0].merit - wider[1][0].merit
+        fall = ends[0].merit - wider[0].merit
         cautions.append(
             f"{cause.cause} explains the frames better (chi-square falls by "
             f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
         )
         doubts += _contradicted(cause, falls)
-        task, ends = wider
+        task, ends = extended, wider
         tests = missing.run_score_tests(task, ends[0])
     return task, ends, (ends[0], tests, doubts)
 
@@ -264,7 +244,7 @@ def _with_likely_causes(
 def _falls(
     task: SearchTask,
     best: FitSolution,
-    leans: list[ScoreTest],
+    score_tests: list[ScoreTest],
     *,
     out_of_bounds: float = 10.0,
 ) -> list[tuple[float, ScoreTest]]:
@@ -275,7 +255,7 @@ def _falls(
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
-    for cause in missing.to_fit(leans, stuck=stuck):
+    for cause in missing.to_fit(score_tests, stuck=stuck):
         fall = best.merit - multistart.merit_with(task, best, cause.frees)
         if fall > (out_of_bounds if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
@@ -317,7 +297,7 @@ def _check_likeness(arrangement: FrameArrangement, lens: Lens) -> None:
         )
 
 
-def _as_laid(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
+def _arranged(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
     """The task with its frames in an arrangement, and its window fixed at the light."""
     sideways = arrangement.clearly and arrangement.orientation % 2 == 1
     model = task.model.exchanged() if sideways else task.model
@@ -326,7 +306,7 @@ def _as_laid(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
         task,
         model=model,
         data=task.data.arranged(lambda part: rearrange_frames(part, arrangement)),
-        found=arrangement,
+        arrangement=arrangement,
     )
 
 
@@ -349,7 +329,7 @@ def _result(
     model, data, names = task.model, task.data, task.names
     solution, value = posterior.best, posterior.best.value
     fitted = dict(zip(names, value.tolist(), strict=True))
-    unseen = verdict.left_out(task, solution)
+    held_out = verdict.hold_out_chi_square(task, solution)
     unstated = tests.shifts()
     findings = [*_findings(task, solution, tests), *doubts]
     # intervals about the value less the expected shift, widened by its spread
@@ -359,9 +339,9 @@ def _result(
     high = np.maximum(centre + np.hypot(posterior.high - value, more), posterior.high)
     prior_share = (posterior.high - posterior.low) / (2 * uncertainty.REACH)
     cautions = [*cautions, *(finding.words for finding in findings)]
-    if gain.known and unseen > _LEFT_OUT:
+    if gain.known and held_out > _HELD_OUT:
         cautions.append(
-            f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not "
+            f"frames left out are predicted with chi-square {held_out:.2f} a pixel, not "
             "1: do not extrapolate"
         )
     return AsBuilt(
@@ -410,7 +390,7 @@ def _result(
             for name, profile in posterior.profiles.items()
         },
         verdicts=(
-            verdict.psf_verdict(task, posterior, unseen),
+            verdict.psf_verdict(task, posterior, held_out),
             verdict.process_verdict(
                 usual_parameters(names, model.lens),
                 low,
@@ -460,7 +440,7 @@ def _findings(
     structure = verdict.correlated_residuals_text(
         np.where(data.saturated, 0.0, residual), shared
     )
-    return [*structure, *missing.score_test_text(looked.leans)]
+    return [*structure, *missing.score_test_text(looked.tests)]
 
 
 def _problems(task: SearchTask, solution: FitSolution, gain: SensorNoise) -> list[str]:

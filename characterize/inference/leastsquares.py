@@ -16,6 +16,9 @@ from metalens.core.errors import FitError
 
 # sigma of the least step that updates slopes: images are rounded to about 1e-3 sigma
 _TELLING = 0.03
+# relative error of the predicted change of the images above which the Jacobian is
+# computed anew
+_MISSED = 0.6
 HUBER = 6.0  # sigma beyond which a residual counts linearly
 _NODES, _WEIGHTS = special.roots_jacobi(4, 1.0, 0.0)
 _JACOBI = (_NODES + 1) / 2, _WEIGHTS / 4  # of (1 - s) f(s) over s from 0 to 1
@@ -119,20 +122,16 @@ class SolverSettings:
     """When a fit stops, how it treats outliers, and when it renews the Jacobian.
 
     huber: sigma beyond which a residual counts linearly.
-    secant: update the Jacobian by the images of each step (Broyden 1965); steps that
-    look final, and those that fail, are checked with an exact one.
-    near: length of steps, sigma, over which an exact Jacobian is reused.
-    miss: relative error of the predicted change of the images above which the Jacobian
-    is computed anew.
+    near: length of steps, sigma, over which an exact Jacobian is trusted: it is updated
+    by the images of each step (Broyden 1965), and steps that look final, and those that
+    fail, are checked with an exact one beyond.
     finish: the Jacobian at the end is exact, or was so within ``near``.
     """
 
     iterations: int = 40
     step_tolerance: float = 0.02
     huber: float = HUBER
-    secant: bool = False
     near: float = 0.3
-    miss: float = math.inf
     finish: bool = True
 
 
@@ -198,8 +197,8 @@ class FitProblem:
             slopes=slopes,
         )
 
-    def held(self, i: int, value: float) -> "FitProblem":
-        """The same with parameter number ``i`` held at ``value``."""
+    def with_fixed(self, i: int, value: float) -> "FitProblem":
+        """The same with parameter number ``i`` fixed at ``value``."""
         low, high = self.prior.low.copy(), self.prior.high.copy()
         low[i] = high[i] = value
         prior = dataclasses.replace(self.prior, low=low, high=high)
@@ -258,20 +257,10 @@ def fit_levenberg_marquardt(
             state = _linearise(model, data, x, prior, settings)
             damping = 1e-3
             continue
-        if accepted and not done and _missed(state, step, image) > settings.miss:
+        if accepted and not done and _missed(state, step, image) > _MISSED:
             state = _linearise(model, data, state.x + step, prior, settings)
-        elif accepted and settings.secant:
-            state = _secant(data, state, step, image, prior, settings, moved=moved)
-        elif accepted and state.travel + moved <= settings.near:
-            state = _state(
-                data,
-                (state.x + step, image, state.jacobian),
-                prior,
-                settings,
-                travel=state.travel + moved,
-            )
         elif accepted:
-            state = _linearise(model, data, state.x + step, prior, settings)
+            state = _secant(data, state, step, image, prior, settings, moved=moved)
         if done:
             converged = moved < 10 * settings.step_tolerance
             reason = (

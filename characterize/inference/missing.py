@@ -78,7 +78,7 @@ class ScoreTests:
     assumed size as changes (k, pixels) over the noise, of one standard deviation each.
     """
 
-    leans: list[ScoreTest]
+    tests: list[ScoreTest]
     fit: "FitAtMode"
     unstated: tuple[ImageChange, ...]
 
@@ -93,7 +93,7 @@ class ScoreTests:
         p = len(self.fit.names)
         sizes = [len(cause.images) for cause in self.unstated]
         changes = [cause.images for cause in self.unstated]
-        every = np.concatenate([np.empty((0, len(self.fit.rest))), *changes])
+        every = np.concatenate([np.empty((0, len(self.fit.residual))), *changes])
         number = np.repeat(np.arange(len(sizes)), sizes)
         exact = np.array([not cause.roughly for cause in self.unstated], bool)[number]
         bench = np.array([not cause.of_mask for cause in self.unstated], bool)[number]
@@ -174,7 +174,9 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     for effect in causes.systematic_changes(task, x, by_name):
         change = (effect.images * root).reshape(len(effect.images), -1)
         test = dataclasses.replace(
-            fit.lean(effect.cause, change), frees=effect.frees, stated=effect.stated
+            fit.score_test(effect.cause, change),
+            frees=effect.frees,
+            stated=effect.stated,
         )
         if np.any(effect.sigma):
             assumed = np.reshape(effect.sigma, (-1, 1)) * change
@@ -278,12 +280,12 @@ class FitAtMode:
 
     names: tuple[str, ...]
     slopes: Array
-    known: Array
-    rest: Array
+    information: Array
+    residual: Array
     shared: Array
     pull: Array
 
-    def lean(self, cause: str, changes: Array) -> ScoreTest:
+    def score_test(self, cause: str, changes: Array) -> ScoreTest:
         """Score test of a cause by its changes G (k, pixels).
 
         Score s = G'ᵀr of the part G' that the fit does not take up; chi-square sᵀS⁻¹s
@@ -293,17 +295,17 @@ class FitAtMode:
         changes = changes[size > 0] / size[size > 0, None]
         if not len(changes):
             return ScoreTest(cause, 0.0, 0, 1.0)
-        left, score = self.left(changes)
+        left, score = self.residual_changes(changes)
         values, vectors = np.linalg.eigh(changes @ left.T)
         vectors = vectors[:, values > 1e-3]
         degrees = vectors.shape[1]
         if not degrees:
             return ScoreTest(cause, 0.0, 0, 1.0)
-        scatter = vectors.T @ (changes @ left.T + self.in_common(left)) @ vectors
+        scatter = vectors.T @ (changes @ left.T + self.shared_scatter(left)) @ vectors
         chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
         return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
-    def left(self, changes: Array) -> tuple[Array, Array]:
+    def residual_changes(self, changes: Array) -> tuple[Array, Array]:
         """(k, pixels) changes less what the fit takes up, and their (k,) scores.
 
         G' = G - M J of changes G, with shifts M and slopes J. The score is G'ᵀr + Mᵀ
@@ -311,11 +313,11 @@ class FitAtMode:
         """
         moved = self.moved_by(changes).T
         left = changes - moved @ self.slopes
-        return left, left @ self.rest + moved @ self.pull
+        return left, left @ self.residual + moved @ self.pull
 
     def moved_by(self, changes: Array) -> Array:
         """(p, k) shift M of the parameters by (k, pixels) changes."""
-        return np.asarray(np.linalg.solve(self.known, self.slopes @ changes.T))
+        return np.asarray(np.linalg.solve(self.information, self.slopes @ changes.T))
 
     def odds(self, changes: Array) -> float:
         """Bayes factor of a cause against its absence, at most exp(100).
@@ -337,14 +339,14 @@ class FitAtMode:
 
         With H = GᵀG' and S the scatter of their scores s, C = (1 + H S⁻¹ H)⁻¹.
         """
-        left, score = self.left(changes)
+        left, score = self.residual_changes(changes)
         effect = changes @ left.T
-        scatter = effect + self.in_common(left)
+        scatter = effect + self.shared_scatter(left)
         scatter += max(1e-9 * float(np.trace(scatter)), 1e-300) * np.eye(len(scatter))
         weight = np.linalg.solve(scatter, effect)
         return np.linalg.inv(np.eye(len(effect)) + effect @ weight), weight.T @ score
 
-    def in_common(self, left: Array) -> Array:
+    def shared_scatter(self, left: Array) -> Array:
         """(k, k) additional scatter of scores by errors that all frames share.
 
         Errors of dark and of flat; less what of the dark is in the noise already.
@@ -375,10 +377,12 @@ def _strongest(
     best, index, count = 0.0, 0, 0
     for image in changes:
         change = (image * root).reshape(1, -1)
-        left, score = fit.left(change)
+        left, score = fit.residual_changes(change)
         effect = float((change * left).sum())
         if effect > 1e-3 * float((change**2).sum()) and score[0] > 0:
-            chi2 = float(score[0]) ** 2 / (effect + float(fit.in_common(left)[0, 0]))
+            chi2 = float(score[0]) ** 2 / (
+                effect + float(fit.shared_scatter(left)[0, 0])
+            )
             best, index = max((best, index), (chi2, count))
         count += 1
     return best, index, min(1.0, count * float(stats.chi2.sf(best, 1)) / 2)

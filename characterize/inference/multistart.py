@@ -2,8 +2,8 @@
 every other valley as good.
 """
 
+import contextlib
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +20,6 @@ from characterize.inference.leastsquares import (
     GaussianPrior,
     SolverSettings,
 )
-from characterize.inference.prepare import LeftOut, lit_part
 from characterize.model import (
     NAMES,
     PARAMETERS,
@@ -38,19 +37,13 @@ from metalens.lens import Lens
 
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
+_EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
 _LEANING_RAD = 0.3  # of the starts that look for a twin
-# bias by which starts are moved along the valley; largest offset of a window
-_ALONG_NM, _ASIDE_UM = 9.0, 50.0
+_ASIDE_UM = 50.0  # largest offset of a window
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
-# sigma of a prior to either side that is scanned, and of a step
-_REACH, _STEP, _MINIMA = 2.5, 0.35, 3
-_SCANNED = SolverSettings(
-    iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False
-)
-_ONWARD = SolverSettings(
-    iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False
-)
+_PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of a prior
+_ONWARD = SolverSettings(iterations=25, step_tolerance=0.3, near=1.0, finish=False)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 _WORTH = 10.0
 
@@ -60,21 +53,18 @@ class SearchTask:
     """What is searched: the model and its data, all start values, what is known, how
     the frames lie, what is free.
 
-    found: None before frames are there: no search begins without it.
+    arrangement: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes
     (``characterize.model.UNFITTED``).
-    left_out: what is added to images and slopes of the model; see
-    :func:`correct_surrogate`.
     """
 
     model: ForwardModel
     data: FitImages
     start: Array
     known: dict[str, KnownValue]
-    found: FrameArrangement | None
+    arrangement: FrameArrangement | None
     free: tuple[str, ...] = ()
     unfitted: dict[str, float] = field(default_factory=dict)
-    left_out: LeftOut | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -86,21 +76,16 @@ class SearchTask:
         """Of the fitted parameters."""
         return prior_of(self.names, self.known, self.model.lens)
 
-    def problem(self, frames: Array | None = None) -> leastsquares.Model:
-        """Images of all frames, or roughly of some."""
-        model = self.model if frames is None else self.model.only(frames)
-        if self.left_out is None:
-            return named_images(
-                model if frames is None else model.quick(), self.names, self.start
-            )
-        return self.left_out.added(named_images(model, self.names, self.start), frames)
-
     def posed(self, frames: Array | None = None) -> FitProblem:
-        """The least-squares problem of all frames, or of those of index ``frames`` with
-        rough images.
-        """
-        data = self.data if frames is None else self.data.planes(frames)
-        return FitProblem(self.problem(frames), data, self.prior)
+        """The least-squares problem of all frames, or of those of index ``frames``."""
+        model, data = self.model, self.data
+        if frames is not None:
+            model, data = model.only(frames), data.planes(frames)
+        return FitProblem(named_images(model, self.names, self.start), data, self.prior)
+
+    def rough(self) -> "SearchTask":
+        """The task with the fastest model, for choosing among starts."""
+        return dataclasses.replace(self, model=self.model.rough())
 
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
@@ -125,32 +110,6 @@ def named_images(
     return images
 
 
-def correct_surrogate(task: SearchTask, at: FitSolution) -> SearchTask:
-    """The task with a fast model, corrected at a fit: a third of the work or less.
-
-    The difference of images and slopes to the full model at the fit is added
-    (:class:`LeftOut`). The fast model omits a percent or two of the light and of its
-    changes. Among lenses that explain the frames, whose images differ by a few sigma,
-    that omission varies by about 0.1 sigma. (A test checks this on a small lens; on
-    1 mm it was 0.2 where images differ by 20 sigma.)
-
-    Args:
-        task: model, frames and priors.
-        at: fit at which the model is corrected.
-    """
-    window = lit_part(task.model, task.data, task.all_of(at.value), at.image)
-    quick = dataclasses.replace(task, model=task.model.quick(*window), left_out=None)
-    image, slopes = quick.problem()(at.value, True)
-    outside = np.ones(at.image.shape[1:], bool)
-    outside[window] = False
-    return dataclasses.replace(
-        quick,
-        left_out=LeftOut(
-            at.value, at.image - image, at.slopes - np.asarray(slopes), outside
-        ),
-    )
-
-
 def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     """The likeliest of tasks that differ by the arrangement of the frames.
 
@@ -161,15 +120,16 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     if len(tasks) == 1:
         return tasks[0]
     few = few_frames(tasks[0].model.setting)
+    rough = [task.rough() for task in tasks]
     tries = [
-        _short(task, few, starting_points(task, biases_nm=(0.0,)))[0] for task in tasks
+        _short(task, few, starting_points(task, biases_nm=(0.0,)))[0] for task in rough
     ]
     merits = np.array([trial.merit for trial in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
-            merits[k] = tasks[k].posed(few).fit(tries[k].value, _ONWARD).merit
+            merits[k] = rough[k].posed(few).fit(tries[k].value, _ONWARD).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
-    arrangements = [task.found for task in tasks if task.found is not None]
+    arrangements = [task.arrangement for task in tasks if task.arrangement is not None]
     chosen = arrangements[best]
     # turns that cannot be distinguished from the chosen one
     turns = {
@@ -180,42 +140,35 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     turns = {*chosen.alike, *turns} - {0}
     return dataclasses.replace(
         tasks[best],
-        found=dataclasses.replace(chosen, alike=tuple(sorted(turns)), others=()),
+        arrangement=dataclasses.replace(chosen, alike=tuple(sorted(turns)), others=()),
     )
 
 
-def search_modes(
-    task: SearchTask, *, begins: Sequence[Array] = ()
-) -> tuple[SearchTask, list[FitSolution]]:
+def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
     1. Short fits on a few frames, from the nominal lens, other global biases and
-       astigmatic wave fronts, or from ``begins``.
-    2. The best of these to the end, mostly by the fast model.
-    3. Short fits from it with even aberrations reversed and along the valley of the
-       bias; all promising ones of both to the end.
+       astigmatic wave fronts.
+    2. The best of these to the end.
+    3. Other promising ones, and mirrored starts, to the end.
 
     Returns:
         (the task with its windows fixed at the light, modes).
     """
     few = few_frames(task.model.setting)
     plain = starting_points(task)
-    first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
+    first = _short(task.rough(), few, [*plain, *_leaning(plain[0])])
     task = hold_windows(task, first[0].value)
-    nearer = _nearer(task, first[0].value)
-    best = _long(task, nearer.value, nearer.slopes)
-    twins = _short(task, few, _twins(task, best))
-    tries = sorted([*first[1:], *twins], key=lambda t: t.merit)
-    floor = min(tries[0].merit, first[0].merit)
-    promising = [t.value for t in tries if t.merit < floor + _PROMISING]
-    fast = correct_surrogate(task, best)
-    others = follow_starts(fast, best, promising[: 2 * _MOST])
-    return task, add_mirrored_starts(fast, distinct_modes([best, *others]))
+    best = _long(task, first[0].value)
+    floor = first[0].merit + _PROMISING
+    promising = [trial.value for trial in first[1:] if trial.merit < floor]
+    others = follow_starts(task, best, promising[: 2 * _MOST])
+    return task, add_mirrored_starts(task, distinct_modes([best, *others]))
 
 
 def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
-    """The modes, and fits started from their reversed bias gradients: near focus both
-    signs give similar frames.
+    """The modes, and fits from the mirrored starts (:func:`mirrored_starts`) of the
+    best.
 
     Args:
         task: model, frames, priors and arrangement of the search.
@@ -225,8 +178,8 @@ def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSo
         best = ends[0]
         begins = [
             b
-            for b in bias_reversals(task, best)
-            if all(_apart(b, end) > 2.0 for end in ends)
+            for b in mirrored_starts(task, best)
+            if all(_sigma_distance(b, end) > 2.0 for end in ends)
         ]
         ends = distinct_modes([*ends, *follow_starts(task, best, begins)])
         if ends[0].merit > best.merit - 1:
@@ -234,66 +187,22 @@ def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSo
     return ends
 
 
-def scan_parameter(
-    task: SearchTask, modes: Sequence[FitSolution], i: int
-) -> list[FitSolution]:
-    """The modes, with those that a scan of parameter ``i`` leads to, best first.
-
-    The parameter is held at places across its prior with all others fitted to a few
-    frames, from the best mode outwards. Minima are then fitted with all free, on all
-    frames.
+def starts_along(task: SearchTask, best: FitSolution, name: str) -> list[Array]:
+    """(p,) starts at places of a parameter across its prior, the others at their
+    conditional mean.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        modes: fits so far, best first.
+        best: the best fit so far.
+        name: of the parameter.
     """
-    modes_so_far = list(modes)
-    for _ in range(_AGAIN):
-        best, few = modes_so_far[0], few_frames(task.model.setting)
-        problem = task.posed(few)
-        here = dataclasses.replace(
-            best,
-            merit=problem.merit(best.value),
-            image=best.image[few],
-            slopes=best.slopes[:, few],
-        )
-        scan = functools.partial(_scan_side, problem, here, i)
-        sides = threads.run_each(scan, (-1, 1))
-        stops = [*sides[0][::-1], here, *sides[1]]
-        wall = np.array([math.inf, *(stop.merit for stop in stops), math.inf])
-        low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
-        begins = [stops[k].value for k in low[np.argsort(wall[1:-1][low])]]
-        begins = [x for x in begins if x[i] != best.value[i]][:_MINIMA]
-        modes_so_far = distinct_modes(
-            [*modes_so_far, *follow_starts(task, best, begins)]
-        )
-        if modes_so_far[0].merit > best.merit - 1:
-            break
-    return modes_so_far
-
-
-def _scan_side(
-    problem: FitProblem, mode: FitSolution, i: int, sign: int
-) -> list[FitSolution]:
-    """Fits with parameter ``i`` held at steps from the mode to one end of its prior.
-
-    Args:
-        sign: side, -1 or 1.
-    """
-    prior = problem.prior
-    own = math.sqrt(float(mode.covariance[i, i]))
-    sigma, middle = float(prior.sigma[i]), float(prior.mean[i])
-    if not math.isfinite(sigma):
-        sigma, middle = 3 * own, float(mode.value[i])
-    end = float(np.clip(middle + sign * _REACH * sigma, prior.low[i], prior.high[i]))
-    count = max(math.ceil(sign * (end - float(mode.value[i])) / (_STEP * sigma)), 0)
-    out = list[FitSolution]()
-    here = mode
-    for target in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
-        way = here.covariance[:, i] / here.covariance[i, i] * (target - here.value[i])
-        here = problem.held(i, target).fit(here.value + way, _SCANNED, here.slopes)
-        out.append(here)
-    return out
+    i = task.names.index(name)
+    prior = task.prior
+    along = best.covariance[:, i] / best.covariance[i, i]
+    sigma = min(prior.sigma[i], (prior.high[i] - prior.low[i]) / 4)
+    places = prior.mean[i] + sigma * np.array(_PLACES)
+    starts = best.value + np.multiply.outer(places - best.value[i], along)
+    return list(np.clip(starts, prior.low, prior.high))
 
 
 def follow_starts(
@@ -308,48 +217,51 @@ def follow_starts(
         best: the best fit so far.
         begins: (p,) starts.
     """
-    settings = SolverSettings(
-        iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False
-    )
+    settings = SolverSettings(iterations=6, step_tolerance=0.5, near=1.0, finish=False)
     ends: list[FitSolution] = []
     for begin in begins:
         if len(ends) == _MOST:
             break
-        if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
+        if any(_sigma_distance(begin, end) < 2.0 for end in [best, *ends]):
             continue
-        trial = task.posed().fit(begin, settings)
-        if trial.merit < best.merit + MODES_WITHIN + _WORTH and all(
-            _apart(trial.value, e) > 2.0 for e in [best, *ends]
-        ):
-            ends.append(_long(task, trial.value, trial.slopes))
+        with contextlib.suppress(FitError):  # starts outside the model's range
+            trial = task.posed().fit(begin, settings)
+            if trial.merit < best.merit + MODES_WITHIN + _WORTH and all(
+                _sigma_distance(trial.value, e) > 2.0 for e in [best, *ends]
+            ):
+                ends.append(_long(task, trial.value, trial.slopes))
     return ends
 
 
-def bias_reversals(task: SearchTask, best: FitSolution) -> list[Array]:
-    """(p,) starts with the sign of some biases reversed.
+def mirrored_starts(task: SearchTask, best: FitSolution) -> list[Array]:
+    """(p,) starts with the sign of some parameters reversed.
 
-    Near focus images depend almost only on products of parts of the bias field, which
-    are equal for the reversed field. First the whole field, where it differs from 0 by
-    its sigma; then each such gradient, and these together. The other parameters take
-    their conditional mean.
+    Near focus the opposite even aberrations give nearly the same images, and so does
+    the reversed bias field, as images depend almost only on products of its parts. In
+    turn: the even aberrations; the whole bias field, where it differs from 0 by its
+    sigma; each such gradient, and these together. The other parameters take their
+    conditional mean.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         best: fit that is reversed.
     """
-    value = best.value
-    covariance = best.covariance
+    value, covariance = best.value, best.covariance
     rows = usual_parameters(task.names, task.model.lens)
-    whole = [i for i, row in enumerate(rows) if row.reversible]
-    places = [i for i in whole if task.names[i] != "bias_nm"]
+    field = [i for i, row in enumerate(rows) if row.reversible]
+    even = [i for i, row in enumerate(rows) if row.name in _EVEN]
+    clear = [
+        i
+        for i in field
+        if rows[i].name != "bias_nm" and abs(value[i]) > math.sqrt(covariance[i, i])
+    ]
     off = 0.0  # squared distance of the whole field from 0, in sigma
-    if whole:
-        inverse = leastsquares.invert_information(covariance[np.ix_(whole, whole)])
-        off = float(value[whole] @ inverse @ value[whole])
-    clear = [i for i in places if abs(value[i]) > math.sqrt(covariance[i, i])]
-    reversals = [whole if off > 1 else [], *([i] for i in clear), clear]
+    if field:
+        inverse = leastsquares.invert_information(covariance[np.ix_(field, field)])
+        off = float(value[field] @ inverse @ value[field])
     out = []
-    for some in (list(key) for key in dict.fromkeys(map(tuple, reversals)) if key):
+    sets = [even, field if off > 1 else [], *([i] for i in clear), clear]
+    for some in (list(key) for key in dict.fromkeys(map(tuple, sets)) if key):
         # conditional mean of the others where these change sign
         block = np.linalg.solve(covariance[np.ix_(some, some)], -2 * value[some])
         moved = value + covariance[:, some] @ block
@@ -396,25 +308,24 @@ def place_windows(
     if moved is task:
         return task, ends
     best = _long(moved, ends[0].value, ends[0].slopes)
-    fast = correct_surrogate(moved, best)
-    others = (_long(fast, end.value, end.slopes) for end in ends[1:])
+    others = (_long(moved, end.value, end.slopes) for end in ends[1:])
     return moved, distinct_modes([best, *others])
 
 
-def widen_search(
-    task: SearchTask, begin: Array
-) -> tuple[SearchTask, list[FitSolution]] | None:
-    """A search with more parameters from where the usual ones led; None where they lead
+def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
+    """Modes with more parameters, from where the usual ones led; empty where they lead
     out of the model's range.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        begin: (p,) start of the search.
+        begin: (parameters,) start of the search.
     """
+    start = with_values(begin, _opened(task, begin))
     try:
-        return search_modes(task, begins=[begin])
+        best = _long(task, start[[PLACE[name] for name in task.names]])
+        return add_mirrored_starts(task, [best])
     except FitError:
-        return None
+        return []
 
 
 def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> float:
@@ -425,12 +336,10 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
         task: model, frames, priors and arrangement of the search.
         frees: names of the parameters that are fitted too.
     """
-    more = dataclasses.replace(task, free=(*task.free, *frees), left_out=None)
+    more = dataclasses.replace(task, free=(*task.free, *frees))
     x = task.all_of(best.value)
     begin = with_values(x, _opened(more, x))[[PLACE[name] for name in more.names]]
-    settings = SolverSettings(
-        iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
-    )
+    settings = SolverSettings(iterations=12, step_tolerance=0.3, near=1.0, finish=False)
     try:
         return more.posed().fit(begin, settings).merit
     except FitError:
@@ -446,12 +355,12 @@ def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
     modes: list[FitSolution] = []
     for end in sorted(ends, key=lambda e: e.merit):
         likely = end.merit < modes[0].merit + MODES_WITHIN if modes else True
-        if likely and all(_apart(end.value, mode) > 1.0 for mode in modes):
+        if likely and all(_sigma_distance(end.value, mode) > 1.0 for mode in modes):
             modes.append(end)
     return modes
 
 
-def _apart(value: Array, end: FitSolution) -> float:
+def _sigma_distance(value: Array, end: FitSolution) -> float:
     """Distance in sigma of the end's own parabola."""
     step = value - end.value
     square = step @ leastsquares.invert_information(end.covariance) @ step
@@ -472,7 +381,7 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
     prior = dataclasses.replace(problem.prior, sigma=sigma)
     problem = dataclasses.replace(problem, prior=prior)
     short = SolverSettings(
-        iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False
+        iterations=4, step_tolerance=1.0, near=math.inf, finish=False
     )
 
     def fit_from(begin: Array) -> FitSolution:
@@ -484,19 +393,8 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
 
 def _long(task: SearchTask, value: Array, slopes: Array | None = None) -> FitSolution:
     """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
-    settings = SolverSettings(iterations=80, secant=True)
+    settings = SolverSettings(iterations=80)
     return task.posed().fit(value, settings, slopes)
-
-
-def _nearer(task: SearchTask, value: Array) -> FitSolution:
-    """Near the lowest place on all frames, by a quick model put right where a short fit
-    ended.
-    """
-    end = task.posed().fit(value, SolverSettings(iterations=0))
-    settings = SolverSettings(
-        iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False
-    )
-    return correct_surrogate(task, end).posed().fit(end.value, settings, end.slopes)
 
 
 def _opened(task: SearchTask, x: Array) -> dict[str, float]:
@@ -594,14 +492,14 @@ def starting_points(
     """
     model = task.model
     data = task.data
-    found = task.found
-    if found is None:
+    arrangement = task.arrangement
+    if arrangement is None:
         raise FitError("a search begins where the frames lie; arrange them first")
-    place = window_um(found, model)
+    place = window_um(arrangement, model)
     level = float(np.median((data.electrons / model.setting.glow)[data.usable]))
     values = {
-        "stage_zero_um": found.stage_zero_um,
-        "distance_um": found.distance_um,
+        "stage_zero_um": arrangement.stage_zero_um,
+        "distance_um": arrangement.distance_um,
         "background_e": level,
         "decentre_x_um": place[0],
         "decentre_y_um": place[1],
@@ -628,24 +526,8 @@ def _leaning(plain: Array) -> list[Array]:
 
     The plain start lies between the two: either sign of both astigmatisms.
     """
-    even = ("astigmatism_rad", "oblique_astigmatism_rad")
     return [
         with_values(plain, {name: size})
-        for name in even
+        for name in _EVEN[:2]
         for size in (_LEANING_RAD, -_LEANING_RAD)
     ]
-
-
-def _twins(task: SearchTask, best: FitSolution) -> list[Array]:
-    """Starts from the best with even aberrations reversed, and moved along the bias."""
-    x = task.all_of(best.value)
-    even = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-    out = [with_values(x, {name: -float(x[PLACE[name]]) for name in even})]
-    if "bias_nm" in task.names:
-        i = task.names.index("bias_nm")
-        step_nm = _ALONG_NM * wavelength_scale(task.model.lens.wavelength_um)
-        along = step_nm * best.covariance[:, i] / best.covariance[i, i]
-        for sign in (1, -1):
-            moved = np.clip(best.value + sign * along, task.prior.low, task.prior.high)
-            out.append(task.all_of(moved))
-    return out

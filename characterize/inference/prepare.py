@@ -5,7 +5,6 @@ how little of the model is enough."""
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,22 +14,14 @@ from characterize.captures import (
     merge_brackets,
     quantization_score,
 )
-from characterize.inference.leastsquares import FitImages, Model
-from characterize.model import (
-    ForwardModel,
-    FrameSetting,
-    KnownValue,
-    background_planes,
-    usual_parameters,
-)
+from characterize.inference.leastsquares import FitImages
+from characterize.model import ForwardModel, FrameSetting, KnownValue, usual_parameters
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 from metalens.fabrication import Kinds, Sensitivity
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
-# share of what light tells that may lie where a quick model knows nothing of it
-_DARK = 3e-5
 _STILL = 0.05  # counts of noise at least that levels of pixels add, whatever is stated
 _FEW_BEYOND, _ROUGH = 0.01, 0.1  # share of the pillars, of slopes
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
@@ -219,57 +210,6 @@ def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel
         if float((residual**2).sum()) < _NOTHING:
             return rough
     return model
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LeftOut:
-    """Difference of the full to a fast model, at (p,) ``value``.
-
-    image: (n, y, x). slopes: (p, n, y, x).
-    beside: (y, x) pixels outside the fast model's region; there images are extrapolated
-    linearly from ``value``.
-    """
-
-    value: Array
-    image: Array
-    slopes: Array
-    beside: Array
-
-    def added(self, plain: Model, frames: Array | None) -> Model:
-        """The fast model ``plain`` with the difference added, of all frames or some."""
-        chosen = slice(None) if frames is None else frames
-        image = self.image[chosen]
-        slopes = self.slopes[:, chosen]
-        dark = slopes[:, :, self.beside]
-
-        def images(value: Array, jacobian: bool) -> tuple[Array, Array | None]:
-            frames, rates = plain(value, jacobian)
-            frames = frames + image
-            frames[:, self.beside] += np.tensordot(value - self.value, dark, 1)
-            return frames, None if rates is None else rates + slopes
-
-        return images
-
-
-def lit_part(
-    model: ForwardModel, data: FitImages, x: Array, image: Array
-) -> tuple[slice, slice]:
-    """Illuminated region of interest: rows and columns outside which all frames hold
-    little signal above noise.
-
-    Args:
-        model: the forward model.
-        data: frames, masks and noise that are fitted.
-        x: all parameters, of ``image`` (n, y, x).
-    """
-    light = np.maximum(image - background_planes(x, model.setting), 0.0)
-    information = (light**2 / data.variance(image) * data.usable).sum(0)
-    out = []
-    for axis in (1, 0):
-        share = np.cumsum(information.sum(axis)) / max(float(information.sum()), 1e-300)
-        first, last = np.searchsorted(share, (_DARK / 4, 1 - _DARK / 4)).tolist()
-        out.append(slice(first, min(last, len(share) - 1) + 1))
-    return out[0], out[1]
 
 
 def check_enough(data: FitImages, names: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+from scipy import special, stats
 
 from characterize.captures import SensorNoise
 from characterize.inference.leastsquares import (
@@ -15,16 +15,15 @@ from characterize.inference.leastsquares import (
     FitSolution,
     SolverSettings,
     gaussian_draws,
-    invert_information,
     pixel_weights,
 )
 from characterize.inference.multistart import (
     SearchTask,
     add_mirrored_starts,
-    correct_surrogate,
     distinct_modes,
+    follow_starts,
     refine_fit,
-    scan_parameter,
+    starts_along,
 )
 from metalens.core import threads
 from metalens.core.arrays import Array
@@ -37,8 +36,8 @@ _CLOSE = 0.05  # relative error of the goal at which a place is the profile's en
 _LOWER = 0.5  # fall of -2 ln posterior below the mode that counts as a better mode
 _RESTARTS = 2
 _OF_THE_BENCH = ("log_gain", "background")
-_HELD = SolverSettings(
-    iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False
+_PROFILE_FIT = SolverSettings(
+    iterations=6, step_tolerance=0.3, near=math.inf, finish=False
 )
 
 
@@ -48,7 +47,7 @@ class ProfileLikelihood:
 
     low, high: 95 % interval. value, rise: (k,) the parameter, and the rise of -2 ln
     posterior there with all others fitted. parabolic: whether the ends are those of the
-    parabola. found: whether the low and the high end were reached. stops: the fits with
+    parabola. reached: whether the low and the high end were reached. stops: the fits with
     the parameter fixed.
     """
 
@@ -57,7 +56,7 @@ class ProfileLikelihood:
     value: Array
     rise: Array
     parabolic: bool
-    found: tuple[bool, bool] = (True, True)
+    reached: tuple[bool, bool] = (True, True)
     stops: tuple[FitSolution, ...] = ()
 
 
@@ -101,10 +100,10 @@ def explore_posterior(
         ends: the modes, best first.
         gain: noise model of the sensor, with the error of its gain.
     """
-    task = correct_surrogate(task, ends[0])
     modes = list(ends)
     if "bias_nm" in task.names:
-        modes = scan_parameter(task, modes, task.names.index("bias_nm"))
+        starts = starts_along(task, modes[0], "bias_nm")
+        modes = distinct_modes([*modes, *follow_starts(task, modes[0], starts)])
     if modes[0] is not ends[0]:
         modes = add_mirrored_starts(task, modes)
     problem = task.posed()
@@ -188,8 +187,9 @@ def _profile_side(
 ) -> tuple[float, bool, list[FitSolution]]:
     """One end of a profile: where the root of the rise of -2 ln posterior is ``goal``.
 
-    That root grows evenly with the distance, so that each place is the secant's through
-    the two nearest to ``goal``. At every place the other parameters are fitted.
+    That root grows nearly evenly with the distance: each place is interpolated in those
+    before, or extrapolated along the line from the mode, at most to twice the distance.
+    At every place the other parameters are fitted.
 
     Args:
         sign: side, -1 or 1.
@@ -202,41 +202,28 @@ def _profile_side(
     bound = abs(float((prior.high if sign > 0 else prior.low)[i]) - middle)
     distance = min(goal * math.sqrt(float(mode.covariance[i, i])), bound)
     # distances from the mode, roots of the rise there, and the fits
-    places, roots = [0.0], [0.0]
-    stops = list[FitSolution]()
-    here = mode
+    places, roots, stops = [0.0], [0.0], [mode]
     for _ in range(_SIDE):
+        here = stops[int(np.argmin(np.abs(np.array(places) - distance)))]
         value = middle + sign * distance
         way = here.covariance[:, i] / here.covariance[i, i] * (value - here.value[i])
-        stop = problem.held(i, value).fit(here.value + way, _HELD, here.slopes)
-        stops.append(stop)
-        places.append(distance)
-        roots.append(math.sqrt(max(stop.merit - mode.merit, 0.0)))
-        if abs(roots[-1] - goal) < _CLOSE * goal or (
-            distance >= bound and roots[-1] < goal
-        ):
+        stop = problem.with_fixed(i, value).fit(
+            here.value + way, _PROFILE_FIT, here.slopes
+        )
+        root = math.sqrt(max(stop.merit - mode.merit, 0.0))
+        at = int(np.searchsorted(places, distance))
+        for values, new in ((places, distance), (roots, root), (stops, stop)):
+            values.insert(at, new)
+        if abs(root - goal) < _CLOSE * goal or (distance >= bound and root < goal):
             break
-        # secant through the two places about the goal, or the last two
-        order = np.argsort(places)
-        place, root = (np.array(v)[order] for v in (places, roots))
-        above = np.flatnonzero(root >= goal)
-        k = int(above[0]) if len(above) else len(root) - 1
-        slope = (root[k] - root[k - 1]) / max(place[k] - place[k - 1], 1e-300)
-        step = (goal - root[k - 1]) / slope if slope > 0 else math.inf
-        distance = min(float(place[k - 1] + step), 2 * max(places), bound)
-        nearest = int(np.argmin(np.abs(np.array(places) - distance)))
-        here = [mode, *stops][nearest]
-    order = np.argsort(places)
-    place = np.array(places)[order]
-    root = np.maximum.accumulate(np.array(roots)[order])
-    reached = bool(root[-1] > (1 - _CLOSE) * goal)
-    if not reached:
-        return float(place[-1]), bool(place[-1] >= bound), stops
-    k = min(int(np.searchsorted(root, goal)), len(root) - 1)
-    rising = max(float(root[k] - root[k - 1]), 1e-300)
-    share = (goal - float(root[k - 1])) / rising
-    end = float(place[k - 1] + share * (place[k] - place[k - 1]))
-    return min(end, bound), True, stops
+        if max(roots) >= goal:
+            distance = float(np.interp(goal, np.maximum.accumulate(roots), places))
+        else:
+            distance *= min(2.0, goal / max(root, goal / 2))
+        distance = min(distance, bound)
+    end = float(np.interp(goal, np.maximum.accumulate(roots), places))
+    reached = max(roots) > (1 - _CLOSE) * goal or end >= bound
+    return end, reached, [stop for stop in stops if stop is not mode]
 
 
 def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
@@ -297,33 +284,26 @@ def draw_posterior(
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    centre = np.array([fit.value for fit in components])
-    inverse = np.array([invert_information(fit.covariance) for fit in components])
-    inverse = inverse / spread
     share = mode_probabilities(components, spread)
-    roots = [
-        np.linalg.cholesky(spread * fit.covariance + 1e-12 * _diagonal(fit.covariance))
+    # units in which all parameters are alike: eigenvalues are cut off at rounding
+    unit = np.sqrt(np.diag(components[0].covariance))
+    mixture = [
+        stats.multivariate_normal(
+            fit.value / unit,
+            spread * fit.covariance / np.outer(unit, unit),
+            allow_singular=True,
+        )
         for fit in components
     ]
-    # draws x of the mixture q, within the bounds
-    total = 2 * count
-    drawn = list[Array]()
-    for _ in range(50):
-        kind = rng.choice(len(components), total, p=share)
-        normal = rng.standard_normal((total, centre.shape[1]))
-        x = np.array(
-            [centre[k] + roots[k] @ z for k, z in zip(kind, normal, strict=True)]
-        )
-        keep = ((x >= problem.prior.low) & (x <= problem.prior.high)).all(1)
-        drawn += list(x[keep])
-        if len(drawn) >= total:
-            break
-    x = np.array(drawn[:total])
-    # ln q, but for a constant
-    off = x[:, None] - centre
-    square = np.einsum("nki,kij,nkj->nk", off, inverse, off)
-    volume = np.array([np.log(np.diag(root)).sum() for root in roots])
-    log_q = special.logsumexp(np.log(share) - volume - square / 2, axis=1)
+    counts = rng.multinomial(2 * count, share)
+    pairs = zip(mixture, counts, strict=True)
+    drawn = [part.rvs(n, rng).reshape(n, -1) for part, n in pairs if n]
+    whitened = np.concatenate(drawn)
+    x = whitened * unit
+    log_parts = np.stack([part.logpdf(whitened) for part in mixture], 1)
+    log_q = special.logsumexp(np.log(share) + log_parts, axis=1)
+    inside = ((x >= problem.prior.low) & (x <= problem.prior.high)).all(1)
+    x, log_q = x[inside], log_q[inside]
     # weights posterior / q, truncated
     merit = np.array(threads.run_each(problem.merit, list(x)))
     log_w = -merit / (2 * spread) - log_q
@@ -334,10 +314,6 @@ def draw_posterior(
     places = (rng.random() + np.arange(count)) / count
     index = np.searchsorted(np.cumsum(weight), places).clip(0, len(x) - 1)
     return rng.permutation(x[index]), float(1 / (weight**2).sum())
-
-
-def _diagonal(matrix: Array) -> Array:
-    return np.diag(np.diag(matrix))
 
 
 def _joined(
@@ -417,7 +393,10 @@ def posterior_text(names: Sequence[str], posterior: FitPosterior) -> list[str]:
         "perhaps beyond"
         for name, profile in posterior.profiles.items()
         for which, place, reached in zip(
-            ("lower", "upper"), (profile.low, profile.high), profile.found, strict=True
+            ("lower", "upper"),
+            (profile.low, profile.high),
+            profile.reached,
+            strict=True,
         )
         if not reached
     ]

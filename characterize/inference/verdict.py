@@ -11,13 +11,12 @@ import numpy as np
 
 from characterize.captures import SensorNoise
 from characterize.inference.leastsquares import (
-    FitProblem,
     FitSolution,
     GaussianPrior,
     SolverSettings,
 )
 from characterize.inference.missing import ResidualFinding
-from characterize.inference.multistart import WAVES_RAD, SearchTask, named_images
+from characterize.inference.multistart import WAVES_RAD, SearchTask
 from characterize.inference.uncertainty import FitPosterior
 from characterize.model import FitParameter, KnownValue, background_planes
 from metalens.core import threads
@@ -315,14 +314,14 @@ def process_verdict(
     return "; ".join(words)
 
 
-def psf_verdict(task: SearchTask, posterior: FitPosterior, unseen: float) -> str:
+def psf_verdict(task: SearchTask, posterior: FitPosterior, held_out: float) -> str:
     """Sentence on the expected relative L2 error of the images at the captured depths
     and angles, √(tr(C JJᵀ) / |I|²), without background and at the brightness of the best.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         posterior: the posterior, with its covariance C.
-        unseen: reduced chi-square of frames left out; nan without such.
+        held_out: reduced chi-square of frames left out; nan without such.
     """
     best = posterior.best
     background = background_planes(task.all_of(best.value), task.model.setting)
@@ -333,13 +332,13 @@ def psf_verdict(task: SearchTask, posterior: FitPosterior, unseen: float) -> str
     slopes = slopes - np.outer(slopes @ light / power, light)
     square = posterior.covariance[np.ix_(lens, lens)] * (slopes @ slopes.T)
     tested = ""
-    if not math.isnan(unseen):
-        tested = f"; frames left out agree within {unseen:.2f} times their noise"
+    if not math.isnan(held_out):
+        tested = f"; frames left out agree within {held_out:.2f} times their noise"
     error = math.sqrt(max(float(square.sum()), 0.0) / power)
     return f"the PSF is known to {error:.1%} at the captured depths and angles{tested}"
 
 
-def left_out(task: SearchTask, mode: FitSolution) -> float:
+def hold_out_chi_square(task: SearchTask, mode: FitSolution) -> float:
     """Reduced chi-square of frames left out of a fit (cross-validation).
 
     About 1 where model and intervals hold; nan with fewer than four frames.
@@ -357,12 +356,12 @@ def left_out(task: SearchTask, mode: FitSolution) -> float:
         (np.sort(fitted), np.sort(hidden))
         for fitted, hidden in itertools.permutations((order[::2], order[1::2]))
     ]
-    predict = functools.partial(_unseen, task, mode)
+    predict = functools.partial(_held_out, task, mode)
     total, count = np.sum(threads.run_each(predict, halves), 0)
     return float(total / max(count, 1))
 
 
-def _unseen(
+def _held_out(
     task: SearchTask, mode: FitSolution, halves: tuple[Array, Array]
 ) -> tuple[float, int]:
     """(chi-square, pixels) of frames that are predicted from a fit to the others.
@@ -372,18 +371,15 @@ def _unseen(
     Args:
         halves: indices of the fitted and of the predicted frames.
     """
-    fitted, hidden = halves
-    images = named_images(task.model.only(fitted), task.names, task.start)
-    problem = FitProblem(images, task.data.planes(fitted), task.prior)
+    fitted, hidden = (task.posed(index) for index in halves)
     settings = SolverSettings(
-        iterations=6, step_tolerance=0.3, secant=True, near=math.inf, finish=False
+        iterations=6, step_tolerance=0.3, near=math.inf, finish=False
     )
-    part = problem.fit(mode.value, settings, mode.slopes[:, fitted])
-    data = task.data.planes(hidden)
-    predict = named_images(task.model.only(hidden), task.names, task.start)
-    image = predict(part.value, False)[0]
+    part = fitted.fit(mode.value, settings, mode.slopes[:, halves[0]])
+    data = hidden.data
+    image = hidden.model(part.value, False)[0]
     keep = data.usable & ~data.saturated
-    slopes = mode.slopes[:, hidden][:, keep]
+    slopes = mode.slopes[:, halves[1]][:, keep]
     # variance of the prediction, e²
     by_fit = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)
     variance = data.variance(image)[keep] + by_fit

@@ -2,7 +2,6 @@
 pixel area, gain, background.
 """
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -45,8 +44,7 @@ class DetectorGrid:
     rows, columns: pixels of the window. oversample: fine samples per pixel side.
     margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief
     ray.
-    fill: width of a pixel over the pitch. aside: (y, x) pixels from the window's middle
-    to that of a part of it.
+    fill: width of a pixel over the pitch.
     """
 
     rows: int
@@ -56,7 +54,6 @@ class DetectorGrid:
     margin: int = 2
     middle_um: tuple[float, float] = (0.0, 0.0)
     fill: float = 1.0
-    aside: tuple[float, float] = (0.0, 0.0)
 
     @property
     def fine_um(self) -> float:
@@ -73,7 +70,7 @@ class DetectorGrid:
 
         ``middle_um`` is at pixel ((rows - 1) / 2, (columns - 1) / 2).
         """
-        y, x = self._centre_um()
+        x, y = self.middle_um
         return self._axis(self.rows) + y, self._axis(self.columns) + x
 
     def across_um(self, near_um: float) -> float:
@@ -81,26 +78,9 @@ class DetectorGrid:
 
         Offsets of the window count beyond ``near_um`` only.
         """
-        off = max(0.0, *(abs(v) - near_um for v in self._centre_um()))
+        off = max(0.0, *(abs(v) - near_um for v in self.middle_um))
         side = (max(self.rows, self.columns) + self.margin) * self.pixel_um
         return side + _ROOM_UM + 2 * off
-
-    def part(self, rows: slice, columns: slice, margin: int) -> "DetectorGrid":
-        """Grid of neighbouring rows and columns, at most ``margin`` pixels wider."""
-        y_part = range(self.rows)[rows]
-        x_part = range(self.columns)[columns]
-        # pixels from the middle of the whole to that of the part
-        y = self.aside[0] + (y_part[0] + y_part[-1] - (self.rows - 1)) / 2
-        x = self.aside[1] + (x_part[0] + x_part[-1] - (self.columns - 1)) / 2
-        margin = min(margin, self.margin)
-        return dataclasses.replace(
-            self, rows=len(y_part), columns=len(x_part), margin=margin, aside=(y, x)
-        )
-
-    def _centre_um(self) -> tuple[float, float]:
-        """(y, x) of the middle of the window from the chief ray."""
-        x, y = self.middle_um
-        return y + self.aside[0] * self.pixel_um, x + self.aside[1] * self.pixel_um
 
     def _axis(self, pixels: int) -> Array:
         fine = np.arange((pixels + 2 * self.margin) * self.oversample)

@@ -9,10 +9,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from characterize.model import detector
+from characterize.model.compressed import (
+    CompressedLens,
+    CouplingTerms,
+    WindowOperators,
+    wrapped_phasors,
+)
 from characterize.model.glass import BenchGeometry, FilmStack, source_paths
-from characterize.model.kernel import real_of, wrapped_phasors
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import (
     ChangeRange,
@@ -21,7 +27,6 @@ from characterize.model.pillars import (
     of_lens,
     pillar_change_of,
 )
-from characterize.model.reduced import CompressedLens
 from characterize.model.setting import (
     BENDING,
     LIGHT,
@@ -34,7 +39,6 @@ from characterize.model.setting import (
     pixel_brightness,
     true_depth,
 )
-from characterize.model.window import WindowOperators
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import (
@@ -54,20 +58,14 @@ WIDENING, ANSWERING = (
     {name: n for n, name in enumerate(names_of_kind(kind))}
     for kind in (CDError, ResponseError)
 )
-EVERY = slice(None)
 Light = tuple[Array, dict[str, Array]]  # light, and its derivatives by name
 # relative error of derivatives: it slows the last steps of a fit, not its result
 _SLOPE_TOLERANCE = 8e-3
-# parameters that change the kernel: name in WindowOperators.rates, and um a unit
-_WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}
+_KERNEL_STEP = 1e-3  # relative step of distance and wavelength in the kernel
 _WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02  # of difference quotients: wavelength, bandwidth
 _PITCH = PLACE["pixel_percent"]
 # offset from the chief ray up to which a window needs no further directions
 _NEAR_UM = 5.0
-# of a quick model: relative error of its fields, and its share of the oversampling
-_FEW, _FEWER = 2e-2, 0.85
-# pixels of margin around a part of a window: blur from farther off changes little
-_NARROW = 2
 
 
 class ForwardModel:
@@ -100,10 +98,7 @@ class ForwardModel:
         self.reference_um = float(
             2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max())
         )
-        over, self._over = (
-            detector.required_oversampling(lens, share * setting.pixel_um)
-            for share in (1.0, _FEWER)
-        )
+        over = detector.required_oversampling(lens, setting.pixel_um)
         self.grid = detector.DetectorGrid(
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
@@ -111,7 +106,6 @@ class ForwardModel:
         self._span = span
         self.cut = 0.0
         self._lean_um = 0.0
-        self._lit = EVERY, EVERY
         self._pillars: dict[float, PillarResponse] = {}  # by angle of incidence
         self.films = FilmStack.of(lens.layers, lens.wavelength_um)
         self.area_um2 = (
@@ -209,36 +203,11 @@ class ForwardModel:
         part.grid = dataclasses.replace(self.grid, rows=s.columns, columns=s.rows)
         return part
 
-    def rough(self, tolerance: float) -> "ForwardModel":
+    def rough(self, tolerance: float = 2e-2) -> "ForwardModel":
         """The same model with fields to a relative ``tolerance``, fast enough for scans."""
         part = copy.copy(self)
         part.cut = tolerance
         return part
-
-    def quick(self, rows: slice = EVERY, columns: slice = EVERY) -> "ForwardModel":
-        """A fast model for differences to its own images: few terms, fewer samples.
-
-        Args:
-            rows: of the part of the window that is bright enough to differ. Outside it
-                the images are background alone.
-            columns: of the same part.
-        """
-        part = self.rough(_FEW)
-        part.grid = self._sparser()
-        part._lit = rows, columns
-        window_um = None
-        narrow = part.grid.part(rows, columns, _NARROW)
-        if narrow.rows < self.grid.rows or narrow.columns < self.grid.columns:
-            part.grid, window_um = narrow, narrow.across_um(_NEAR_UM)
-        part.groups = [group.quick(window_um) for group in self.groups]
-        return part
-
-    def _sparser(self) -> detector.DetectorGrid:
-        """Samples for differences of images.
-
-        Their error of derivatives is below a third of ``_SLOPE_TOLERANCE``.
-        """
-        return dataclasses.replace(self.grid, oversample=self._over)
 
     def with_pixel_pitch(self, ratio: float) -> "ForwardModel":
         """The same model with pixels ``ratio`` times as far apart and as wide."""
@@ -370,10 +339,10 @@ class ForwardModel:
                 part for whole in self.groups for part in whole.illuminated_parts
             ):
                 intensity, rates = self._group_light(x, group, offset_nm, names)
-                light[group.index, *self._lit] += weight * intensity
+                light[group.index] += weight * intensity
                 for name in names:
                     if name in rates:
-                        slopes[name][group.index, *self._lit] += weight * rates[name]
+                        slopes[name][group.index] += weight * rates[name]
         if "bandwidth_nm" in names:
             widened = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
             wider = self._light(widened, None, bandwidth_nm)[0]
@@ -404,7 +373,7 @@ class ForwardModel:
         x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, pupil = threads.run_concurrently(
             lambda: self._operators(x, group),
-            lambda: wrapped_phasors(self._phase(x, group), group.reduced.kind),
+            lambda: wrapped_phasors(self._phase(x, group)),
             lambda: self._pupil(x, group, bool(names)),
         )
         lens_field = pupil[0] * phasor
@@ -423,13 +392,14 @@ class ForwardModel:
             # the part of the derivative along the field itself: exact without a sum
             along = np.vdot(lens_field, slope) / power
             slope = slope - along * lens_field
-            field_slope = operators.envelope(operators.coarse(slope, tolerance))
-            if name in _WINDOW:
-                kernel_name, um = _WINDOW[name]
-                ratio = float(np.linalg.norm(slope)) / math.sqrt(power) / um
-                field_slope = field_slope + um * operators.rates(
-                    lens_field, kernel_name, tolerance, beside=ratio
-                )
+            in_kernel = name in ("distance_um", "wavelength_nm")
+            # the slope of the kernel nearly cancels that of the lens
+            cut = self.cut if in_kernel else tolerance
+            field_slope = operators.coarse(slope, cut)
+            if in_kernel:
+                terms = operators.terms
+                field_slope += self._kernel_slope(x, group, name, lens_field, terms)
+            field_slope = operators.envelope(field_slope)
             change = 2 * (conjugate * field_slope).real
             slopes[name] = self.grid.sample(change, transfer) + 2 * along.real * light
         growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
@@ -484,7 +454,7 @@ class ForwardModel:
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
         inside = np.abs(bias) < reach
-        bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
+        bias = np.clip(bias, -reach, reach).astype(np.float32)
         weight = group.pillars.weights(bias)
         values = group.pillars.coefficients(pillar_change_of(x), self._lean_um)
         pupil = group.reduced.combined(weight, values)
@@ -502,10 +472,10 @@ class ForwardModel:
         longer[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
         shifted = group.pillars.coefficients(pillar_change_of(longer), self._lean_um)
         by_wave = (shifted - values) / _WAVE_STEP_NM
-        bias_rates = group.pillars.rates(bias, weight) * inside
         return (
             pupil,
-            group.reduced.combined(bias_rates, values),
+            group.reduced.combined(weight[:-1], chebyshev.chebder(values) / reach)
+            * inside,
             np.stack(by_answer),
             group.reduced.combined(weight, by_wave),
         )
@@ -563,14 +533,42 @@ class ForwardModel:
             * (self._phase(x + shift, group) - self._phase(x - shift, group))
         )
 
-    def _operators(self, x: Array, group: AngleGroup) -> WindowOperators:
+    def _operators(
+        self, x: Array, group: AngleGroup, terms: CouplingTerms | None = None
+    ) -> WindowOperators:
+        """Operators of wavelength and distance, by the coupling ``terms`` of some cell;
+        by those of its own without them.
+        """
         nominal = group.reduced.bench
+        distance_um = nominal.distance_um + x[PLACE["distance_um"]]
+        if terms is None:
+            terms = group.reduced.coupling(distance_um, self.grid.axes_um())
+        wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
         return group.reduced.operators(
-            wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
-            distance_um=nominal.distance_um + x[PLACE["distance_um"]],
-            axes_um=self.grid.axes_um(),
-            edge_um=self.grid.margin * self.setting.pixel_um,
+            terms, wavelength_um=wavelength_um, distance_um=distance_um
         )
+
+    def _kernel_slope(
+        self, x: Array, group: AngleGroup, name: str, light: Array, terms: CouplingTerms
+    ) -> Array:
+        """(frames, Y, X) derivative of the coarse field by the kernel alone, by a
+        central difference over the distance or the wavelength.
+
+        Args:
+            light: (frames, q, p) field on the nodes.
+            terms: of the cell of the distance in ``x``.
+        """
+        bench = group.reduced.bench
+        scale = (
+            bench.distance_um if name == "distance_um" else 1e3 * bench.wavelength_um
+        )
+        step = _KERNEL_STEP * scale
+        shift = step * (np.arange(len(x)) == PLACE[name])
+        up, down = (
+            self._operators(x + sign * shift, group, terms).coarse(light, self.cut)
+            for sign in (1, -1)
+        )
+        return np.asarray((up - down) * np.float32(0.5 / step))
 
     def _growth(self, x: Array, group: AngleGroup) -> dict[str, Array]:
         """(frames,) d ln(magnification) by distance and stage zero, 1/um, by parameter.
@@ -609,12 +607,11 @@ class ForwardModel:
         magnification = sensor_um / source_um
         crosstalk_px = x[PLACE["crosstalk_px"]]
         sizes_um = x[PLACE["pinhole_um"]] * magnification
-        kind = real_of(group.reduced.kind)
         return detector.detector_transfers(
             grid or self.grid,
             crosstalk_px,
             sizes_um,
             magnification,
             sized="pinhole_um" in names,
-            kind=kind,
+            kind=np.float32,
         )

@@ -2,24 +2,21 @@
 of the lens, and through a plate of glass, tilted or not, in front of it.
 """
 
-import functools
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.optics import Layers, media
-from metalens.optics.paths import sensor_path
+from metalens.optics.interpolant import chebyshev_interpolant
+from metalens.optics.paths import hypot_minus_length, sensor_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
-# terms of a series, and its rounding: at reaches up to the distance the error is 1e-15
-_TERMS, _ROUNDING = 24, 1e-14
 Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
@@ -123,13 +120,46 @@ class FilmStack:
         )
         return share * tangents[0], share * tangents[1]
 
-    def rays(self, distance_um: float, reach2_um2: float) -> "RaySeries":
-        """Rays from lens to sensor up to a squared reach, rounded up to share a series."""
-        return _rays(
-            self,
-            distance_um,
-            2.0 ** (math.ceil(4 * math.log2(max(reach2_um2, 1e-12))) / 4),
+    def _chord(self, distance_um: float, reach2_um2: Array) -> Array:
+        """Optical path of rays from lens to sensor of a squared reach, um."""
+        pairs = self.pairs(distance_um)
+        path = chebyshev_interpolant(
+            lambda u: media.whole_path(pairs, media.solve_direction_square(pairs, u)),
+            np.asarray(reach2_um2),
         )
+        return np.asarray(path)
+
+    def path_change(
+        self, distance_um: float, reach2_um2: Array, more_um2: Array
+    ) -> Any:
+        """Path from lens to sensor of squared reach ``reach2_um2 + more_um2`` less that
+        of ``reach2_um2``, um, without cancellation in air.
+        """
+        if self.none_behind:
+            ray_um = np.sqrt(reach2_um2 + distance_um**2)
+            return hypot_minus_length(ray_um, more_um2)
+        far, near = (
+            self._chord(distance_um, reach2_um2 + more) for more in (more_um2, 0.0)
+        )
+        return far - near
+
+    def amplitude(self, distance_um: float, reach2_um2: Array) -> tuple[Array, Array]:
+        """(size, path r) of the amplitude size (1/r - ik) exp(ikr) of rays from lens to
+        sensor of a squared reach: √(passed / spread) / (2 pi); d / (2 pi r²) in air.
+        """
+        if self.none_behind:
+            r2 = reach2_um2 + distance_um**2
+            return distance_um / (2 * np.pi * r2), np.sqrt(r2)
+        pairs = self.pairs(distance_um)
+        order = (self.filling, *(n for n, _ in self.behind))
+
+        def size(u: Any) -> Any:
+            w = media.solve_direction_square(pairs, u)
+            spread = media.area_spreading_of_square(pairs, w)
+            return np.sqrt(media.passed_at(order, w) / spread) / (2 * np.pi)
+
+        level = chebyshev_interpolant(size, reach2_um2)
+        return np.asarray(level), self._chord(distance_um, reach2_um2)
 
     def sensor_path(
         self,
@@ -144,76 +174,12 @@ class FilmStack:
         """
         if self.none_behind:
             return np.asarray(sensor_path(x_um, y_um, centre_um, distance_um))
-        axis2 = centre_um[0] ** 2 + centre_um[1] ** 2
+        axis2 = np.array(centre_um[0] ** 2 + centre_um[1] ** 2)
         reach2 = np.asarray((x_um - centre_um[0]) ** 2 + (y_um - centre_um[1]) ** 2)
-        rays = self.rays(distance_um, max(float(reach2.max()), axis2))
-        return np.asarray(rays.chord(reach2) - rays.chord(axis2))
+        return np.asarray(self.path_change(distance_um, axis2, reach2 - axis2))
 
 
 AIR = FilmStack()
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RaySeries:
-    """Rays through plane-parallel media up to a reach, as Chebyshev series in reach²,
-    to rounding.
-
-    series: of the optical path less that along the normal, ``along_um``; of reach over
-    n sin θ; of √(passed / spread).
-    """
-
-    most_um2: float
-    series: tuple[Array, Array, Array]
-    along_um: float
-
-    def chord(self, reach2_um2: Any) -> Any:
-        """Optical path less that along the normal, um."""
-        return self._at(0, reach2_um2)
-
-    def bend(self, reach2_um2: Any) -> Any:
-        """Reach over n sin θ, um."""
-        return self._at(1, reach2_um2)
-
-    def level(self, reach2_um2: Any) -> Any:
-        """√(passed / spread), 1/um."""
-        return self._at(2, reach2_um2)
-
-    def _at(self, which: int, reach2_um2: Any) -> Any:
-        return chebyshev.chebval(
-            (2 / self.most_um2) * reach2_um2 - 1, self.series[which]
-        )
-
-
-@functools.lru_cache(maxsize=256)
-def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
-    """Chebyshev series of rays from lens to sensor up to a squared reach, cached.
-
-    Of path difference, of reach over n sin θ and of √(passed / spread), each cut at
-    rounding.
-    """
-    pairs = films.pairs(distance_um)
-    order = (films.filling, *(n for n, _ in films.behind))
-    node, to_series = _nodes()
-    w = media.solve_direction_square(pairs, most_um2 / 2 * (1 + node))
-    along_um = sum(n * t for n, t in pairs)
-    level = np.sqrt(
-        media.passed_at(order, w) / media.area_spreading_of_square(pairs, w)
-    )
-    chord = media.whole_path(pairs, w) - along_um
-    bend = media.reach_per_direction(pairs, w)
-    coefficients = to_series @ np.stack([chord, bend, level], 1)
-    chord, bend, level = (
-        chebyshev.chebtrim(series, _ROUNDING * np.abs(series).max())
-        for series in coefficients.T
-    )
-    return RaySeries(most_um2, (chord, bend, level), along_um)
-
-
-@functools.cache
-def _nodes() -> tuple[Array, Array]:
-    """Chebyshev's nodes, and the (term, node) matrix from values there to a series."""
-    node = chebyshev.chebpts1(_TERMS)
-    return node, np.linalg.inv(chebyshev.chebvander(node, _TERMS - 1))
 
 
 def source_paths(

@@ -39,7 +39,6 @@ class FitParameter:
     plausible: standard deviation where it is neither fitted nor stated; 0 for sigma.
     effect: its name as a cause in score tests while it is not fitted; empty for none.
     probe: amount of it in these tests.
-    extra: fitted too where the usual parameters do not explain the frames.
     reversible: near focus the opposite sign gives similar images.
     measured_by: measurement that determines it independently of the frames.
     """
@@ -55,7 +54,6 @@ class FitParameter:
     plausible: float = 0.0
     effect: str = ""
     probe: float = 0.0
-    extra: bool = False
     reversible: bool = False
     measured_by: str = ""
 
@@ -125,7 +123,6 @@ PARAMETERS: tuple[FitParameter, ...] = (
         plausible=1.0,
         effect="a spectrum of finite width",
         probe=2.0,
-        extra=True,
         measured_by="the spectrum",
     ),
     FitParameter(
@@ -165,7 +162,6 @@ PARAMETERS: tuple[FitParameter, ...] = (
         free=False,
         effect="a tilt of the lens about y",
         probe=0.3,
-        extra=True,
         measured_by="frames at opposite field angles",
     ),
     FitParameter(
@@ -178,7 +174,6 @@ PARAMETERS: tuple[FitParameter, ...] = (
         free=False,
         effect="a tilt of the lens about x",
         probe=0.3,
-        extra=True,
         measured_by="frames at opposite field angles",
     ),
     FitParameter(
@@ -278,7 +273,6 @@ PARAMETERS: tuple[FitParameter, ...] = (
         plausible=5.0,
         effect="a source of finite size",
         probe=6.0,
-        extra=True,
         measured_by="the pinhole, or frames at more distant depths",
     ),
     FitParameter(
@@ -300,7 +294,6 @@ PARAMETERS: tuple[FitParameter, ...] = (
         free=False,
         effect="a wrong pixel pitch",
         probe=1.0,
-        extra=True,
         measured_by="the pixel pitch",
     ),
     FitParameter(

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from scipy.interpolate import CubicSpline
 
 from characterize.model.parameters import PLACE, process_state_of
 from metalens.cell import Cell
-from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
@@ -34,9 +34,6 @@ from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
-# wavelengths that t is interpolated between: it turns by less than one radian over the
-# span
-_COLOURS = 12
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(ResponseError)]
@@ -96,7 +93,7 @@ class PillarResponse:
     within the range, which the basis was not computed from.
     """
 
-    _laid: tuple[int, ...] = (
+    _refinements: tuple[int, ...] = (
         1,
         2,
         3,
@@ -125,21 +122,21 @@ class PillarResponse:
         self.response = response
         self.span = span
         self.angle_rad = angle_rad
-        self.diameter_um = self._kinds()
+        self.diameter_um = self._grid_um()
         step_um = 0.006 * wavelength_scale(lens.wavelength_um)
         b = max(7, 2 * math.ceil(span.bias_um / step_um) + 1)
-        for times in self._laid:  # resonances need more nodes
-            self._lay(times * (b - 1) + 1, tolerance)
+        for times in self._refinements:  # resonances need more nodes
+            self._set_basis(times * (b - 1) + 1, tolerance)
             self.error = self._measure()
             if self.error < _MISSED:
                 break
 
-    def _kinds(self) -> Array:
+    def _grid_um(self) -> Array:
         """(grid,) designed diameters that the functions are known at."""
         built = self.lens.diameters.diameter_um[self.lens.diameters.diameter_um > 0]
         return np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
 
-    def _lay(self, count: int, tolerance: float) -> None:
+    def _set_basis(self, count: int, tolerance: float) -> None:
         """Set ``count`` bias nodes (Chebyshev) and the low-rank basis of t there.
 
         Left singular vectors of t over the training changes, to rms ``tolerance``.
@@ -148,9 +145,7 @@ class PillarResponse:
         self.nodes_um = unit * self.span.bias_um
         share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
         self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
-        self._answer, self._biased = self._answers(self.nodes_um[:, None])
-        self._designed: dict[float, Array] = {}
-        self._colours = self._through_colours()
+        self._answer, self._bias_factor = self._answers(self.nodes_um[:, None])
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         # rms of t outside the first functions
@@ -213,75 +208,34 @@ class PillarResponse:
         return np.asarray(self._to_series @ (rates @ self.basis.T))
 
     def _at_nodes(self, change: PillarChange) -> Array:
-        """(b, grid) :meth:`exact` at the bias nodes.
-
-        t as designed, cached for eight wavelengths, times the factors of the answering
-        causes and of the bias.
+        """(b, grid) :meth:`exact` at the bias nodes: t as designed, times the factors of
+        the answering causes and of the bias.
         """
-        wave = self.lens.wavelength_um + change.wavelength_um
-        if wave not in self._designed:
-            if len(self._designed) >= 8:
-                self._designed.pop(next(iter(self._designed)))
-            self._designed[wave] = self._designed_at(
-                wave, change.wavelength_um / self.span.wavelength_um
-            )
-        return np.asarray(
-            self._designed[wave]
-            * self._answer.factor(np.array(change.answers))
-            * self._biased
-        )
+        designed = self._designed_at(self.lens.wavelength_um + change.wavelength_um)
+        factor = self._answer.factor(np.array(change.answers))
+        return np.asarray(designed * factor * self._bias_factor)
 
-    def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
-        """(b, grid) t as designed at the bias nodes, at ``wave_um``.
-
-        Interpolated between sampled wavelengths where |share| <= 1.
-
-        Args:
-            share: offset from the design's wavelength over the span.
-        """
-        if abs(share) <= 1 and len(self._colours):
-            return np.asarray(
-                np.tensordot(
-                    legendre.interpolation_matrix(_COLOURS, np.array(share)),
-                    self._colours,
-                    1,
-                )
-            )
+    def _designed_at(self, wave_um: float) -> Array:
+        """(b, grid) t as designed at the bias nodes, at ``wave_um``."""
         d = self.diameter_um + self.nodes_um[:, None]
         return designed_transmission(
             self.lens.proxy, d, wave_um, angle_rad=self.angle_rad
-        )
-
-    def _through_colours(self) -> Array:
-        """(colours, b, grid) t as designed at Legendre nodes of the wavelengths.
-
-        Empty where the proxy's range does not contain the span.
-        """
-        middle, reach = self.lens.wavelength_um, self.span.wavelength_um
-        low, high = self.lens.proxy.wavelengths_um
-        if not low <= middle - reach < middle + reach <= high:
-            return np.empty(0)
-        return np.stack(
-            [
-                self._designed_at(w)
-                for w in legendre.mapped_nodes(_COLOURS, middle - reach, middle + reach)
-            ]
         )
 
     def table(self) -> Array:
         """(r, entries): the conjugate basis on a fine grid of diameters; the last entry
         is no pillar.
         """
-        place = np.linspace(0, len(self.diameter_um) - 1, _ENTRIES)
-        rows = [_cubic(row.conj(), place) for row in self.basis]
+        count = len(self.diameter_um)
+        spline = CubicSpline(np.arange(count), self.basis.conj(), axis=1)
+        rows = spline(np.linspace(0, count - 1, _ENTRIES))
         return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1)
 
     def entries(self, diameters: DiameterMap, rows: slice, columns: slice) -> Array:
-        """(y, x) entries of :meth:`table` of the pillars of some rows and columns."""
-        return self.place(diameters.diameter_um[rows, columns])
-
-    def place(self, diameter_um: Array) -> Array:
-        """(*shape) entry of :meth:`table` nearest to each designed diameter, um."""
+        """(y, x) entries of :meth:`table` nearest to the pillars of some rows and
+        columns.
+        """
+        diameter_um = diameters.diameter_um[rows, columns]
         low, high = self.diameter_um[0], self.diameter_um[-1]
         entry = np.rint(
             (np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))
@@ -298,21 +252,6 @@ class PillarResponse:
         for n in range(2, len(value)):
             value[n] = 2 * x * value[n - 1] - value[n - 2]
         return value
-
-    def rates(self, bias_um: Array, weights: Array) -> Array:
-        """(b, *shape) derivatives of :meth:`weights` by the bias, 1/um.
-
-        Args:
-            bias_um: (*shape).
-            weights: (b, *shape) polynomials at these biases.
-        """
-        x = np.asarray(bias_um) / self.span.bias_um
-        reach = self.span.bias_um
-        slope = np.empty_like(weights)
-        slope[0], slope[1] = 0.0, 1.0
-        for n in range(2, len(weights)):
-            slope[n] = 2 * weights[n - 1] + 2 * x * slope[n - 1] - slope[n - 2]
-        return slope / reach
 
     def _training(self) -> list[PillarChange]:
         """Changes that the basis is computed from: none, each extreme, random ones."""
@@ -353,31 +292,33 @@ class PairedPillars(PillarResponse):
     ``diameter_um``: width of each pair.
     """
 
-    _laid = 3, 6  # rectangles have more resonances than rounds
+    _refinements = 3, 6  # rectangles have more resonances than rounds
 
-    def _kinds(self) -> Array:
+    def _grid_um(self) -> Array:
         pairs = self.response.pairs
         if pairs is None:
             raise FitError("pillars of two sizes: slopes of such pillars are needed")
-        self._table, self._own = PairTable.of(self.lens), Kinds.of(self.lens.diameters)
-        self._rates = pairs.at(self._own.width_um, self._own.length_um)
-        return self._own.width_um
+        self._table, self._sizes = (
+            PairTable.of(self.lens),
+            Kinds.of(self.lens.diameters),
+        )
+        self._rates = pairs.at(self._sizes.width_um, self._sizes.length_um)
+        return self._sizes.width_um
 
     def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
         return Answer(self._rates[:, None], None, np.ones(1)), 1.0
 
     def exact(self, bias_um: Array | float, change: PillarChange) -> Array:
         """(..., kinds) complex t of both sizes + bias under a change."""
-        t = self._table.t(self._own.width_um + bias_um, self._own.length_um + bias_um)
+        t = self._table.t(
+            self._sizes.width_um + bias_um, self._sizes.length_um + bias_um
+        )
         return np.asarray(
             t * np.exp(np.tensordot(np.array(change.answers), self._rates, 1))
         )
 
-    def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
+    def _designed_at(self, wave_um: float) -> Array:
         return self.exact(self.nodes_um[:, None], PillarChange())
-
-    def _through_colours(self) -> Array:
-        return np.empty(0)
 
     def _waves(self) -> bool:
         return False
@@ -390,7 +331,7 @@ class PairedPillars(PillarResponse):
 
     def entries(self, diameters: DiameterMap, rows: slice, columns: slice) -> Array:
         """(y, x) kinds of the pillars of some rows and columns."""
-        return self._own.index(diameters, rows, columns)
+        return self._sizes.index(diameters, rows, columns)
 
 
 def of_lens(
@@ -444,15 +385,3 @@ def _draw(random: np.random.Generator, span: ChangeRange, waves: bool) -> Pillar
     return PillarChange(
         tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves
     )
-
-
-def _cubic(values: Array, place: Array) -> Array:
-    """Cubic Lagrange interpolation at ``place`` (in samples) of an even grid.
-
-    Through the four nearest samples, at the ends through the outermost four.
-    """
-    i = np.clip(place.astype(int), 1, len(values) - 3)
-    t = place - i
-    a, b, c, d = values[i - 1], values[i], values[i + 1], values[i + 2]
-    outer = t * (t - 1) / 6 * ((t + 1) * d - (t - 2) * a)
-    return np.asarray(outer + (t + 1) * (t - 2) / 2 * ((t - 1) * b - t * c))

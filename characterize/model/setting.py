@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.model.compressed import CompressedLens
 from characterize.model.glass import AIR, FilmStack
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import PillarResponse
-from characterize.model.reduced import CompressedLens
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import CDError, WavefrontError, derivative_maps, names_of_kind
@@ -169,8 +169,8 @@ class AngleGroup:
 
     index: of the frames. bending, widening, residual: (m, q, p) on the nodes: phase by
     wave-front parameters, diameter by CD parameters, residual phase modes.
-    apart: behind a stop the same frames in parts of equal shadow; where the stop is not
-    at the pillars, one part for each depth.
+    shaded_parts: behind a stop the same frames in parts of equal shadow; where the stop
+    is not at the pillars, one part for each depth.
     """
 
     index: Array
@@ -179,12 +179,12 @@ class AngleGroup:
     bending: Array
     widening: Array
     residual: Array
-    apart: tuple["AngleGroup", ...] = ()
+    shaded_parts: tuple["AngleGroup", ...] = ()
 
     @property
     def illuminated_parts(self) -> tuple["AngleGroup", ...]:
         """Groups whose frames meet the same pillars."""
-        return self.apart or (self,)
+        return self.shaded_parts or (self,)
 
     @classmethod
     def of(
@@ -214,41 +214,32 @@ class AngleGroup:
             if lens.layers.stop.distance_um
             else [slice(None)]
         )
-        apart = tuple(
+        shaded_parts = tuple(
             dataclasses.replace(
                 self,
                 index=self.index[some],
                 reduced=self.reduced.shaded(lens, self.pillars, float(at[some][0])),
-                apart=(),
+                shaded_parts=(),
             )
             for some in equal
         )
-        return dataclasses.replace(self, apart=apart)
+        return dataclasses.replace(self, shaded_parts=shaded_parts)
 
     def only(self, frames: Array) -> "AngleGroup | None":
         """The group of some frames, renumbered in rising order; None without any."""
         place = np.flatnonzero(np.isin(frames, self.index))
         if not len(place):
             return None
-        parts = [part.only(frames) for part in self.apart]
-        apart = tuple(part for part in parts if part is not None)
-        return dataclasses.replace(self, index=place, apart=apart)
+        parts = [part.only(frames) for part in self.shaded_parts]
+        shaded_parts = tuple(part for part in parts if part is not None)
+        return dataclasses.replace(self, index=place, shaded_parts=shaded_parts)
 
     def bent(self, residual: Array) -> "AngleGroup":
         """With the shapes of a residual phase; groups apart have the same nodes."""
-        apart = tuple(dataclasses.replace(g, residual=residual) for g in self.apart)
-        return dataclasses.replace(self, residual=residual, apart=apart)
-
-    def quick(self, window_um: float | None) -> "AngleGroup":
-        """The group on the fast lens; see :meth:`CompressedLens.quick`."""
-        reduced = self.reduced.quick(window_um)
-        residual = self.reduced.seen_by(reduced, self.residual)
-        apart = tuple(group.quick(window_um) for group in self.apart)
-        return dataclasses.replace(
-            AngleGroup.of(self.index, self.pillars, reduced),
-            residual=residual,
-            apart=apart,
+        shaded_parts = tuple(
+            dataclasses.replace(g, residual=residual) for g in self.shaded_parts
         )
+        return dataclasses.replace(self, residual=residual, shaded_parts=shaded_parts)
 
     def turning(self, name: str) -> Array | None:
         """(q, p) phase on the nodes for one unit of a wave-front parameter, rad.

@@ -492,9 +492,7 @@ def maximize_likelihood(
     upper_of["blur"][:] = 4 * spec.pixel_um
     lower_of["optics"][:] = -0.3
     upper_of["optics"][:] = 0.3
-    settings = SolverSettings(
-        iterations=iterations, step_tolerance=step, near=2.0, secant=True
-    )
+    settings = SolverSettings(iterations=iterations, step_tolerance=step, near=2.0)
     return leastsquares.fit_levenberg_marquardt(
         model.images,
         data,

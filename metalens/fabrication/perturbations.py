@@ -102,9 +102,8 @@ class Perturbation:
         does. plausible: standard deviation that is assumed where it is neither
         fitted nor stated; sigma where 0. effect: as a cause in words, where it is
         looked for while it is not fitted; probe: so much of it is tried then.
-    extra: fitted too where the usual ones do not explain the frames. reversible: near
-        focus the images of a lens with the opposite sign look equal. measured_by: what
-        measures it besides the frames.
+    reversible: near focus the images of a lens with the opposite sign look equal.
+    measured_by: what measures it besides the frames.
     """
 
     name: str
@@ -120,7 +119,6 @@ class Perturbation:
     plausible: float = 0.0
     effect: str = ""
     probe: float = 0.0
-    extra: bool = False
     reversible: bool = False
     measured_by: str = ""
 
@@ -348,7 +346,6 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         free=False,
         effect="a saddle of the diameters",
         probe=3.0,
-        extra=True,
         measured_by="CDs at four rims (SEM)",
     ),
     _cd_error(
@@ -360,7 +357,6 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         free=False,
         effect="an oblique saddle of the diameters",
         probe=3.0,
-        extra=True,
         measured_by="CDs at four rims (SEM)",
     ),
     Perturbation(

@@ -110,16 +110,9 @@ def test_few_functions_hold_every_change(response):
     )
     for bias_um in (-0.0117, 0.0, 0.0193):
         weight = pillars.weights(np.array(bias_um))
-        rate = pillars.rates(np.array(bias_um), weight)
         coefficients = pillars.coefficients(change)
         found = pillars.basis.conj().T @ (weight @ coefficients)
         assert np.abs(found - pillars.exact(bias_um, change)).max() < 2e-3
-        near = [
-            pillars.weights(np.array(bias_um + s)) @ coefficients for s in (1e-6, -1e-6)
-        ]
-        assert rate @ coefficients == pytest.approx(
-            (near[0] - near[1]) / 2e-6, rel=1e-5, abs=1e-5
-        )
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ def test_a_bent_valley_is_followed_to_its_ends():
     close = 0.06 * (ends[1] - ends[0])  # a parabola within 15 % is left as it is
     assert found.low == pytest.approx(ends[0], abs=close)
     assert found.high == pytest.approx(ends[1], abs=close)
-    assert found.found == (True, True)
+    assert found.reached == (True, True)
     assert len(found.stops) <= 8
 
 

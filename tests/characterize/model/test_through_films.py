@@ -196,8 +196,8 @@ def test_derivatives_are_differences_of_images(monkeypatch):
         | {"pinhole_um": 4.0, "glass_um": 20.0, "distance_um": 3.0, "log_gain": 5.0}
     )
     steps = {
-        "distance_um": 0.02, "wavelength_nm": 0.02, "stage_zero_um": 0.2, "stage_scale": 1e-3, "decentre_y_um": 0.02,
-        "tilt_x_deg": 0.01, "source_y_um": 0.1, "bias_nm": 0.05, "pinhole_um": 0.1, "glass_um": 0.1,
+        "distance_um": 0.1, "wavelength_nm": 0.1, "stage_zero_um": 0.2, "stage_scale": 1e-3, "decentre_y_um": 0.02,
+        "tilt_x_deg": 0.01, "source_y_um": 0.1, "bias_nm": 0.5, "pinhole_um": 0.1, "glass_um": 0.1,
     }  # fmt: skip
     slopes = model.images(base, list(steps))[1]
     for (name, step), slope in zip(steps.items(), slopes, strict=True):
