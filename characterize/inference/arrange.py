@@ -35,7 +35,7 @@ _TWIN = 0.05
 # as-built lens were observed to exchange
 _NEAR = 0.02
 _TWINS = 5e-3  # likeness within which the simplest of reversed twins is chosen
-_TOLD = 40.0  # chi-square between two orientations that a fit can distinguish
+_DISTINCT = 40.0  # chi-square between two orientations that a fit can distinguish
 _SURE = 0.9  # likeness above which the nominal lens explains the frames
 _ZEROS = 17  # stage zeros of a scan
 # distances of a scan: steps of 25 um over two prior sigma, a tenth of a wave of defocus
@@ -56,10 +56,9 @@ class FrameArrangement:
     order_seen: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the
     stated one beyond doubt.
-    alike: turns (1 to 7) under which the nominal images do not change: these cannot be
+    equivalent: turns (1 to 7) under which the nominal images do not change: these cannot be
     distinguished from the chosen one.
-    others: the same in other ways about as much alike: as a lens is made, any may be
-    the one; fits tell.
+    others: other arrangements of nearly equal likeness; fits choose among them.
     """
 
     stage_zero_um: float
@@ -71,7 +70,7 @@ class FrameArrangement:
     order_seen: bool
     orientation: int
     clearly: bool
-    alike: tuple[int, ...]
+    equivalent: tuple[int, ...]
     others: tuple["FrameArrangement", ...] = ()
 
     @property
@@ -292,13 +291,13 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
         order_seen=order_seen,
         orientation=chosen[1],
         clearly=clearly,
-        alike=tuple(k for k in chi2 if k and chi2[k] < _TOLD),
+        equivalent=tuple(k for k in chi2 if k and chi2[k] < _DISTINCT),
     )
     distinct = [
         way
         for way in likeness_of
         if way[0] == reordered
-        and chi2[relative_orientation(chosen[1], way[1])] >= _TOLD
+        and chi2[relative_orientation(chosen[1], way[1])] >= _DISTINCT
     ]
     # the likeliest of the other order
     twin = sorted(
@@ -430,7 +429,7 @@ def _brightness(light: Array, expected: Array, noise: Array) -> float:
 
 
 def _distance(a: Array, b: Array) -> float:
-    """Squared difference of two images after the shift that makes them most alike."""
+    """Squared difference of two images after the shift of highest correlation."""
     _, (dy, dx) = normalized_cross_correlation(a, b, 0.0)
     return float(((a - shift_frames(b, (int(dy), int(dx)))) ** 2).sum())
 
@@ -482,8 +481,8 @@ def arrangement_text(arrangement: FrameArrangement) -> list[str]:
         words.append(
             f"frames fit the stated depths only in the order {arrangement.order.tolist()}: used so"
         )
-    if arrangement.alike:
-        which = ", ".join((TURNS + MIRRORED)[k] for k in arrangement.alike)
+    if arrangement.equivalent:
+        which = ", ".join((TURNS + MIRRORED)[k] for k in arrangement.equivalent)
         words.append(
             f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
             "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"

@@ -1,6 +1,4 @@
-"""The lens that was made, as a record and as a file: values, covariance, what can and
-what cannot be known.
-"""
+"""The as-built lens as a record and as a file: values, covariance, intervals, texts."""
 
 import math
 from dataclasses import dataclass, field
@@ -54,29 +52,26 @@ class AsBuilt:
 
     design: the lens as designed. response: what height, index and sidewall do to its
     pillars.
-    names, value, covariance: of the fitted parameters, priors and what cannot be told
-    included.
+    names, value, covariance: of the fitted parameters, with priors and unstated effects.
     held: {name: value} of parameters that were not fitted.
     information: Fisher information of the frames alone.
     depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the
     sensor.
-    measured, predicted, nominal: (n, y, x) electrons: seen, as built, as designed (with
+    measured, predicted, nominal: (n, y, x) electrons: measured, as built, as designed (with
     fitted gain and background).
     residual_sigma: (n, y, x), 0 where masked.
     identifiable: combinations of parameters that the frames alone fix, with their 1
     sigma, best first, in words.
-    degeneracies: what cannot be told apart, in words. cautions: everything that was put
-    right or assumed.
+    degeneracies: parameters that are not identifiable, in words. cautions: everything
+    that was corrected or assumed.
     trusted: every check passed; problems: those that did not.
     low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no
     parabola.
     within: the same within the model, narrower.
     verdicts: how well the PSF is known, and how well the process, in words.
-    causes, by_cause: what the captures cannot tell apart and nobody stated: names (c,),
-    (c, p) shift of every parameter
-        by each of plausible size, standard deviations. bench: (p, p) second moment of
-        the shifts by those of the bench
-        alone, which the lens leaves behind.
+    causes, by_cause: effects that nobody stated: names (c,), (c, p) standard deviation
+    of the shift of every parameter by each. bench: (p, p) second moment of the shifts
+    by those of the bench alone, which the lens leaves behind.
     curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there
     with all others fitted.
     """

@@ -258,7 +258,7 @@ def _exactly(task: SearchTask, name: str) -> bool:
 def _size(task: SearchTask, name: str) -> float:
     """Standard deviation of a cause: as stated, else a Type B estimate.
 
-    0 where it is held as stated.
+    0 where it is fixed as stated.
     """
     if name in task.unfitted:
         return task.unfitted[name]

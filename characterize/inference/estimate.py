@@ -1,5 +1,5 @@
-"""Bench captures and a design to the lens that was made: every valley of the
-likelihood, checked, explained.
+"""Bench captures and a design to the as-built lens: every mode of the posterior, checked
+and explained.
 """
 
 import dataclasses
@@ -275,7 +275,7 @@ def _contradicted(
         ResidualFinding(
             f"{test.cause} would explain the frames about as well as {fitted.cause} "
             f"({math.sqrt(fall):.1f} sigma: chi-square falls by {fall:.0f}), but "
-            f"{', '.join(test.frees)} is held as stated: state it with its error, or "
+            f"{', '.join(test.frees)} is fixed as stated: state it with its error, or "
             "mend the bench",
             math.sqrt(fall),
         )

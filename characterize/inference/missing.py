@@ -36,7 +36,7 @@ _CURES = {
 
 @dataclass(frozen=True, slots=True)
 class ResidualFinding:
-    """What the residuals hold beside noise, in words, and its significance in sigma."""
+    """Structure of the residuals in addition to noise, in words, and its significance in sigma."""
 
     words: str
     sigma: float

@@ -41,7 +41,7 @@ _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
 _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ASIDE_UM = 50.0  # largest offset of a window
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
-_HELD_PX = 0.1  # off the decentre that windows may be held
+_OFF_PX = 0.1  # off the decentre that windows may stay
 _PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of a prior
 _ONWARD = SolverSettings(iterations=25, step_tolerance=0.3, near=1.0, finish=False)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
@@ -137,10 +137,12 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
         for other, merit in zip(arrangements, merits, strict=True)
         if merit < merits[best] + _PROMISING and other.reordered == chosen.reordered
     }
-    turns = {*chosen.alike, *turns} - {0}
+    turns = {*chosen.equivalent, *turns} - {0}
     return dataclasses.replace(
         tasks[best],
-        arrangement=dataclasses.replace(chosen, alike=tuple(sorted(turns)), others=()),
+        arrangement=dataclasses.replace(
+            chosen, equivalent=tuple(sorted(turns)), others=()
+        ),
     )
 
 
@@ -294,7 +296,7 @@ def hold_windows(task: SearchTask, value: Array) -> SearchTask:
     x = task.all_of(value)
     middle = float(x[PLACE["decentre_x_um"]]), float(x[PLACE["decentre_y_um"]])
     off = max(abs(a - b) for a, b in zip(middle, model.grid.middle_um, strict=True))
-    if off < _HELD_PX * model.setting.pixel_um:
+    if off < _OFF_PX * model.setting.pixel_um:
         return task
     return dataclasses.replace(task, model=model.about(middle))
 

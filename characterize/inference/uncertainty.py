@@ -285,7 +285,7 @@ def draw_posterior(
     """
     rng = np.random.default_rng(seed)
     share = mode_probabilities(components, spread)
-    # units in which all parameters are alike: eigenvalues are cut off at rounding
+    # in units of their sigma: eigenvalues are cut off at rounding
     unit = np.sqrt(np.diag(components[0].covariance))
     mixture = [
         stats.multivariate_normal(
@@ -417,7 +417,7 @@ def posterior_text(names: Sequence[str], posterior: FitPosterior) -> list[str]:
         out.append(
             "a second lens explains the frames nearly as well (misfit "
             f"{mode.merit - posterior.best.merit:+.1f}, probability {share:.0%}): {values}; "
-            "frames farther from focus on both sides tell them apart"
+            "frames farther from focus on both sides distinguish them"
         )
     if len(posterior.draws) and posterior.effective_draws < DRAWS / 4:
         out.append(

@@ -399,7 +399,7 @@ class CompressedLens:
     def shaded(
         self, lens: Lens, pillars: PillarResponse, depth_um: float
     ) -> "CompressedLens":
-        """The lens lit from ``depth_um`` through its stop.
+        """The lens illuminated from ``depth_um`` through its stop.
 
         It shares with this one all that does not depend on the pillars.
         """

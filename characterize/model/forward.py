@@ -28,8 +28,8 @@ from characterize.model.pillars import (
     pillar_change_of,
 )
 from characterize.model.setting import (
-    BENDING,
     LIGHT,
+    WAVEFRONT_ERRORS,
     AngleGroup,
     FrameSetting,
     SpectralLine,
@@ -54,7 +54,7 @@ GEOMETRY = (
     "distance_um", "wavelength_nm", "decentre_x_um", "decentre_y_um", "tilt_x_deg", "tilt_y_deg", "source_x_um",
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
-WIDENING, ANSWERING = (
+CD_ERRORS, RESPONSE_ERRORS = (
     {name: n for n, name in enumerate(names_of_kind(kind))}
     for kind in (CDError, ResponseError)
 )
@@ -428,12 +428,12 @@ class ForwardModel:
             pupil: the pupil and its derivatives, of :meth:`_pupil`.
             phasor: (frames, q, p) exp(i phase).
         """
-        if name in WIDENING:
-            slope = pupil[1] * group.widening[WIDENING[name]] * phasor
-        elif name in ANSWERING:
-            slope = pupil[2][ANSWERING[name]] * phasor
-        elif (turning := group.turning(name)) is not None:
-            slope = 1j * turning * pupil[0] * phasor
+        if name in CD_ERRORS:
+            slope = pupil[1] * group.cd_maps[CD_ERRORS[name]] * phasor
+        elif name in RESPONSE_ERRORS:
+            slope = pupil[2][RESPONSE_ERRORS[name]] * phasor
+        elif (phase_map := group.phase_map(name)) is not None:
+            slope = 1j * phase_map * pupil[0] * phasor
         elif name in GEOMETRY:
             slope = self._phase_slope(x, group, name) * (pupil[0] * phasor)
             if name == "wavelength_nm":
@@ -447,11 +447,11 @@ class ForwardModel:
     ) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex pupil on the lens nodes, with its derivatives.
 
-        In order: the pupil; its derivative by the bias per um; by the answering causes
+        In order: the pupil; its derivative by the bias per um; by the pillar-response errors
         (causes, q, p) per unit of the parameter; by the wavelength per nm. Without
         ``slopes`` the derivatives are the pupil itself and mean nothing.
         """
-        bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
+        bias = np.tensordot([x[PLACE[name]] for name in CD_ERRORS], group.cd_maps, 1)
         reach = group.pillars.span.bias_um
         inside = np.abs(bias) < reach
         bias = np.clip(bias, -reach, reach).astype(np.float32)
@@ -511,7 +511,9 @@ class ForwardModel:
         phase += exit_path
         phase *= k
         phase -= reduced.known
-        phase += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
+        phase += np.tensordot(
+            [x[PLACE[name]] for name in WAVEFRONT_ERRORS], group.phase_maps, 1
+        )
         uneven = x[[PLACE[name] for name in LIGHT]]
         light = (
             -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1)

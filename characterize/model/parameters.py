@@ -325,12 +325,12 @@ UNFITTED: tuple[UnfittedEffect, ...] = (
     ),
     UnfittedEffect(
         "window_px",
-        "window of a field angle off the chief ray there, each way, beside the common decentre",
+        "window of a field angle off the chief ray there, each way, in addition to the common decentre",
         0.3,
     ),
     UnfittedEffect(
         "stop_um",
-        "aperture stop of the lens beside its place in the design, each way",
+        "aperture stop of the lens off its place in the design, each way",
         3.0,
     ),
 )

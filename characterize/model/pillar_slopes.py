@@ -1,4 +1,4 @@
-"""What the answering causes do to the pillars, from the cell solvers: t itself where
+"""What the pillar-response errors do to the pillars, from the cell solvers: t itself where
 they are quick, else slopes.
 """
 
@@ -48,7 +48,7 @@ _KEPT = 64  # lenses whose slopes are kept on disk
 def log_response_slopes(
     lens: Lens, *, tolerance: float = 0.02, names: Container[str] = ()
 ) -> Sensitivity:
-    """d ln t by the answering causes over the diameters of a lens, or a table of t.
+    """d ln t by the pillar-response errors over the diameters of a lens, or a table of t.
 
     The causes are those of :mod:`metalens.fabrication.perturbations`.
 
@@ -199,7 +199,7 @@ def _solve(lens: Lens, tolerance: float, names: Container[str]) -> Sensitivity:
 def _table_slopes(
     lens: Lens, table: Solved, diameter_um: Array, names: Container[str]
 ) -> Array:
-    """(answering causes, n) d ln t at the design, from the table.
+    """(pillar-response errors, n) d ln t at the design, from the table.
 
     By RCWA where the table lacks a cause in ``names``; zero for the others.
     """

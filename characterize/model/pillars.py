@@ -41,7 +41,7 @@ _ROWS = [row for _, row in of_kind(ResponseError)]
 
 @dataclass(frozen=True, slots=True)
 class PillarChange:
-    """Change of the pillars that is the same all over the lens: the answering causes in
+    """Change of the pillars that is the same all over the lens: the pillar-response errors in
     base units, and the wavelength.
 
     Zeros are the design.
@@ -112,7 +112,7 @@ class PillarResponse:
 
         Args:
             lens: its cell, proxy and diameters.
-            response: slopes of ln t by the answering causes.
+            response: slopes of ln t by the pillar-response errors.
             span: largest changes; the usual ones without it.
             tolerance: rms error of t in the basis.
             angle_rad: of incidence.
@@ -156,7 +156,7 @@ class PillarResponse:
         self.basis = np.ascontiguousarray(u[:, :rank].T.conj())
 
     def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
-        """Response to the answering causes, and factor of the bias, at (b, 1) nodes."""
+        """Response to the pillar-response errors, and factor of the bias, at (b, 1) nodes."""
         d = self.diameter_um + nodes
         return prepare_response(self.lens.proxy, self.response, d), bias_ratio(
             self.response, d, nodes
@@ -201,7 +201,7 @@ class PillarResponse:
         return np.asarray(self._to_series @ (t @ self.basis.T))
 
     def slopes(self, change: PillarChange) -> Array:
-        """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering
+        """(pillar-response errors, b, r) derivatives of :meth:`coefficients` by the answering
         causes, in base units.
         """
         rates = self._answer.rates(np.array(change.answers)) * self._at_nodes(change)
@@ -209,7 +209,7 @@ class PillarResponse:
 
     def _at_nodes(self, change: PillarChange) -> Array:
         """(b, grid) :meth:`exact` at the bias nodes: t as designed, times the factors of
-        the answering causes and of the bias.
+        the pillar-response errors and of the bias.
         """
         designed = self._designed_at(self.lens.wavelength_um + change.wavelength_um)
         factor = self._answer.factor(np.array(change.answers))
@@ -287,7 +287,7 @@ class PairedPillars(PillarResponse):
     """As :class:`PillarResponse`, for pillars of two sizes: one column for each pair.
 
     A bias moves all edges, so it adds to both sizes, along the table of the lens. The
-    slopes by the answering causes are those of the designed sizes. t is that of the
+    slopes by the pillar-response errors are those of the designed sizes. t is that of the
     design's wavelength, as the table has single ones.
     ``diameter_um``: width of each pair.
     """
@@ -345,7 +345,7 @@ def of_lens(
 
     Args:
         response: slopes of the pillars.
-        span: largest changes that are held.
+        span: largest changes of the pillars.
         angle_rad: angle of incidence or field angle, rad.
     """
     kind = PillarResponse if lens.pairs is None else PairedPillars

@@ -69,7 +69,7 @@ class FrameSetting:
     @property
     def glow(self) -> Array:
         """(n, 1, 1) background of every frame over that of exposure 1; what nobody
-        subtracted is alike in all.
+        subtracted is equal in all.
         """
         return np.where(self.dark_known, self.exposure, 1.0)[:, None, None]
 
@@ -148,7 +148,7 @@ def background_planes(x: Array, setting: FrameSetting) -> Array:
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
-BENDING = {name: n for n, name in enumerate(names_of_kind(WavefrontError))}
+WAVEFRONT_ERRORS = {name: n for n, name in enumerate(names_of_kind(WavefrontError))}
 LIGHT = ("light_x", "light_y", "light_r")
 
 
@@ -167,7 +167,7 @@ def light_maps(u: Array, v: Array) -> Array:
 class AngleGroup:
     """Frames of one field angle, and the lens on nodes for it.
 
-    index: of the frames. bending, widening, residual: (m, q, p) on the nodes: phase by
+    index: of the frames. phase_maps, cd_maps, residual: (m, q, p) on the nodes: phase by
     wave-front parameters, diameter by CD parameters, residual phase modes.
     shaded_parts: behind a stop the same frames in parts of equal shadow; where the stop
     is not at the pillars, one part for each depth.
@@ -176,8 +176,8 @@ class AngleGroup:
     index: Array
     pillars: PillarResponse
     reduced: CompressedLens
-    bending: Array
-    widening: Array
+    phase_maps: Array
+    cd_maps: Array
     residual: Array
     shaded_parts: tuple["AngleGroup", ...] = ()
 
@@ -191,12 +191,17 @@ class AngleGroup:
         cls, index: Array, pillars: PillarResponse, reduced: CompressedLens
     ) -> "AngleGroup":
         """Without a residual phase."""
-        bending, widening = (
+        phase_maps, cd_maps = (
             derivative_maps(kind, reduced.u, reduced.v)
             for kind in (WavefrontError, CDError)
         )
         return cls(
-            index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape))
+            index,
+            pillars,
+            reduced,
+            phase_maps,
+            cd_maps,
+            np.empty((0, *reduced.u.shape)),
         )
 
     def shaded(self, lens: Lens, depth_um: Array) -> "AngleGroup":
@@ -235,13 +240,13 @@ class AngleGroup:
         return dataclasses.replace(self, index=place, shaded_parts=shaded_parts)
 
     def bent(self, residual: Array) -> "AngleGroup":
-        """With the shapes of a residual phase; groups apart have the same nodes."""
+        """With the shapes of a residual phase; shaded parts have the same nodes."""
         shaded_parts = tuple(
             dataclasses.replace(g, residual=residual) for g in self.shaded_parts
         )
         return dataclasses.replace(self, residual=residual, shaded_parts=shaded_parts)
 
-    def turning(self, name: str) -> Array | None:
+    def phase_map(self, name: str) -> Array | None:
         """(q, p) phase on the nodes for one unit of a wave-front parameter, rad.
 
         Imaginary for uneven illumination; None for any other parameter.
@@ -252,7 +257,11 @@ class AngleGroup:
             return np.asarray(
                 -0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)]
             )
-        return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
+        return (
+            np.asarray(self.phase_maps[WAVEFRONT_ERRORS[name]])
+            if name in WAVEFRONT_ERRORS
+            else None
+        )
 
 
 @dataclass(frozen=True, slots=True)
