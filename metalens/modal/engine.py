@@ -24,7 +24,7 @@ from metalens.modal.match import (
     scattering_matrix,
     zero_order,
 )
-from metalens.modal.mesh import CellMatrices, MeshPlan, assemble_disc
+from metalens.modal.mesh import MeshPlan, assemble_disc
 from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
 
 SMALL = 500  # unknowns of a symmetry class: more of the bases up to it are cached
@@ -45,14 +45,6 @@ class MeshSolution:
     energy: float
     unknowns: int
     loss: float
-
-
-@lru_cache(maxsize=4)
-def disc_geometry(rho: float, plan: MeshPlan) -> tuple[CellMatrices, CellMatrices]:
-    """Finite-element matrices of a disc ``rho`` pitches wide on the mesh of a ``plan``,
-    cached.
-    """
-    return assemble_disc(rho, plan)
 
 
 def homogeneous_basis(
@@ -79,7 +71,7 @@ def cached_basis(
     and ``bloch``.
     """
     return homogeneous_modes(
-        disc_geometry(rho, plan), plan, electric=electric, half_phase_rad=bloch or None
+        assemble_disc(rho, plan), plan, electric=electric, half_phase_rad=bloch or None
     )
 
 

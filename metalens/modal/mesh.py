@@ -295,9 +295,10 @@ def gradient_matrix(plan: MeshPlan) -> np.ndarray:
     return gradient
 
 
+@lru_cache(maxsize=6)
 def assemble_disc(rho: float, plan: MeshPlan) -> tuple[CellMatrices, CellMatrices]:
     """Finite-element matrices of the whole quarter cell and of its part inside a disc,
-    in half pitches: what a geometry costs once, for all wavelengths.
+    in half pitches: what a geometry costs once, for all wavelengths; cached.
 
     Args:
         rho: diameter over pitch. plan: of the mesh.

@@ -16,12 +16,14 @@ from metalens.modal.mesh import (
     Y1,
     CellMatrices,
     MeshPlan,
+    assemble_disc,
     build_mesh,
     gradient_matrix,
 )
 
 # half Bloch phases below it lose digits in the squared problem of the gradients
 SMALL_PHASE_RAD = 0.05
+TYPICAL = 0.5  # pitches: diameter of the disc whose mass weights the cotree
 
 
 Unknowns = tuple[np.ndarray, np.ndarray]  # places of the functions, complex weights
@@ -92,7 +94,8 @@ def symmetry_class(
 ) -> SymmetryClass:
     """Unknowns, gradient and cotree of a symmetry class; cached.
 
-    The cotree follows from QR with pivoting of the gradients.
+    The cotree follows from QR with pivoting of the gradients, weighted by the mass of a
+    typical disc.
 
     Args:
         plan: of the mesh. electric: whether the y walls are electric, else natural.
@@ -104,7 +107,9 @@ def symmetry_class(
         for wall in (mesh.vector_wall, mesh.scalar_wall)
     )
     gradient = restrict_matrix(gradient_matrix(plan), vectors, scalars)
-    pivots = sl.qr(gradient.T, mode="r", pivoting=True)[1]
+    mass = restrict_matrix(assemble_disc(TYPICAL, plan)[0].mass, vectors, vectors)
+    weighted = np.sqrt(mass.diagonal()) * gradient.T
+    pivots = sl.qr(weighted, mode="r", pivoting=True)[1]
     cotree = np.sort(pivots[gradient.shape[1] :])
     return SymmetryClass(vectors, scalars, csr_array(gradient), cotree)
 
