@@ -21,14 +21,13 @@ class ChainFiles:
     run.
 
     cell, design, process: of library, lens and mask. psf: of the PSF stack; its
-    defaults without it.
+        defaults without it.
     run: of a co-design run. bench_truth, bench_metrology: hidden errors and other
-    measurements of a virtual bench; it
-        measures the lens of the run, which is then retrained for, or without a run the
-        one of bench_design.
+        measurements of a virtual bench; it measures the lens of the run, which is then
+        retrained for, or without a run the one of bench_design.
     budget: whether the error budget is computed.
     bench_design: lens that the virtual bench measures, where it is not the run's or the
-    design's.
+        design's.
     """
 
     cell: Path
@@ -277,7 +276,7 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
         "Every site takes the printable diameter whose phase is the wanted one. A direct Rayleigh-Sommerfeld sum "
         "over all pillars then shows where the light really meets.",
         ("design", "design.toml", "-o", "lens.h5"),
-        ("max_phase_error_rad", "rad between wanted and made phase"),
+        ("max_phase_error_rad", "rad between target and assigned phase"),
         (
             (
                 "lens.png",
@@ -299,10 +298,6 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
         (
             ("psf_xz.png", "Slice through the PSF along depth."),
             ("psf_montage.png", "PSFs over depth and field angle."),
-            (
-                "psf_information.png",
-                "Axial information of Eq. 11 under three binnings.",
-            ),
             ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
         ),
     )
@@ -370,9 +365,9 @@ def _bench_stages(files: ChainFiles) -> Iterator[ChainStage]:
     if files.bench_design:
         yield ChainStage(
             "A lens for the bench",
-            "A small sister of the lens, of the same pillars, to be made wrong in hidden ways and measured.",
+            "A small sister of the lens, of the same pillars, with hidden fabrication errors, to be measured.",
             ("design", "bench_design.toml", "-o", "bench_lens.h5"),
-            ("max_phase_error_rad", "rad between wanted and made phase"),
+            ("max_phase_error_rad", "rad between target and assigned phase"),
         )
     measured = "bench_lens.h5" if files.bench_design else "run/lens.h5"
     yield ChainStage(
@@ -384,7 +379,7 @@ def _bench_stages(files: ChainFiles) -> Iterator[ChainStage]:
     )
     yield ChainStage(
         "The lens as built",
-        "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
+        "Captures to parameters with their intervals; what the frames cannot separate is said in words.",
         (
             "fit",
             "captures",

@@ -68,13 +68,12 @@ class YPolarizationTarget:
 
 @dataclass(frozen=True, slots=True)
 class AdditionalWavelength:
-    """Light beside the design's own that the same pillars are to serve.
+    """Another wavelength that the same pillars are to serve.
 
     wavelength_nm: of that light. weight: of its squared errors, against 1 of the
-    design's own wavelength.
-    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a
-    collimated beam); left out, as at the
         design's own wavelength.
+    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a
+        collimated beam); left out, as at the design's own wavelength.
     """
 
     wavelength_nm: float = field(metadata={"above": 0})
@@ -93,28 +92,25 @@ class DesignSettings:
     aperture_mm: diameter of the round aperture, up to 10.
     wavelength_nm: of the design; left out, that of a library which holds one, else 850.
     sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a
-    collimated beam).
+        collimated beam).
     library: library.h5 of the pillar cell, relative to the config; without it ``cell``
-    is swept first.
+        is swept first.
     cell: the pillar cell, where no library is given.
     limits: what the process prints.
     layers: [[layers.front]] and [[layers.behind]] with material and thickness_um, in
-    the order that the light meets
-        them: films that the phase is corrected for; the gap behind the pillars is
-            filled by the cell's cover.
+        the order that the light meets them: films that the phase is corrected for; the
+        gap behind the pillars is filled by the cell's cover.
     double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` looks for
-    a source distance of its own,
-        about the one that is given.
+        a source distance of its own, about the one that is given.
     along_y: [along_y] with profile, distances and their tables: what light polarised
-    along y is to see, where the
-        library is one over two sizes; without it the same as light along x.
+        along y is to see, where the library is one over two sizes; without it the same
+        as light along x.
     hand: of the circular light that comes, where the library is for circular light:
-    right (x + iy) or left. The phase
-        is then made by the turn of pillars of one size.
-    wavelengths: [[wavelengths]] with wavelength_nm, weight and distances: light beside
-    the design's own that the same
-        pillars are to serve, by least squares over wavelengths (an achromatic lens
-        where distances are left out).
+        right (x + iy) or left. The phase is then made by the turn of pillars of one
+        size.
+    wavelengths: [[wavelengths]] with wavelength_nm, weight and distances: further
+        wavelengths that the same pillars are to serve, by least squares over
+        wavelengths (an achromatic lens where distances are left out).
     """
 
     profile: Profile = "hyperbolic"
@@ -226,8 +222,8 @@ class Options(CommonOptions):
         skip_focus_check: do not judge place and Strehl ratio of the focus.
         accept_partial_turn: where the pillars cover less than a turn, take the nearest;
             the loss is stated.
-        own_cell: solve rows of its own unlike pillars (minutes), for efficiency, lens
-            file, PSFs, images; else rough.
+        own_cell: solve rows of its own non-identical pillars (minutes), for efficiency,
+            lens file, PSFs, images; else rough.
     """
 
     config: tyro.conf.Positional[Path]

@@ -303,7 +303,7 @@ def _notes(pillars: PillarLibrary, failures: list[str]) -> list[str]:
     stated = any(failure.startswith(_above(pillars)) for failure in failures)
     if not (pillars.converged or stated):
         notes.append(
-            f"{_above(pillars)}, which the file does not state: beside resonances as a "
+            f"{_above(pillars)}, which the file does not state: near resonances as a "
             "rule, of narrow walls and shapes without mirrors in more places"
         )
     if (
@@ -312,7 +312,7 @@ def _notes(pillars: PillarLibrary, failures: list[str]) -> list[str]:
         and not pillars.cell.alike
     ):
         notes.append(
-            "all of it for light along x: these pillars answer light along y otherwise"
+            "all of it for light along x: these pillars respond to light along y otherwise"
         )
         outline = pillars.cell.outline(float(pillars.diameter_um[-1]))
         if not (outline.keeps(-1, 1) or outline.keeps(1, -1)):

@@ -8,7 +8,7 @@ import importlib
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -21,15 +21,7 @@ from metalens.commands.design import format_place
 from metalens.core import config, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.core.report import (
-    Figure,
-    KeyFigure,
-    Section,
-    figure_png,
-    make_figure,
-    summary_table,
-    write_report,
-)
+from metalens.core.report import Figure, KeyFigure, Section, summary_table, write_report
 from metalens.core.store import Provenance, write_bytes
 from metalens.lens import reach
 from metalens.optics import Layers
@@ -37,7 +29,6 @@ from metalens.psf import export as psf_export
 from metalens.psf import spectrum as spectra
 
 MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
-PIXEL_UM = 3.0  # of a camera, on which axial information is shown
 AIRY = 28.0  # width of a window in units of wavelength / NA
 
 
@@ -45,49 +36,43 @@ AIRY = 28.0  # width of a window in units of wavelength / NA
 class PsfSettings:
     """What is computed; kept in the file.
 
-    depths_mm: nearest and farthest source, and the largest step between depths; left
-    out: infinity for a lens for collimated light, else 21 depths, its focus among them,
-    over which the rim
-        of this lens goes from 1.75 waves out of focus on one side to as many on the
-        other.
+    depths_mm: nearest and farthest source, and the largest step between depths. Left
+        out, infinity for a lens for collimated light, else 21 depths, its focus among
+        them, over which the rim of this lens goes from 1.75 waves out of focus on one
+        side to as many on the other.
     sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
     angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the
-    image of a positive angle lies
-        at +x; left out: 0 and the half field over which a hyperbolic lens of this focus
-        is diffraction-limited (Strehl ratio 0.8), or the angles that a lens was
-        measured at. angles_y_deg: along y (down), one for each or none for 0.
+        image of a positive angle lies at +x; left out: 0 and the half field over which
+        a hyperbolic lens of this focus is diffraction-limited (Strehl ratio 0.8), or
+        the angles that a lens was measured at. angles_y_deg: along y (down), one for
+        each or none for 0.
     window_um, samples: full width along x of the window that follows the chief ray, and
-    samples along it; without a
-        width 28 wavelength / NA, or 8 blur radii at the worst depth where that is more.
+        samples along it; without a width 28 wavelength / NA, or 8 blur radii at the
+        worst depth where that is more.
     height_um: its height, of samples as far apart; 0 for a square window.
     offset_um: [x, y] from the chief ray to the window's middle.
     source_um: full size of an incoherent source: diameter of a disc, side of a square,
-    full width at half maximum of a
-        gaussian; 0 for a point. source_deg: the same as an angle, for sources at
-        infinity too.
+        full width at half maximum of a gaussian; 0 for a point. source_deg: the same as
+        an angle, for sources at infinity too.
     source_shape: disc, square or gaussian.
     led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
     spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose
-    product is the spectrum (LED,
-        filter, sensor).
+        product is the spectrum (LED, filter, sensor).
     wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add.
     weights: of each; none for equal.
     tolerance: relative L2 error of the PSFs.
     polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in
-    NA), ``flux`` (that of both
-        polarisations, which a pixel counts), ``vector`` (Ex, Ey, Ez of both, squares
-        added), or ``auto``: the scalar
-        where its distance to the flux is below the tolerance, else the flux.
+        NA), ``flux`` (that of both polarisations, which a pixel counts), ``vector``
+        (Ex, Ey, Ez of both, squares added), or ``auto``: the scalar where its distance
+        to the flux is below the tolerance, else the flux.
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
     light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean
-    of the two, where they are
-        focused from and to the same distances (any light, for other lenses).
+        of the two, where they are focused from and to the same distances (any light,
+        for other lenses).
     own_cell: solve rows of non-identical pillars of the lens's own cell (seconds to
-    minutes): the PSFs then
-        hold the factor of those neighbours, the error budget what is left. A lens of
-        ``design --own-cell`` holds its
-        rows. Without either, pillars are taken one by one, and that term is rough,
-        of the default cell.
+        minutes): the PSFs then hold the factor of those neighbours, the error budget
+        what is left. A lens of ``design --own-cell`` holds its rows. Without either,
+        pillars are taken one by one, and that term is rough, of the default cell.
     """
 
     depths_mm: tuple[float, float, float] | None = None
@@ -339,8 +324,9 @@ class ComputedPsfs:
     scan: "psf.FocusScan | None" = None
 
 
-# by kind of file, the module whose ``load`` gives an :class:`AsBuiltSource`; filled by
-# the command line
+# by kind of file, the module whose ``load`` gives an as-built lens: its ``design``, the
+# (n, 2) field angles ``angle_rad`` of its captures, ``psf_stack(view, tolerance=)`` and
+# their relative L2 error ``psf_posterior(view)``; filled by the command line
 SOURCES: dict[str, str] = {}
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
@@ -349,7 +335,6 @@ CAPTIONS = {
     "and the share of the window's light inside a circle.",
     "zscan": "Irradiance along x on planes behind the lens for light along the axis, and its peak and width over the "
     "plane's shift from the sensor.",
-    "information": "Axial information I(z) of Eq. 11 under three binnings, mean over 9 sub-pixel positions.",
 }
 
 
@@ -527,25 +512,7 @@ def _run_far_field(options: Options) -> int:
     )
 
 
-class AsBuiltSource(Protocol):
-    """A lens that was made, with the PSFs of what was made."""
-
-    @property
-    def design(self) -> lens.Lens:
-        """What was to be made."""
-
-    @property
-    def angle_rad(self) -> Array:
-        """(n, 2) field angles of the captures."""
-
-    def psf_stack(self, view: "psf.View", *, tolerance: float) -> "psf.PsfStack":
-        """PSFs (angle, depth, y, x)."""
-
-    def psf_posterior(self, view: "psf.View") -> float:
-        """Relative L2 error of the PSFs by what the captures leave open."""
-
-
-def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
+def _read(path: Path) -> tuple[lens.Lens, Any]:
     """The design in a file, and the as-built lens where the file is of such a kind.
 
     :data:`SOURCES` names the kinds; None for a design.
@@ -553,12 +520,12 @@ def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
     kind = store.kind_of(path)
     if kind not in SOURCES:
         return lens.load(path), None
-    source: AsBuiltSource = importlib.import_module(SOURCES[kind]).load(path)
-    return source.design, source
+    built = importlib.import_module(SOURCES[kind]).load(path)
+    return built.design, built
 
 
 def _compute(
-    path: Path, settings: PsfSettings, device: lens.Lens, built: AsBuiltSource | None
+    path: Path, settings: PsfSettings, device: lens.Lens, built: Any
 ) -> ComputedPsfs:
     """PSFs, figures of the sharpest depth of every angle, and a scan along z.
 
@@ -613,9 +580,6 @@ def _write(path: Path, computed: ComputedPsfs, *, page: bool) -> None:
         key=lambda limit: limit.cutoff_per_um,
     )
     pictures = psf_plots.psf_pictures(computed.stack, limit=limit, scan=computed.scan)
-    depths = computed.stack.depths_um
-    if len(depths) > 1 and np.isfinite(depths).all() and np.diff(depths).all():
-        pictures["information"] = plot_information(computed.stack)
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
     if page:
@@ -638,46 +602,7 @@ def _write(path: Path, computed: ComputedPsfs, *, page: bool) -> None:
         )
 
 
-def plot_information(stack: psf.PsfStack) -> bytes:
-    """PNG of the axial information I(z) of Eq. 11 over depth, in the L2 normalisation.
-
-    Pixels of 3 µm (three samples, if that is more), binned 1, 2 and 3 times; the first
-    and last field angle. Information between neighbouring depths is divided by the
-    squared step in mm.
-
-    Args:
-        stack: PSFs over angle, depth and wavelength.
-    """
-    import torch
-
-    from metalens import fisher
-
-    light = torch.as_tensor(stack.intensity).double()
-    light = light.reshape(len(stack.angles_rad), *light.shape[-3:])
-    pitch = max(PIXEL_UM, 3 * stack.step_um)
-    middle_mm = (stack.depths_um[1:] + stack.depths_um[:-1]) / 2e3
-    figure, panel = make_figure(1, 1, size=(5.5, 3.6))
-    for bins in (1, 2, 3):
-        value = fisher.axial_information(
-            light[:, :-1],
-            light[:, 1:],
-            step_um=1e3,
-            sample_um=stack.step_um,
-            pixel_um=pitch * bins,
-            normalisation="l2",
-        )
-        for i in sorted({0, len(value) - 1}):
-            x, y = np.rad2deg(stack.angles_rad[i])
-            label = f"{bins}×{bins}, ({x:.3g}°, {y:.3g}°)"
-            curve = value[i].numpy() / (np.diff(stack.depths_um) * 1e-3) ** 2
-            line = "-" if i == 0 else "--"
-            panel.plot(middle_mm, curve, line, color=f"C{bins}", label=label)
-    panel.set(xlabel="source depth / mm", ylabel="I(z) / mm⁻²", ylim=(0, None))
-    panel.legend(fontsize=7, title=f"bins of {pitch:g} µm pixels", title_fontsize=7)
-    return figure_png(figure)
-
-
-def _of_built(path: Path, settings: PsfSettings, built: AsBuiltSource) -> psf.PsfStack:
+def _of_built(path: Path, settings: PsfSettings, built: Any) -> psf.PsfStack:
     """PSFs of an as-built lens, with the posterior of its fit in their error.
 
     Args:

@@ -3,6 +3,7 @@ nearest one.
 """
 
 import dataclasses
+import json
 import math
 import re
 import reprlib
@@ -503,15 +504,6 @@ def _dump(record: Any, prefix: str, lines: list[str]) -> None:
             _dump(entry, f"{prefix}{key}.", lines)
 
 
-def _escaped(c: str) -> str:
-    """A character as written inside a TOML string."""
-    if c in '\\"':
-        return "\\" + c
-    if c == "\n":
-        return "\\n"
-    return c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}"
-
-
 def _text(value: Any) -> str:
     """A plain value in TOML."""
     if hasattr(value, "item"):  # a scalar of NumPy
@@ -521,5 +513,6 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(_text(v) for v in value) + "]"
     if isinstance(value, str | Path):
-        return '"' + "".join(_escaped(c) for c in str(value)) + '"'
+        # strings of JSON are strings of TOML, but for the control character 7f
+        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

@@ -425,10 +425,10 @@ class CommandConsole:
         Returns:
             The exit status of the command: 1 with a failure, else 0.
         """
-        told = [note.strip() for note in notes if note]
-        lines = [title, *format_summary(values), *(f"  {note}" for note in told)]
+        sentences = [note.strip() for note in notes if note]
+        lines = [title, *format_summary(values), *(f"  {s}" for s in sentences)]
         text = "\n".join(lines)
-        return self.judged({**values, "notes": told}, text, failures)
+        return self.judged({**values, "notes": sentences}, text, failures)
 
     def result(self, values: dict[str, Any], text: str) -> None:
         """Print the outcome: ``values`` as JSON with --json, else ``text``.

@@ -227,11 +227,8 @@ def _resolve_link(target: Path) -> Path:
 
 @contextlib.contextmanager
 def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path]:
-    """Context that locks an output and gives an empty scratch folder next to it,
-    removed at the end.
-
-    Folders above the output that were created here are removed again on failure, where
-    they are empty.
+    """Context that locks an output and gives an empty scratch folder ``.NAME.new`` next
+    to it, removed at the end.
 
     Args:
         target: the output.
@@ -249,9 +246,6 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
         raise OutputError(
             f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work"
         )
-    new_parents = [
-        folder for folder in target.parents if not folder.exists()
-    ] * terms.parents
     if terms.parents:
         target.parent.mkdir(parents=True, exist_ok=True)
     if not target.parent.is_dir():
@@ -261,26 +255,6 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
             else "does not exist; make it or give"
         )
         raise OutputError(f"{target}: folder {target.parent} {problem} another name")
-    try:
-        with _scratch(target) as scratch:
-            yield scratch
-    except BaseException as error:
-        for folder in new_parents:  # only empty ones can be removed
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-        if isinstance(error, OSError) and error.filename is None:  # a full disk
-            error.add_note(f"{target} could not be made")
-        raise
-
-
-@contextlib.contextmanager
-def _scratch(target: Path) -> Iterator[Path]:
-    """Context of the locked output's scratch folder ``.NAME.new``, emptied at the start
-    and removed at the end.
-
-    Raises:
-        OutputError: the folder of the output cannot be written.
-    """
     scratch = target.with_name(f".{target.name}.new")
     with contextlib.ExitStack() as stack:
         try:
@@ -293,7 +267,12 @@ def _scratch(target: Path) -> Iterator[Path]:
                 f"{target}: its folder cannot be written ({error.strerror}); give another"
             ) from error
         stack.callback(shutil.rmtree, scratch, ignore_errors=True)
-        yield scratch
+        try:
+            yield scratch
+        except OSError as error:
+            if error.filename is None:  # a full disk
+                error.add_note(f"{target} could not be made")
+            raise
 
 
 def _refuse(

@@ -1,4 +1,4 @@
-"""A wanted phase made of pillars, and the check that it focuses."""
+"""Target phases, their assignment to pillars, and the check of the focus."""
 
 import lazy_loader
 

@@ -22,11 +22,10 @@ from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.design.sites import LatticeSites, PhaseOf, lattice_sites, least_period_um
 from metalens.lens import HANDS, DiameterMap, Hand, Lens, TwoSizeTable
 from metalens.library import GeometricPhase, PillarLibrary, Proxy, height_hint
-from metalens.library.axes import AxesLibrary, cell_of_sizes
+from metalens.library.axes import AxesLibrary
 
 EDGE_UM = 2e-3  # a proxy that ends this near a printable limit is ended by the process
 _STEP_RAD = 0.05  # phase step between tabulated diameters (parabolic interpolation)
-_GAPS = 12  # grid of sizes along each axis for the gaps of oblique pillars
 
 # target phases (channels, sites) -> (maps (k, sites), [(phase, |t|) of each channel])
 _Choice = Callable[
@@ -689,29 +688,23 @@ def _table_sizes(
 def _is_printable(library: AxesLibrary, limits: Limits) -> Array:
     """(m, n) whether the process prints a pillar of sizes x, y next to an equal one.
 
-    For upright pillars on a rectangular lattice the gap is the period less the size.
-    Otherwise gaps are computed on a coarse grid of sizes; a pair takes the gap of the
-    next larger grid point.
+    The gap is that between the boxes, along the axes, that hold two neighbours. It is
+    exact for upright rectangles on a rectangular lattice, and a lower bound otherwise.
 
     Args:
         library: m sizes along x, n along y, and the cell.
         limits: least diameter and gap of the process.
     """
-    x, y, cell = library.x_um, library.y_um, library.cell
-    wide = np.minimum(x[:, None], y) >= limits.min_diameter_nm * 1e-3 - 1e-9
-    least_gap = limits.min_gap_nm * 1e-3
-    quarters = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
-    if cell.lattice.kind != "hexagonal" and quarters % 1 == 0:
-        px, py = cell.lattice.periods_um(cell.pitch_um)[:: -1 if quarters % 2 else 1]
-        gap = np.minimum(px - x[:, None], py - y)
-        return np.asarray(wide & (gap >= least_gap - 1e-9))
-    grid = [np.linspace(v[0], v[-1], _GAPS) for v in (x, y)]
-    gaps = [[cell_of_sizes(cell, a, b).gap_um(a) for b in grid[1]] for a in grid[0]]
-    row, column = (
-        np.minimum(np.searchsorted(nodes, v), _GAPS - 1)
-        for nodes, v in zip(grid, (x, y), strict=True)
-    )
-    return np.asarray(wide & (np.array(gaps)[row[:, None], column] >= least_gap))
+    x, y, cell = library.x_um[:, None], library.y_um, library.cell
+    angle_rad = getattr(cell.shape, "angle_rad", 0.0)
+    c, s = abs(math.cos(angle_rad)), abs(math.sin(angle_rad))
+    width, height = c * x + s * y, s * x + c * y
+    gaps = [
+        np.maximum(abs(dx) - width, abs(dy) - height)
+        for dx, dy in cell.lattice.steps_um(cell.pitch_um)
+    ]
+    wide = np.minimum(x, y) >= limits.min_diameter_nm * 1e-3 - 1e-9
+    return np.asarray(wide & (np.min(gaps, axis=0) >= limits.min_gap_nm * 1e-3 - 1e-9))
 
 
 def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:

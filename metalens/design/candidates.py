@@ -93,7 +93,8 @@ class CandidateTable:
             phases_rad: (channels, sites) wanted phases of a sample of sites.
         """
         count = 1 if self.common_piston else len(self.t)
-        results = [self._converged(phases_rad, start) for start in _starts(count)]
+        starts = np.random.default_rng(0).uniform(0, 2 * np.pi, (_STARTS, count))
+        results = [self._converged(phases_rad, start) for start in starts]
         return min(results, key=lambda result: result[0])[1]
 
     def _converged(self, phases: Array, start: Array) -> tuple[float, Array]:
@@ -129,18 +130,3 @@ def _vertices(sums: Array) -> Array:
     bend = before - 2 * here + after
     off = (before - after) / (2 * np.maximum(bend, 1e-30))
     return np.asarray(inner + np.where((best == inner) & (bend > 0), off, best - inner))
-
-
-def _starts(count: int) -> Array:
-    """(16, count) pistons spread evenly over all turns, rad.
-
-    Additive recurrence of the roots of x^(n+1) = x + 1 (M. Roberts, 2018).
-
-    Args:
-        count: pistons of one start.
-    """
-    root = 2.0
-    for _ in range(50):
-        root = (1 + root) ** (1 / (count + 1))
-    steps = root ** -np.arange(1.0, count + 1)
-    return np.asarray(2 * np.pi * (np.arange(_STARTS)[:, None] * steps % 1))

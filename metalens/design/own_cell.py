@@ -24,14 +24,12 @@ class NeighbourCouplingLoss:
     """Focus power lost to coupling between non-identical neighbours, against the
     locally periodic approximation.
 
-    share: of that power. error: estimate of its error. pillars: in the rows along the
-    lattice that were solved; none:
-    rough.
+    share: of that power.
+    error: estimate of its error.
     """
 
     share: float
     error: float
-    pillars: tuple[int, ...] = ()
 
 
 def solve_coupling_rows(lens: Lens) -> NeighbourRows:
@@ -66,8 +64,8 @@ def neighbour_coupling_loss(lens: Lens) -> NeighbourCouplingLoss:
     sine s, with the coupling factor c of the rows.
 
     Accuracy: the change by another truncation, plus that by leaving out any one row,
-    plus
-        a fifth of the loss for zones that shorten from one to the next, as in no row.
+        plus a fifth of the loss for zones that shorten from one to the next, as in no
+        row.
 
     Args:
         lens: the lens; rows that it holds are not solved again.
@@ -83,12 +81,7 @@ def neighbour_coupling_loss(lens: Lens) -> NeighbourCouplingLoss:
     error = truncation + max(
         (abs(other_share - share) for other_share in reduced), default=0.0
     )
-    pitches = lens.wavelength_um / (rows.sine[~rows.diagonal] * lens.cell.pitch_um)
-    return NeighbourCouplingLoss(
-        share,
-        error + CURVED * abs(1 - share),
-        tuple(np.rint(pitches).astype(int).tolist()),
-    )
+    return NeighbourCouplingLoss(share, error + CURVED * abs(1 - share))
 
 
 def estimate_neighbour_coupling_loss(lens: Lens) -> NeighbourCouplingLoss:

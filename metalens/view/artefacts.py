@@ -346,9 +346,7 @@ def _degrees(pair: Array) -> str:
 
 
 def plain_panels(path: Path) -> list[Panel]:
-    """Arrays of any artefact as images or curves, and its attributes as a table.
-
-    Images for arrays of 8 by 8 or more, curves for (n,) of 8 or more.
+    """Arrays of any artefact of 8 by 8 or more as images, and its content as a table.
 
     Args:
         path: of the artefact.
@@ -375,12 +373,6 @@ def plain_panels(path: Path) -> list[Panel]:
                     1.0,
                     signed=bool(array.min() < 0),
                     across="samples",
-                )
-            )
-        elif array.ndim == 1 and len(array) >= 8:
-            panels.append(
-                CurvePanel(
-                    name, np.arange(len(array)), "index", {name: _finite(array)}, ""
                 )
             )
     rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]

@@ -165,7 +165,7 @@ class DrawingPanel:
 @dataclass(frozen=True, eq=False, slots=True)
 class PointPanel:
     """Points that can be picked, by a click or with the arrow keys; what is known of
-    the picked one is told.
+    the picked one is shown.
 
     x, y: (n,) finite. groups: (n,) name of each, which gives its colour. front: places
     of the points that a stepped

@@ -252,7 +252,7 @@ class FisherPhase:
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """What the best phase has most of: energy kept first, then mean information."""
+        """Sort key of designs: encircled energy kept, then mean information."""
         return self.converged, float(self.score.information.mean())
 
     @property

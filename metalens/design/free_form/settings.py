@@ -17,34 +17,29 @@ class FisherSettings:
     """What a Fisher-designed lens is asked for.
 
     objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets
-    of eyes).
+        of eyes).
     depths_mm: range of the source; left out, from 1.75 waves out of focus at the rim on
-    one side of the design's source
-        distance to as many on the other.
+        one side of the design's source distance to as many on the other.
     angles_deg: field angles that the lens is made for, each in every direction; the
-    energy is held at all of them, and
-        the information of each counts equally.
+        energy is held at all of them, and the information of each counts equally.
     pixel_um: pixels that the information is read with: the sensor's pitch, or 2 or 3
-    times it for 2 x 2 or 3 x 3
-        binning; left out, 0.88 wavelength / NA.
+        times it for 2 x 2 or 3 x 3 binning; left out, 0.88 wavelength / NA.
     encircled: least share of the light inside ``radius_um`` of the axis, at every
-    depth; 0 leaves it free.
+        depth; 0 leaves it free.
     radius_um: left out, 5.3 wavelength / NA.
     focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread
-    between them. Left out, the
-        middle two fifths of the depths, in 1/z.
+        between them. Left out, the middle two fifths of the depths, in 1/z.
     grids: control points across the aperture, stage by stage; 0 as the last for one
-    free value a node of the pupil
-        (cells of about 6 um), which sends light away best where the energy allows it.
+        free value a node of the pupil (cells of about 6 um), which sends light away
+        best where the energy allows it.
     iterations: of all stages, shared in proportion to their grids. starts: tried.
     zones: rings of the double helix that the starts begin from, in turn; 0 for none.
     spread_rad: deviation of the random start (a tenth of it on a double helix).
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
-    0 the logarithm of its mean.
+        0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
     scenes: of the objective of that name. orthogonality: its weight lambda in Eq. 6, of
-    the squared cosine of the
-        span angle.
+        the squared cosine of the span angle.
     """
 
     objective: Literal["axial", "scenes"] = "axial"

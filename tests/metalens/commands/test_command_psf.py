@@ -83,7 +83,7 @@ def test_command_writes_stack_pictures_and_report(folder, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["converged"]
     assert said["error"] <= 1e-4
-    for name in ("xz", "montage", "mtf", "information"):
+    for name in ("xz", "montage", "mtf"):
         assert (folder / f"psf_{name}.png").read_bytes()[:4] == b"\x89PNG"
     assert "Point spread functions" in (folder / "psf.html").read_text()
     stack = psf.load(folder / "psf.h5")

@@ -189,7 +189,6 @@ def test_a_lens_for_collimated_light_is_looked_at_from_infinity(saved, capsys):
     assert (folder / "p_zscan.png").exists()
     assert (folder / "p_montage.png").exists()
     assert not (folder / "p_xz.png").exists()
-    assert not (folder / "p_information.png").exists()
 
 
 def test_planes_behind_the_lens_are_those_of_a_plain_sum():
