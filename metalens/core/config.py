@@ -36,9 +36,8 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
 
     A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its
     field says otherwise: ``signed`` (or not), ``above`` (more than that), ``most``,
-    ``may_be_inf``. A list or name has entries unless its default is empty or
-    ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses is
-    reported with file and key.
+    ``may_be_inf``. A list or name has entries unless its default is empty. A seed is
+    any whole number from 0. What a record itself refuses is reported with file and key.
 
     Args:
         path: of the file.
@@ -261,14 +260,8 @@ def _check_range(
         key: its full name in errors.
     """
     limits = field.metadata
-    may_be_empty = (
-        field.metadata.get("may_be_empty")
-        or field.default in ("", ())
-        or _factory_default(field) == ()
-    )
-    if (value in ((), "") and not may_be_empty) or (
-        isinstance(value, Path) and not value.name
-    ):
+    nameless = isinstance(value, Path) and not value.name
+    if nameless or (value in ((), "") and field.default not in ((), "")):
         raise ConfigError(
             f"{where}: {key} is empty, need {'entries' if value == () else 'a name'}"
         )
@@ -300,15 +293,6 @@ def _check_sign(
             raise ConfigError(
                 f"{where}: {key} is {value}, need more than {limits['above']}"
             )
-
-
-def _factory_default(field: dataclasses.Field[Any]) -> Any:
-    """The value of a field's default factory; None without one."""
-    return (
-        None
-        if field.default_factory is dataclasses.MISSING
-        else field.default_factory()
-    )
 
 
 def _numbers(value: Any) -> Iterator[int | float]:
@@ -352,19 +336,13 @@ def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
     return _convert_scalar(value, hint, where, key)
 
 
-def _kinds(options: tuple[Any, ...]) -> dict[str, Any]:
-    """{kind: record} of a union of records that each have a literal ``kind``; empty for
-    any other union.
-    """
-    records: dict[str, Any] = {}
-    for option in options:
-        kind = dataclasses.is_dataclass(option) and typing.get_type_hints(option).get(
-            "kind"
-        )
-        if not kind or typing.get_origin(kind) is not typing.Literal:
-            return {}
-        records |= dict.fromkeys(typing.get_args(kind), option)
-    return records
+def _kinds(records: list[Any]) -> dict[str, Any]:
+    """{kind: record} of records that each have a literal ``kind``."""
+    kinds: dict[str, Any] = {}
+    for record in records:
+        kind = typing.get_type_hints(record).get("kind")
+        kinds |= dict.fromkeys(typing.get_args(kind), record)
+    return kinds
 
 
 def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -> Any:
@@ -379,24 +357,20 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
         where: file or place that errors name.
         key: its full name in errors.
     """
-    kinds = _kinds(options)
-    if kinds and isinstance(value, dict):
+    records = [option for option in options if dataclasses.is_dataclass(option)]
+    if isinstance(value, dict) and records:
+        kinds = _kinds(records)
         kind = value.get("kind")
-        if not isinstance(kind, str) or kind not in kinds:
+        if kinds and (not isinstance(kind, str) or kind not in kinds):
             raise ConfigError(
                 f"{where}: {key}.kind is {_shown(kind)}{nearest_name_hint(_shown(kind), kinds)}"
             )
-        return _convert(value, kinds[kind], where, key)
-    errors = []
-    records = [option for option in options if dataclasses.is_dataclass(option)]
-    if isinstance(value, dict) and len(records) > 1:
-        matching_keys = [
-            len(value.keys() & {f.name for f in dataclasses.fields(option)})
-            for option in records
+        known = [
+            value.keys() & {f.name for f in dataclasses.fields(r)} for r in records
         ]
-        return _convert(
-            value, records[matching_keys.index(max(matching_keys))], where, key
-        )
+        most = records[max(range(len(records)), key=lambda i: len(known[i]))]
+        return _convert(value, kinds.get(kind, most), where, key)
+    errors = []
     for option in options:
         if option is type(None):
             continue
