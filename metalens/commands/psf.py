@@ -622,7 +622,7 @@ def _of_built(path: Path, settings: PsfSettings, built: Any) -> psf.PsfStack:
     if settings.polarisation in ("flux", "vector"):
         stated = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
         raise ConfigError(f"{path}: {stated}")
-    stack = built.psf_stack(settings.view, tolerance=settings.tolerance)
+    stack: psf.PsfStack = built.psf_stack(settings.view, tolerance=settings.tolerance)
     posterior = built.psf_posterior(settings.view)
     budget = replace(stack.budget, posterior=posterior)
     return replace(

@@ -369,7 +369,7 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
             value.keys() & {f.name for f in dataclasses.fields(r)} for r in records
         ]
         most = records[max(range(len(records)), key=lambda i: len(known[i]))]
-        return _convert(value, kinds.get(kind, most), where, key)
+        return _convert(value, kinds.get(str(kind), most), where, key)
     errors = []
     for option in options:
         if option is type(None):
