@@ -38,7 +38,7 @@ class Options(CommonOptions):
     """Options of ``metalens view``.
 
     Attributes:
-        file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the
+        file: library.h5, lens.h5, psf.h5, asbuilt.h5 and most other HDF5 files of the
             toolchain; a mask (GDSII or OASIS);
             or the folder of a mask, of captures or of a co-design run.
         output: the page to write; by default the file's name with .html, beside it, or
@@ -122,15 +122,18 @@ def _about(path: Path) -> dict[str, object]:
 def panels_of(kind: str) -> Callable[[Path], list[Panel]]:
     """The function that makes the panels of a kind of artefact from its path.
 
-    Kinds without their own are shown by arrays and attributes.
-
     Args:
         kind: as :func:`kind_of` gives it.
+
+    Raises:
+        ConfigError: a kind without a page.
     """
-    module, _, function = VIEWS.get(kind, "").partition(":")
-    if not module:
-        module = "metalens.view.artefacts"
-        function = OWN.get(kind, "plain_panels")
+    if kind not in VIEWS and kind not in OWN:
+        raise ConfigError(
+            f"no page shows files of kind {kind!r}; metalens info lists what they hold"
+        )
+    where = VIEWS.get(kind) or f"metalens.view.artefacts:{OWN[kind]}"
+    module, _, function = where.partition(":")
     make_panels: Callable[[Path], list[Panel]] = getattr(
         importlib.import_module(module), function
     )

@@ -327,10 +327,15 @@ def summary_table(values: Mapping[str, Any], caption: str = "") -> Table:
 
 
 def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of text of rows of cells, each column as wide as its widest cell."""
-    columns = itertools.zip_longest(*rows, fillvalue="")
+    """Lines of text of ``rows`` of cells, each column as wide as its widest cell.
+
+    The last cell of a row takes no part in the width of its column.
+    """
+    columns = itertools.zip_longest(*(row[:-1] for row in rows), fillvalue="")
     widths = [max(map(len, column)) for column in columns]
-    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return [
+        "  ".join([*map(str.ljust, row[:-1], widths), row[-1]]).rstrip() for row in rows
+    ]
 
 
 def _finite(value: Any) -> Any:

@@ -1,11 +1,8 @@
-"""Panels of the artefacts of the optics core: library, lens, PSF stack; and of any
-other HDF5 artefact, plainly.
-"""
+"""Panels of the artefacts of the optics core: library, lens, PSFs, far and near field."""
 
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -343,50 +340,3 @@ def near_field_panels(path: Path) -> list[Panel]:
 def _degrees(pair: Array) -> str:
     x, y = pair
     return f"{x:.3g}, {y:.3g} deg"
-
-
-def plain_panels(path: Path) -> list[Panel]:
-    """Arrays of any artefact of 8 by 8 or more as images, and its content as a table.
-
-    Args:
-        path: of the artefact.
-    """
-    stored = store.load(path)
-    panels: list[Panel] = []
-    for name, array in sorted(stored.arrays.items()):
-        if (
-            array.dtype.kind not in "fiu"
-            or array.size == 0
-            or array.size > MOST_SAMPLES
-        ):
-            continue
-        if array.ndim >= 2 and min(array.shape[-2:]) >= 8:
-            axes = [
-                SliderAxis(f"axis {i}", list(range(n)))
-                for i, n in enumerate(array.shape[:-2])
-            ]
-            panels.append(
-                ImagePanel(
-                    name,
-                    _finite(array),
-                    axes,
-                    1.0,
-                    signed=bool(array.min() < 0),
-                    across="samples",
-                )
-            )
-    rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]
-    rows += [
-        (name, f"{a.dtype} {tuple(a.shape)}")
-        for name, a in sorted(stored.arrays.items())
-    ]
-    return [*panels, TablePanel("Content", ("name", "value"), rows)]
-
-
-def _finite(array: Array) -> Array:
-    return np.asarray(np.nan_to_num(np.asarray(array, float)))
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) < 200 else text[:197] + "..."
