@@ -281,7 +281,7 @@ def format_summary(values: Mapping[str, Any], indent: str = "  ") -> list[str]:
     >>> print("\n".join(format_summary(values)))
       fwhm / µm  1.25
       focus
-        ok       yes   no
+        ok       yes  no
     """
     return [indent + line for line in align_columns(list(summary_rows(values)))]
 
