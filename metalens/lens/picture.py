@@ -113,10 +113,12 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
         else values[rows, columns][has_pillar]
         for values in (d.diameter_um, d.length_um, d.angle_rad)
     )
-    outlines = [
-        _outline(lens, *pillar)
-        for pillar in zip(size, length, turn, x[has_pillar], y[has_pillar], strict=True)
-    ]
+    outlines = []
+    pillars = np.column_stack([size, length, turn, x[has_pillar], y[has_pillar]])
+    for along_x, along_y, turn_rad, *place_um in pillars.tolist():
+        cell = cell_of_sizes(lens.cell, along_x, along_y) if along_y else lens.cell
+        corners = rotate_corners(cell.outline(along_x).line(32), turn_rad)
+        outlines.append(corners + place_um)
     collection = PolyCollection(outlines, cmap="viridis")
     collection.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
     axes.add_collection(collection)
@@ -130,31 +132,3 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     label = "size along x / nm" if d.angle_rad is None else "turn / deg"
     figure.colorbar(collection, ax=axes, label=label, shrink=0.85)
     axes.grid(visible=False)
-
-
-def _outline(
-    lens: Lens,
-    size_um: float,
-    length_um: float,
-    turn_rad: float,
-    x_um: float,
-    y_um: float,
-) -> Array:
-    """(n, 2) corners of one pillar at its place, um.
-
-    Args:
-        lens: whose cell gives the shape.
-        size_um: along x.
-        length_um: along y where it has two sizes, else 0.
-        turn_rad: in the plane.
-        x_um: of its centre.
-        y_um: of its centre.
-    """
-    cell = (
-        cell_of_sizes(lens.cell, float(size_um), float(length_um))
-        if length_um
-        else lens.cell
-    )
-    corners = cell.outline(float(size_um)).line(32)
-    placed: Array = rotate_corners(corners, float(turn_rad)) + np.array([x_um, y_um])
-    return placed

@@ -56,31 +56,6 @@ def solve_to_tolerance(
     return functools.partial(_solve, engine, cell, light, {"tolerance": tolerance})
 
 
-def solver_at_fixed_discretization(
-    cell: Cell,
-    light: Incidence,
-    span_um: tuple[float, float],
-    *,
-    tolerance: float,
-    engine: str,
-) -> Callable[[float], Response]:
-    """Solver of the response at a diameter, on one discretisation for all diameters of
-    ``span_um`` where possible.
-
-    See :func:`solvers_at_common_discretization`.
-
-    Args:
-        cell: unit cell with its materials, shape and lattice.
-        light: plane wave that comes.
-        span_um: (least, largest) size, um.
-        tolerance: error of t that is asked for.
-        engine: auto, rcwa or modal.
-    """
-    return solvers_at_common_discretization(
-        cell, [light], span_um, tolerance=tolerance, engine=engine
-    )[0]
-
-
 def solvers_at_common_discretization(
     cell: Cell,
     lights: Sequence[Incidence],
@@ -146,7 +121,7 @@ def has_upright_walls(cell: Cell, engine: str) -> bool:
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`solver_at_fixed_discretization` took its finest discretisation: a
+    """Whether :func:`solvers_at_common_discretization` took the finest one: a
     single solve of a pillar is then no better.
 
     Args:

@@ -181,20 +181,20 @@ def solve_rotations(
     check_geometric_phase(cell, size_um)
     period = period_rad(cell)
     angles = np.arange(STEPS + 1) / (2 * STEPS) * period
-    solutions = []
-    for angle in angles.tolist():
-        shape = dataclasses.replace(cell.shape, angle_rad=angle)
-        solutions.append(
-            jones(
-                dataclasses.replace(cell, shape=shape),
-                size_um,
-                wavelength_um,
-                tolerance=tolerance,
-            )
+    shapes = [dataclasses.replace(cell.shape, angle_rad=a) for a in angles.tolist()]
+    solutions = [
+        jones(
+            dataclasses.replace(cell, shape=shape),
+            size_um,
+            wavelength_um,
+            tolerance=tolerance,
         )
-    t = np.array([solution.t for solution in solutions])
-    error = np.array([solution.t_error for solution in solutions])
-    earlier = np.array([solution.earlier for solution in solutions])
+        for shape in shapes
+    ]
+    t, error, earlier = (
+        np.array([getattr(solution, name) for solution in solutions])
+        for name in ("t", "t_error", "earlier")
+    )
     mirrored = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
     return GeometricPhase(
         size_um,

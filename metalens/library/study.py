@@ -279,10 +279,16 @@ def study_markdown(
         verdicts: of all its cells.
         command: that wrote the page, shown in it.
     """
+    cell = study.at(study.pitches_um[0], study.heights_um[0])
+    pillar, substrate, cover = map(
+        material_name, (cell.pillar, cell.substrate, cell.cover)
+    )
     lines = [
         "# Cell study",
         "",
-        f"{_subject(study)}. Printable: {_limits(study)}. Each entry is the phase, in turns, "
+        f"Pillars of {pillar} on {substrate} under {cover}: {cell.described}. Printable: nothing solid narrower than "
+        f"{1e3 * study.min_diameter_um:.4g} nm, no gap, hole or hollow narrower than {1e3 * study.min_gap_um:.4g} nm. "
+        "Each entry is the phase, in turns, "
         "that the longest stretch of diameters covers on which the phase rises, |t| >= "
         f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
         "in brackets the mean |t|² over it. **Bold**: a full turn.",
@@ -321,24 +327,6 @@ def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
         f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
         f"largest of {worst.error:.2g} ({place})"
     )
-
-
-def _subject(study: CellStudy) -> str:
-    """The pillars of the study with their materials, in words."""
-    if study.cell is None:
-        return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
-    substrate = material_name(study.cell.substrate)
-    cover = material_name(study.cell.cover)
-    return f"Pillars of {material_name(study.material)} on {substrate} under {cover}: {study.cell.described}"
-
-
-def _limits(study: CellStudy) -> str:
-    """The printable sizes, in words."""
-    least = f"{1e3 * study.min_diameter_um:.4g} nm"
-    gap = f"{1e3 * study.min_gap_um:.4g} nm"
-    if study.at(study.pitches_um[0], study.heights_um[0]).round:
-        return f"diameter from {least} to the pitch less {gap}"
-    return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
 
 
 def material_name(material: Material) -> str:

@@ -368,20 +368,19 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     """
     weights = lagrange_weights(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
+
+    def without(*left_out: int) -> Array:
+        kept = np.delete(np.arange(len(nodes)), left_out)
+        return np.asarray(lagrange_weights(nodes[kept], x) @ table[kept, 0])
+
     first_change = np.zeros(table.shape[2])
     second_change = np.zeros(table.shape[2])
     for k in range(len(nodes)):
-        all_but_k = np.arange(len(nodes)) != k
-        reduced = np.tensordot(
-            lagrange_weights(nodes[all_but_k], x), table[all_but_k, 0], 1
-        )
+        reduced = without(k)
         first_change = np.maximum(first_change, np.abs(reduced - row[0]))
         for j in range(k):
-            all_but_jk = all_but_k & (np.arange(len(nodes)) != j)
-            twice_reduced = np.tensordot(
-                lagrange_weights(nodes[all_but_jk], x), table[all_but_jk, 0], 1
-            )
-            second_change = np.maximum(second_change, np.abs(twice_reduced - reduced))
+            change = np.abs(without(j, k) - reduced)
+            second_change = np.maximum(second_change, change)
     first_change = maximum_filter1d(first_change, 9)
     second_change = maximum_filter1d(second_change, 9)
     gain = np.minimum(1.0, first_change / np.maximum(second_change, 1e-300))
@@ -393,11 +392,12 @@ def lagrange_weights(nodes: Array, x: float) -> Array:
     """(m,) Lagrange weights at ``x``: w_i = product over j != i of (x - x_j) / (x_i -
     x_j).
     """
-    ratio = (x - nodes[None, :]) / (
-        nodes[:, None] - nodes[None, :] + np.eye(len(nodes))
-    )
-    return np.asarray(
-        np.prod(np.where(np.eye(len(nodes), dtype=bool), 1.0, ratio), axis=1)
+    others = [np.delete(nodes, i) for i in range(len(nodes))]
+    return np.array(
+        [
+            np.prod((x - other) / (node - other))
+            for node, other in zip(nodes, others, strict=True)
+        ]
     )
 
 

@@ -179,8 +179,8 @@ def test_the_phases_that_training_takes_are_those_of_the_solver():
     at, both ends among them.
     """
     low, high = SETTINGS.proxy.domain_um
-    solve = engines.solver_at_fixed_discretization(
-        DEFAULT_CELL, Incidence(0.85), (low, high), tolerance=1e-3, engine="modal"
+    (solve,) = engines.solvers_at_common_discretization(
+        DEFAULT_CELL, [Incidence(0.85)], (low, high), tolerance=1e-3, engine="modal"
     )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
     told = np.exp(1j * np.asarray(SETTINGS.proxy.phase_rad(diameter, 0.85)))

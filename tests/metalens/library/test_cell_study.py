@@ -155,10 +155,6 @@ def test_the_page_says_what_is_printable_of_any_shape():
         "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm"
         in page
     )
-    discs = dataclasses.replace(crosses, cell=Cell(0.3))
-    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.study_markdown(
-        discs, [verdict], command="x"
-    )
 
 
 SOLVED = SolvedNodes(np.array([0.1]), np.array([[1 + 0.5j, 0.1j]]), np.array([0.2]))
