@@ -336,7 +336,7 @@ def _patch(
     return (
         x,
         y,
-        lens.rows_phase_rad(down, lens.wavelength_um, tilt_rad)[:, across],
+        lens.phase_rad(lens.wavelength_um, tilt_rad, rows=down)[:, across],
         inside,
     )
 

@@ -74,7 +74,7 @@ def _lens_rays(lens: Lens) -> tuple[PhaseOf, Focus, float, float]:
             )
         )
         ranges = (slice(row, row + 1) for row in rows.tolist())
-        return np.concatenate([lens.rows_phase_rad(row)[:, columns] for row in ranges])
+        return np.concatenate([lens.phase_rad(rows=row)[:, columns] for row in ranges])
 
     return nearest, lens_focus(lens), d.radius_um + d.pitch_um / 2, d.pitch_um
 

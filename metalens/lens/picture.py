@@ -88,7 +88,7 @@ def mean_field(lens: Lens, sites: int) -> Array:
         band = slice(i * sites, min((i + 1) * sites, d.shape[0]))
         rows = np.asarray(d[band])
         field = np.zeros((sites, width * sites), complex)
-        phasor = np.where(rows > 0, np.exp(1j * lens.rows_phase_rad(band)), 0)
+        phasor = np.where(rows > 0, np.exp(1j * lens.phase_rad(rows=band)), 0)
         field[: len(rows), : rows.shape[1]] = phasor * (2 if centred else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean

@@ -39,11 +39,8 @@ def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
         lens: the lens.
         depth_um: distance of a source in front of the lens, um.
     """
-    return (
-        _illuminated_um(lens, _aperture(lens).radius_um)
-        * sensor_reach_um(lens)
-        * abs(defocus_per_um(lens, depth_um))
-    )
+    defocus = abs(defocus_per_um(lens, depth_um))
+    return _illuminated_radius(lens) * sensor_reach_um(lens) * defocus
 
 
 def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
@@ -160,31 +157,14 @@ def depth_range_um(
     )
 
 
-def _aperture(lens: Lens | ApertureSummary) -> ApertureSummary:
-    """Summary of a lens; a summary is returned as it is."""
-    if isinstance(lens, ApertureSummary):
-        return lens
-    distances = lens.sensor_distance_um, lens.source_distance_um
-    return ApertureSummary(
-        lens.diameters.radius_um, lens.wavelength_um, *distances, lens.layers
-    )
-
-
 def _illuminated_radius(lens: Lens | ApertureSummary) -> float:
-    """Radius of the illuminated part, at least one pitch, um."""
-    radius = (
-        lens.radius_um
-        if isinstance(lens, ApertureSummary)
-        else max(lens.diameters.radius_um, lens.diameters.pitch_um)
-    )
-    return _illuminated_um(lens, radius)
-
-
-def _illuminated_um(lens: Lens | ApertureSummary, radius_um: float) -> float:
-    """Radius limited to the footprint of the light through the stop, um."""
-    return min(
-        radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
-    )
+    """Radius of the part that the light through the stop meets, at least one pitch of a
+    lens, um.
+    """
+    footprint = lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
+    if isinstance(lens, ApertureSummary):
+        return min(lens.radius_um, footprint)
+    return min(max(lens.diameters.radius_um, lens.diameters.pitch_um), footprint)
 
 
 def _reduced(lens: Lens | ApertureSummary, depth_um: float) -> float:

@@ -413,21 +413,20 @@ class Lens:
         )
 
     def phase_rad(
-        self, wavelength_um: float | None = None, angle_rad: float = 0.0
+        self,
+        wavelength_um: float | None = None,
+        angle_rad: float = 0.0,
+        *,
+        rows: slice = slice(None),
     ) -> Array:
-        """(y, x) phase of every pillar, rad, by the proxy or the table, with the
+        """(rows, x) phase of every pillar, rad, by the proxy or the table, with the
         geometric phase of its turn; 0 where there is none.
 
         Args:
             wavelength_um: of the design where it is left out.
             angle_rad: of incidence in air.
+            rows: of the map; all where it is left out.
         """
-        return self.rows_phase_rad(slice(None), wavelength_um, angle_rad)
-
-    def rows_phase_rad(
-        self, rows: slice, wavelength_um: float | None = None, angle_rad: float = 0.0
-    ) -> Array:
-        """(rows, x) phase of some rows; otherwise as :meth:`phase_rad`."""
         d = np.asarray(self.diameters.diameter_um[rows])
         if self.pairs is not None:
             return np.asarray(

@@ -175,7 +175,7 @@ def _behind(
         places = d.x_um, d.y_um[rows][:, None]
         path = source_path(*places, tangents, 1 / source_um)
         phase = np.remainder(
-            lens.rows_phase_rad(rows, wavelength_um, tilt) + k * path, 2 * math.pi
+            lens.phase_rad(wavelength_um, tilt, rows=rows) + k * path, 2 * math.pi
         )
         shadow = lens.layers.shadow(
             tangents, source_um, wavelength_um, places, d.pitch_um

@@ -280,7 +280,7 @@ def _delay_um(
         middle = float(np.clip(point, low, high))
         ends = max(low, middle * (1 - NEARBY)), min(high, middle * (1 + NEARBY))
         turns = [
-            lens.rows_phase_rad(rows, wave, tilt)[has_pillar] / (2 * np.pi)
+            lens.phase_rad(wave, tilt, rows=rows)[has_pillar] / (2 * np.pi)
             for wave in ends
         ]
         change = turns[0] - turns[1]

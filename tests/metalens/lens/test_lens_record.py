@@ -58,7 +58,7 @@ def test_pillars_of_two_sizes_have_phase_and_level_of_their_entries(
     assert level.dtype == float
     assert np.array_equal(level, np.minimum(np.abs(t), 1.0))
     assert lens.phase_rad(wave) == pytest.approx(np.angle(t), abs=1e-15)
-    assert lens.rows_phase_rad(slice(1, 4), wave) == pytest.approx(
+    assert lens.phase_rad(wave, rows=slice(1, 4)) == pytest.approx(
         np.angle(t[1:4]), abs=1e-15
     )
 
