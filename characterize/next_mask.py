@@ -413,7 +413,7 @@ def _corrected_diameters_um(
         np.unwrap(
             np.angle(
                 perturbed_transmission(
-                    design.proxy, response, fine, wave, state.answers()
+                    design.proxy, response, fine, wave, state.response_amounts()
                 )
             )
         )

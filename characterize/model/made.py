@@ -60,7 +60,7 @@ def as_built_transmission(
     state = process_state_of(x)
     bias = _on_pillars(d, state.bias_um) + noise_um
     if lens.pairs is not None:
-        t = _of_two_sizes(lens, response, bias, state.answers())
+        t = _of_two_sizes(lens, response, bias, state.response_amounts())
     else:
         t = _of_one_size(lens, response, x, bias, angle_rad)
     if state.has_wavefront_error():
@@ -97,7 +97,7 @@ def _of_one_size(
     Sites without a pillar get the t of some pillar; the caller masks them.
     """
     d = lens.diameters
-    answers = process_state_of(x).answers()
+    answers = process_state_of(x).response_amounts()
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9

@@ -16,9 +16,9 @@ from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
-    Answer,
     Kinds,
     PairTable,
+    RelativeResponse,
     ResponseError,
     Sensitivity,
     bias_ratio,
@@ -155,7 +155,7 @@ class PillarResponse:
         rank = max(1, int((tail > tolerance).sum()))
         self.basis = np.ascontiguousarray(u[:, :rank].T.conj())
 
-    def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
+    def _answers(self, nodes: Array) -> tuple[RelativeResponse, Array | float]:
         """Response to the pillar-response errors, and factor of the bias, at (b, 1) nodes."""
         d = self.diameter_um + nodes
         return prepare_response(self.lens.proxy, self.response, d), bias_ratio(
@@ -305,8 +305,8 @@ class PairedPillars(PillarResponse):
         self._rates = pairs.at(self._sizes.width_um, self._sizes.length_um)
         return self._sizes.width_um
 
-    def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
-        return Answer(self._rates[:, None], None, np.ones(1)), 1.0
+    def _answers(self, nodes: Array) -> tuple[RelativeResponse, Array | float]:
+        return RelativeResponse(self._rates[:, None], None, np.ones(1)), 1.0
 
     def exact(self, bias_um: Array | float, change: PillarChange) -> Array:
         """(..., kinds) complex t of both sizes + bias under a change."""
@@ -359,7 +359,7 @@ def pillar_change_of(x: Array) -> PillarChange:
         x: all parameters, in the order of ``PARAMETERS``.
     """
     return PillarChange(
-        tuple(process_state_of(x).answers().tolist()),
+        tuple(process_state_of(x).response_amounts().tolist()),
         float(x[PLACE["wavelength_nm"]]) * 1e-3,
     )
 

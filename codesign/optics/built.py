@@ -373,7 +373,7 @@ class MadeLens:
             self.response,
             grid,
             self.design.wavelength_um,
-            state.answers(),
+            state.response_amounts(),
         )
         edges = self.response.by_edges(grid)
         u, v = d.x_um / self._rim_um, d.y_um / self._rim_um

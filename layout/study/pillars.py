@@ -43,7 +43,12 @@ class OneSize:
         bias = np.reshape(bias_um, (-1, 1))
         d = self.diameter_um + bias
         return perturbed_transmission(
-            self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias
+            self.proxy,
+            self.sens,
+            d,
+            self.wavelength_um,
+            state.response_amounts(),
+            bias_um=bias,
         )
 
 
@@ -63,7 +68,7 @@ class TwoSizes:
     def curve(self, bias_um: Array, state: State) -> Array:
         """(bias, kinds) complex t for local biases and one made lens."""
         bias = np.reshape(bias_um, (-1, 1))
-        change = np.exp(np.tensordot(state.answers(), self.rates, 1))
+        change = np.exp(np.tensordot(state.response_amounts(), self.rates, 1))
         return np.asarray(
             self.table.t(self.width_um + bias, self.length_um + bias) * change
         )

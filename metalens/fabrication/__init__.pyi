@@ -29,7 +29,7 @@ from .process import State as State
 from .process import draw_lenses as draw_lenses
 from .process import of_process as of_process
 from .process import with_table as with_table
-from .response import Answer as Answer
+from .response import RelativeResponse as RelativeResponse
 from .response import Sensitivity as Sensitivity
 from .response import Solved as Solved
 from .response import bias_ratio as bias_ratio

@@ -1,5 +1,5 @@
-"""Etch and exposure bias: what is drawn is not what is made; draw so that the designed
-pillar is made.
+"""Etch and exposure bias: the fabricated diameter against the drawn one, and its
+inverse.
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ _PROBES_NM = np.linspace(10, 2000, 1991)
 
 @dataclass(frozen=True, slots=True)
 class Bias:
-    """Bias = made diameter - drawn diameter, both at half the height of the pillar, for
+    """Bias = fabricated diameter - drawn diameter, both at half the height of the pillar, for
     the drawn diameter.
 
     table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond
@@ -63,7 +63,7 @@ class Bias:
         drawn = np.array([pair[0] for pair in self.table_nm])
         if (np.diff(drawn) <= 0).any() or (drawn <= 0).any():
             raise ProcessError(
-                f"diameters of the bias table must rise and be above 0, found {drawn.tolist()}"
+                f"diameters of the bias table must rise and be above 0, got {drawn.tolist()}"
             )
         self._check_slope()
 
@@ -83,7 +83,7 @@ class Bias:
             at = int(abs(slope).argmax())
             raise ProcessError(
                 f"bias changes by {slope[at]:.2f} nm per nm at {probes[at]:g} nm, need at most {STEEPEST}: "
-                "the drawn diameter could not be found from the made one; check the table"
+                "the drawn diameter could not be computed from the fabricated one; check the table"
             )
 
     def at(self, drawn_nm: Array | float) -> Array:

@@ -92,7 +92,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """One row: a number that says how a made lens differs from its design; 0 is the
+    """One row: a number that says how a fabricated lens differs from its design; 0 is the
     design.
 
     meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma:

@@ -89,20 +89,21 @@ class State:
 
     def has_wavefront_error(self) -> bool:
         """Whether the wave front has any phase of its own."""
-        return bool(self._of(WavefrontError).any())
+        return bool(self._amounts(WavefrontError).any())
 
-    def answers(self) -> Array:
+    def response_amounts(self) -> Array:
         """(pillar-response errors,) amounts in um, rad and 1, as the pillars'
         derivatives take them.
         """
-        return self._of(ResponseError) * [row.unit for row, _ in response_errors()]
+        return self._amounts(ResponseError) * [row.unit for row, _ in response_errors()]
 
-    def _of(self, kind: Kind) -> Array:
+    def _amounts(self, kind: Kind) -> Array:
+        """Amounts of the causes that act in one way, in the order of the table."""
         return self.amounts[[n for n, _ in of_kind(kind)]]
 
     def _polynomial(self, kind: type[CDError] | type[WavefrontError]) -> Array:
         return np.asarray(
-            np.tensordot(self._of(kind), polynomial_coefficients(kind), 1)
+            np.tensordot(self._amounts(kind), polynomial_coefficients(kind), 1)
         )
 
 

@@ -118,7 +118,7 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Answer:
+class RelativeResponse:
     """Response of pillars of given diameters to the pillar-response errors.
 
     t over that of the proxy at the design wavelength.
@@ -334,7 +334,7 @@ def _phase_and_level(
 
 def prepare_response(
     proxy: Proxy, response: Sensitivity | ResponseRates, diameter_um: Array
-) -> Answer:
+) -> RelativeResponse:
     """Response of pillars to the pillar-response errors, for many amounts of these.
 
     Where ``response`` has solved series of t, these replace the linear slopes of their
@@ -348,11 +348,11 @@ def prepare_response(
     slopes = np.asarray(response.at(diameter_um))
     solved = response.solved if isinstance(response, Sensitivity) else None
     if solved is None:
-        return Answer(slopes, None, np.ones(1))
+        return RelativeResponse(slopes, None, np.ones(1))
     inside = np.clip(diameter_um, solved.diameter_um[0], solved.diameter_um[-1])
     series = solved.series(inside)
     slopes[np.flatnonzero(solved.powers[:, 1:].any((1, 2)))] = 0.0
-    return Answer(
+    return RelativeResponse(
         slopes, series, designed_transmission(proxy, inside, solved.wavelength_um)
     )
 
@@ -380,7 +380,7 @@ def perturbed_transmission(
     response: Sensitivity | ResponseRates,
     d_um: Array,
     wavelength_um: float,
-    answers: Array,
+    amounts: Array,
     *,
     bias_um: Array | float = 0.0,
     angle_rad: float = 0.0,
@@ -395,12 +395,13 @@ def perturbed_transmission(
         response: derivatives of ln t by the pillar-response errors.
         d_um: (*shape) diameters, um.
         wavelength_um: vacuum wavelength, um.
-        answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
+        amounts: (pillar-response errors,) in base units, as
+            :meth:`State.response_amounts` gives them.
         bias_um: part of the diameters that is a bias of all edges
             (:func:`bias_ratio`).
         angle_rad: angle of incidence in air, rad.
     """
-    factor = prepare_response(proxy, response, d_um).factor(answers)
+    factor = prepare_response(proxy, response, d_um).factor(amounts)
     changed = factor * bias_ratio(response, d_um, bias_um)
     designed = designed_transmission(proxy, d_um, wavelength_um, angle_rad=angle_rad)
     return np.asarray(designed * changed)

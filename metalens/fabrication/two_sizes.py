@@ -1,5 +1,5 @@
 """Pillars of two sizes under change: t by the table of their lens at any sizes, and the
-answers of a solver.
+rates of a solver.
 """
 
 from dataclasses import dataclass, replace

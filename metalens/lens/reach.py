@@ -139,7 +139,7 @@ def depth_range_um(
     depth is at least the lens's diameter, or the depth of focus itself. Both are
     rounded to ``digits`` digits, and lie beyond the films in front.
 
-    A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
+    A lens of 1 mm and 850 nm designed for a source at 20 mm: 16 and 26 mm.
 
     Args:
         lens: the lens.

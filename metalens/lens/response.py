@@ -1,4 +1,4 @@
-"""Answers of all pillars to light of one wavelength and angle, by compiled loops that
+"""Phase and transmission of all pillars for light of one wavelength and angle, by compiled loops that
 read each diameter once.
 """
 

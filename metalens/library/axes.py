@@ -349,10 +349,10 @@ class _Nodes:
         ]
         for key, (nodes,) in zip(new, self._run(tasks, label), strict=True):
             self.known[key] = np.append(nodes.response[:, 0], nodes.error.max())
-        found = np.array([self.known[key] for key in keys])
+        rows = np.array([self.known[key] for key in keys])
         swapped = (solved != pairs).any(axis=1)
-        found[swapped, :4] = found[swapped, 3::-1]  # exchanges x and y of t
-        return found[:, :4], found[:, 4].real
+        rows[swapped, :4] = rows[swapped, 3::-1]  # exchanges x and y of t
+        return rows[:, :4], rows[:, 4].real
 
     def grid(self, x: Array, y: Array) -> tuple[Array, Array]:
         """(m, n, 4) Jones matrices and (m, n) error bars of all pairs of nodes.

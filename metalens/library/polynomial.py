@@ -264,7 +264,7 @@ def invert_phase(
     """Diameters in um whose phase on a curve is ``phase_rad`` modulo 2 pi; see
     :meth:`metalens.library.Proxy.diameter_um`.
 
-    A tensor takes one more Newton step on the detached answer, whose derivative is
+    A tensor takes one more Newton step on the detached diameter, whose derivative is
     exactly 1 / (dphase/dD).
 
     Args:
@@ -328,14 +328,14 @@ def invert_phase(
         beyond = target > cover
         nearest = target - cover <= TURN - target
         target[beyond] = np.where(nearest[beyond], cover, 0.0)
-        found = _newton(p, start + target, target * ((TABLE - 1) / cover), table)
+        diameter = _newton(p, start + target, target * ((TABLE - 1) / cover), table)
         for least, most in excluded_um:
             # an end outside the considered range is no place to move to
             middle = np.inf if most > high else (least + most) / 2
             middle = -np.inf if least < low else middle
-            inside = (found > least) & (found < most)
-            found[inside] = np.where(found[inside] < middle, least, most)
-        return found.astype(chunk.dtype)
+            inside = (diameter > least) & (diameter < most)
+            diameter[inside] = np.where(diameter[inside] < middle, least, most)
+        return diameter.astype(chunk.dtype)
 
     return cast(Values, _over_chunks(invert, values)[()])
 

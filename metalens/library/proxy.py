@@ -144,7 +144,7 @@ class Proxy:
                 move ``within_um`` to choose the branch.
             gap: what to do with a phase that no pillar has (less than a turn covered).
 
-        Accuracy: phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32.
+        Accuracy: phase of the returned diameter within 1e-10 rad in float64, 1e-5 rad in float32.
             Torch gradients are exact. A diameter in one of ``gaps_um`` moves to its
             closer end.
 

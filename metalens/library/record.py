@@ -280,7 +280,7 @@ def check_sweep(cell: Cell, sweep: Sweep) -> None:
     span = sweep.span_um(cell)
     if sweep.lengths_um is not None:
         raise ConfigError(
-            "lengths_um: a library over two sizes is made by metalens.library.axes.sweep_two_sizes"
+            "lengths_um: a library over two sizes comes from metalens.library.axes.sweep_two_sizes"
         )
     if sweep.light == "circular":
         check_geometric_phase(cell, span[1])

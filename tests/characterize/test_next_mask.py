@@ -50,7 +50,11 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
     plan = _plan(height_nm=-12.0)
     now = np.angle(
         perturbed_transmission(
-            lens.proxy, response, plan.wanted_um, 0.85, process_state_of(x).answers()
+            lens.proxy,
+            response,
+            plan.wanted_um,
+            0.85,
+            process_state_of(x).response_amounts(),
         )
     )
     meant = np.angle(
@@ -59,7 +63,7 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
             response,
             plan.designed_um,
             0.85,
-            process_state_of(parameter_vector()).answers(),
+            process_state_of(parameter_vector()).response_amounts(),
         )
     )
     off = np.angle(np.exp(1j * (now - meant)))

@@ -75,7 +75,7 @@ def test_variance_of_a_bowed_bias_by_plain_quadrature():
     radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None]
     turn = 2 * np.pi * np.arange(64) / 64
     bias = state.bias_um(radius * np.cos(turn), radius * np.sin(turn))
-    c, answers = SETTINGS.phase_rates.covariance, state.answers()
+    c, answers = SETTINGS.phase_rates.covariance, state.response_amounts()
     want = (
         c[0, 0] * (bias**2).mean()
         + 2 * bias.mean() * c[0, 1:] @ answers

@@ -18,7 +18,7 @@ from metalens.fabrication.perturbations import (
     WavefrontError,
 )
 from metalens.fabrication.process import State
-from metalens.fabrication.response import Answer, Sensitivity, Solved
+from metalens.fabrication.response import RelativeResponse, Sensitivity, Solved
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
@@ -104,7 +104,7 @@ def test_answers_travel_in_micrometres_radians_and_one():
         2e-3,
         -6e-3,
     ]
-    assert made.answers() == pytest.approx(want, rel=1e-12)
+    assert made.response_amounts() == pytest.approx(want, rel=1e-12)
     assert not State.of().amounts.any()
     assert len(State.of().amounts) == len(PERTURBATIONS)
 
@@ -243,7 +243,7 @@ def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_s
     flat[1, 1:] = [[0.3, -0.2j], [-2.0, 1.0]]
     proxy = np.array([0.45, 0.55j])
     amounts = np.array([0.2, 0.07, -0.4])
-    made = Answer(slopes, flat, proxy)
+    made = RelativeResponse(slopes, flat, proxy)
     row = flat[1, 0] + flat[1, 1] * 0.07 + flat[1, 2] * 0.07**2
     plain = np.exp(0.2 * slopes[0] - 0.4 * slopes[2])
     assert made.factor(amounts) == pytest.approx(plain * row / proxy, rel=1e-12)
@@ -258,7 +258,7 @@ def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_s
         np.log(made.factor(amounts + step) / made.factor(amounts - step)) / 2e-6
     )
     assert rates[1] == pytest.approx(by_difference, rel=1e-6)
-    assert Answer(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(
+    assert RelativeResponse(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(
         plain, rel=1e-12
     )
 
