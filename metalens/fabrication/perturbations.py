@@ -3,7 +3,6 @@ symmetry and measurement of each.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -527,7 +526,6 @@ def inapplicable_names(cell: Cell) -> tuple[str, ...]:
     )
 
 
-@functools.cache
 def polynomial_coefficients(kind: type[CDError] | type[WavefrontError]) -> Array:
     """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each
     cause.

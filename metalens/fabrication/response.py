@@ -112,9 +112,8 @@ class Sensitivity:
         inside = np.clip(diameter_um, self.low_um, self.high_um)
         offset = inside - self.center_um
         slopes = polynomial.polyval(offset, polynomial.polyder(coefficients.T))
-        return polynomial.polyval(offset, coefficients.T) + slopes * (
-            diameter_um - inside
-        )
+        values = polynomial.polyval(offset, coefficients.T)
+        return np.asarray(values + slopes * (diameter_um - inside))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
