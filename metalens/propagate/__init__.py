@@ -1,8 +1,8 @@
 """Light from a point source through the pillars to the sensor window: the exact sum,
 and faster ways to the same field.
 
-``exact`` is the referee, ``angular_spectrum`` the textbook, ``windowed`` the fast way;
-``choose`` picks by error.
+``exact`` is the reference, ``windowed`` the fast field; ``choose_method`` says which
+method a stack of PSFs takes.
 """
 
 import lazy_loader

@@ -36,8 +36,6 @@ def choose_method(
 ) -> MethodChoice:
     """Exact sum for little work, Fourier transforms for wide windows, else windowed.
 
-    The angular spectrum is never chosen: its error (lattice, padding) has no bound.
-
     Args:
         case, tolerance: geometry, and relative error of the field.
         differentiable: leave out the exact sum, which has no derivatives.

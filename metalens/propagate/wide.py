@@ -67,10 +67,9 @@ class WideAxis:
     count, first_um, step_um: even grid over the lens, ``taps`` points larger on both
     sides. over: its density over the least for the kernel. first: points of the first
     transform; its middle ``size`` points cover the padded window. fine: points of the
-    last transform, whose step is the window's step divided by ``every``. middle,
-    reach_um, stretch_um: p0, A, D of the module. most: largest |p - p0| of a ray to the
-    window. guard: band beyond it in which the light is faded out. sharp: half of that
-    in standard deviations. steepest: |p| of a ray to the window.
+    last transform, whose step is the window's step divided by ``every``. fit: its
+    quadratic path. guard: band beyond the rays to the window in which the light is
+    faded out. sharp: half of that in standard deviations.
     """
 
     count: int
@@ -82,13 +81,9 @@ class WideAxis:
     size: int
     fine: int
     every: int
-    middle: float
-    reach_um: float
-    stretch_um: float
-    most: float
+    fit: "QuadraticFit"
     guard: float
     sharp: float
-    steepest: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,31 +115,21 @@ def wide_axes(
         case: geometry of the propagation.
         tolerance: relative error of the field.
     """
-    fits = _fit_quadratics(case, list(case.half_window_um))
-    for _ in range(2):
-        if fits is None:
-            return None
-        extra = [fit.extra_um for fit in fits]
-        if any(
-            e > 2 * (w + h)
-            for e, w, h in zip(
-                extra, case.half_window_um, case.half_size_um, strict=True
-            )
+    sizes = list(zip(case.half_window_um, case.half_size_um, strict=True))
+    half_um = list(case.half_window_um)
+    for _ in range(3):
+        fits = _fit_quadratics(case, half_um)
+        if fits is None or any(
+            fit.extra_um > 2 * (window + lens)
+            for fit, (window, lens) in zip(fits, sizes, strict=True)
         ):
             return None
-        fits = _fit_quadratics(
-            case, [w + e for w, e in zip(case.half_window_um, extra, strict=True)]
-        )
-    if fits is None:
-        return None
+        half_um = [w + f.extra_um for f, (w, _) in zip(fits, sizes, strict=True)]
     sharp = math.sqrt(2 * FADED * math.log(1 / tolerance))
     fade = 2 * sharp**2 / case.wavenumber
-    widths = [
-        2 * (w + fit.extra_um) for w, fit in zip(case.half_window_um, fits, strict=True)
-    ]
     guards = [
-        math.sqrt(2 * fade * fit.most / width)
-        for width, fit in zip(widths, fits, strict=True)
+        math.sqrt(fade * fit.most / half)
+        for half, fit in zip(half_um, fits, strict=True)
     ]
     if fits[0].steepest + max(guards) > STEEPEST * case.media.layers[0][0]:
         return None
@@ -193,7 +178,7 @@ def is_wide(case: PropagationCase, tolerance: float) -> bool:
     if axes is None:
         return False
     waves = (
-        4 * axis.most * half / case.wavelength_um
+        4 * axis.fit.most * half / case.wavelength_um
         for axis, half in zip(axes, case.half_window_um, strict=True)
     )
     return min(*waves, *(axis.count - 2 * axis.taps for axis in axes)) > WIDE
@@ -297,13 +282,9 @@ def _axis(
                     size,
                     fine,
                     every,
-                    fit.middle,
-                    fit.reach_um,
-                    fit.stretch_um,
-                    fit.most,
+                    fit,
                     guard,
                     sharp,
-                    fit.steepest,
                 )
         first = _fast_size(max(first + 1, min(SPARE / over, 1.5) * first))
     return None
@@ -522,8 +503,10 @@ def _lens_phase(case: PropagationCase, axes: tuple[WideAxis, WideAxis]) -> Array
     k, wavelength_um = case.wavenumber, case.wavelength_um
     path_sum, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
     for i, (axis, centre) in enumerate(zip(axes, case.centre_um[::-1], strict=True)):
-        x, x0 = grid_um(axis), centre - axis.reach_um
-        path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (centre - x)
+        x, x0 = grid_um(axis), centre - axis.fit.reach_um
+        path = (x - x0) ** 2 / (2 * axis.fit.stretch_um) + axis.fit.middle * (
+            centre - x
+        )
         turn = np.exp(
             2j * np.pi * (axis.size // 2) * np.arange(axis.count) / axis.first
         )
@@ -534,9 +517,9 @@ def _lens_phase(case: PropagationCase, axes: tuple[WideAxis, WideAxis]) -> Array
     y, x = (grid_um(axis) for axis in axes)
     removed = np.asarray(to_sensor(case, x, y[:, None]))
     scale = case.area_um2 / (
-        1j * wavelength_um * math.sqrt(axes[0].stretch_um * axes[1].stretch_um)
+        1j * wavelength_um * math.sqrt(axes[0].fit.stretch_um * axes[1].fit.stretch_um)
     )
-    start = float(_phase_path(case, axes[0].middle ** 2 + axes[1].middle ** 2))
+    start = float(_phase_path(case, axes[0].fit.middle ** 2 + axes[1].fit.middle ** 2))
     return np.asarray(scale * ramp * np.exp(1j * k * (path_sum - removed + start)))
 
 
@@ -565,32 +548,33 @@ def _window_factors(
         period = axis.fine * case.step_um / axis.every
         n = np.arange(axis.size) - axis.size // 2
         width = period / axis.size
-        place = (axis.first_um - (centre - axis.reach_um)) / axis.step_um
+        place = (axis.first_um - (centre - axis.fit.reach_um)) / axis.step_um
         # the lowest order of the next transform is first
         turns = n * (axis.size // 2 / axis.size - place / axis.first)
         chirps.append(
             np.exp(
-                1j * k * (n * width) ** 2 / (2 * axis.stretch_um) + 2j * np.pi * turns
+                1j * k * (n * width) ** 2 / (2 * axis.fit.stretch_um)
+                + 2j * np.pi * turns
             )
         )
         u = n * case.wavelength_um / period
         first = -(samples - 1) / 2 * case.step_um / width + axis.size // 2
         ramps.append(
             np.exp(2j * np.pi * n * first / axis.size)
-            * _fade(axis, np.abs(u) - axis.most)
+            * _fade(axis, np.abs(u) - axis.fit.most)
             / axis.size
         )
-        squares.append((axis.middle + u) ** 2)
-        paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
+        squares.append((axis.fit.middle + u) ** 2)
+        paths.append(axis.fit.reach_um * u + axis.fit.stretch_um / 2 * u * u)
     squared = squares[0][:, None] + squares[1]
     fading = max(axes, key=lambda axis: axis.guard)
-    in_band = squared < (fading.steepest + 1.1 * fading.guard) ** 2
+    in_band = squared < (fading.fit.steepest + 1.1 * fading.guard) ** 2
     squared = np.where(in_band, squared, 0.0)
     path_left = _phase_path(case, squared) - _phase_path(
-        case, axes[0].middle ** 2 + axes[1].middle ** 2
+        case, axes[0].fit.middle ** 2 + axes[1].fit.middle ** 2
     )
     path_left = path_left + paths[0][:, None] + paths[1]
-    level = _fade(fading, np.sqrt(squared) - fading.steepest)
+    level = _fade(fading, np.sqrt(squared) - fading.fit.steepest)
     level = level * np.sqrt(media.passed_at(case.media.order, squared))
     transfer = np.where(
         in_band, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * path_left), 0
