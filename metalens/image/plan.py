@@ -334,7 +334,7 @@ def waves_of(
     depths = depth_nodes(grid, 2)
     window = Window(grid.window, grid.step_um)
     last = sum_over_spectrum(optics, at, depths, _coarse(optics, source, 1), window)
-    outside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
+    outside = source.outside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):
         rule = _coarse(optics, source, count)
         images = sum_over_spectrum(optics, at, depths, rule, window)

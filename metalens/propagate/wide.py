@@ -118,12 +118,13 @@ def wide_axes(
     sizes = list(zip(case.half_window_um, case.half_size_um, strict=True))
     half_um = list(case.half_window_um)
     for _ in range(3):
-        fits = _fit_quadratics(case, half_um)
-        if fits is None or any(
+        fitted = _fit_quadratics(case, half_um)
+        if fitted is None or any(
             fit.extra_um > 2 * (window + lens)
-            for fit, (window, lens) in zip(fits, sizes, strict=True)
+            for fit, (window, lens) in zip(fitted, sizes, strict=True)
         ):
             return None
+        fits = fitted
         half_um = [w + f.extra_um for f, (w, _) in zip(fits, sizes, strict=True)]
     sharp = math.sqrt(2 * FADED * math.log(1 / tolerance))
     fade = 2 * sharp**2 / case.wavenumber

@@ -42,7 +42,7 @@ ROWS = 64  # rows of pillars whose delays are computed
 NEARBY = 1e-4  # relative step of the wavelength for those delays
 TRIES = 3  # at a spectrum: the PSFs of one give the paths for the next
 ABOVE = "above the tolerance by its spectrum"
-AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
+AT_NORMAL = "pillars respond as at normal incidence: their library has no angles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,8 +320,8 @@ def _quadrature_error(
         return nodes.error
     span = paths_um(lens, view, angle_rad, nodes.source)
     share = light_shares(stack.intensity[0], span.shape[1:])
-    errors = spectra.quadrature_error(nodes, span.ravel())
-    return float(np.sqrt(share.ravel() @ errors**2))
+    rule = nodes.wavelengths_um, nodes.weights
+    return spectra.quadrature_error(nodes.source, rule, span.ravel(), share.ravel())
 
 
 def _at_wavelengths(
@@ -384,7 +384,7 @@ def _at_wavelengths(
     words = [
         stack.reason,
         ABOVE if budget.computed > tolerance and stack.converged else "",
-        f"of {lens.one_light}: these pillars answer x and y apart"
+        f"of {lens.one_light}: these pillars respond to x and y separately"
         if lens.one_light
         else "",
         AT_NORMAL if budget.angle else "",

@@ -2,6 +2,7 @@
 that very weight.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ class SpectralNodes:
 
     wavelengths_um, weights: (n,), the weights of sum 1.
     error: of the quadrature, for the paths that it was chosen for.
-    source: the spectrum, by which :func:`quadrature_error` judges them on any path;
+    source: the spectrum, by which their error is computed for any path;
         None for plain wavelengths.
 
     Raises:
@@ -85,6 +86,7 @@ class SpectralNodes:
             )
 
 
+@functools.lru_cache(maxsize=8)
 def spectral_weight(source: Source) -> tuple[Array, Array]:
     """Wavelengths (n,) in um and weights of sum 1 of a diode on a silicon sensor.
 
@@ -124,13 +126,13 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
 class MeasuredSpectrum:
     """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
 
-    beside: share of the light that is cut off at its ends, outside the wavelengths of
+    outside: share of the light that is cut off at its ends, beyond the wavelengths of
         the pillars' library.
     """
 
     wavelengths_um: Array
     share: Array
-    beside: float = 0.0
+    outside: float = 0.0
 
 
 def read_measured_spectrum(
@@ -297,11 +299,9 @@ def spectral_nodes(
     spans = np.atleast_1d(path_um)
     light = np.ones(1) if light is None else light
     um, share = spectrum_points(source)
-    outside = getattr(source, "beside", 0.0)
     for count in range(1, MOST_NODES + 1):
         rule = gauss_rule(um, share, count)
-        errors = outside + _mean_errors(rule, (um, share), spans)
-        error = float(np.sqrt(light @ errors**2))
+        error = quadrature_error(source, rule, spans, light)
         if error <= tolerance:
             return SpectralNodes(*rule, error, source)
     raise PropagationError(
@@ -310,35 +310,33 @@ def spectral_nodes(
     )
 
 
-def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
-    """(n,) largest error of the mean of exp(2πi·path/λ), over paths up to each span.
+def quadrature_error(
+    source: Source | MeasuredSpectrum,
+    rule: tuple[Array, Array],
+    span_um: Array,
+    light: Array,
+) -> float:
+    """Root mean square error over a window of a rule of wavelengths for a spectrum.
+
+    That of a part of the window is the largest difference of two means of
+    exp(2πi·path/λ), over paths up to the part's span; light outside a measured spectrum
+    is added.
 
     Args:
-        nodes: wavelengths with weights, and the spectrum that they integrate.
-        span_um: (n,) largest difference of optical paths, um.
-    """
-    if nodes.source is None:
-        return np.full(len(span_um), nodes.error)
-    rule = nodes.wavelengths_um, nodes.weights
-    outside = getattr(nodes.source, "beside", 0.0)
-    return outside + _mean_errors(rule, spectrum_points(nodes.source), span_um)
-
-
-def _mean_errors(
-    rule: tuple[Array, Array], points: tuple[Array, Array], span_um: Array
-) -> Array:
-    """(n,) largest difference of two means of exp(2πi·path/λ), over paths up to a span.
-
-    Args:
-        rule: wavelengths in um and weights of the quadrature.
-        points: those of the spectrum itself.
-        span_um: (n,) largest paths, um.
+        source: spectrum of the source.
+        rule: wavelengths in um and weights.
+        span_um: (n,) largest difference of optical paths to each part, um.
+        light: (n,) share of each part in the squared irradiance.
     """
     paths = np.linspace(0, span_um.max(), PATHS)
-    means = [np.exp(2j * np.pi * paths[:, None] / um) @ w for um, w in (rule, points)]
+    means = [
+        np.exp(2j * np.pi * paths[:, None] / um) @ weights
+        for um, weights in (rule, spectrum_points(source))
+    ]
     largest = np.maximum.accumulate(np.abs(means[0] - means[1]))
     place = np.searchsorted(paths, span_um * (1 - 1e-12)).clip(max=PATHS - 1)
-    return np.asarray(largest[place])
+    outside = source.outside if isinstance(source, MeasuredSpectrum) else 0.0
+    return float(np.sqrt(light @ (outside + largest[place]) ** 2))
 
 
 def spectrum_points(source: Source | MeasuredSpectrum) -> tuple[Array, Array]:
