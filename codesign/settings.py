@@ -10,7 +10,6 @@ from metalens.core.errors import ConfigError
 
 Part = Literal["optics", "pitch", "architecture"]
 Place = Literal["auto", "cpu", "cuda"]
-Points = Literal["random", "spread"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +51,8 @@ class ExperimentConfig:
     subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that
     they span.
     axial_mm, lateral_mm: slippage states beside the origin, along z and x.
-    share: of the stimuli that a subject is calibrated on; the rest is judged. points:
-    whether these stimuli are drawn
-        at random or spread over the field, as a calibration screen would show them.
+    share: of the stimuli that a subject is calibrated on, drawn at random; the rest is
+    judged.
     people: who calibrated before, and tell what readings mean for all of them: the
     prior of every subject.
     hidden: neurons of the regressor, of networks that tell no axis.
@@ -74,7 +72,6 @@ class ExperimentConfig:
     axial_mm: tuple[float, ...] = (-5.0, -2.5, 2.5, 5.0)
     lateral_mm: tuple[float, ...] = (-2.5, -5.0)
     share: float = 0.2
-    points: Points = "random"
     people: int = 32
     hidden: int = 10
     fixation_deg: float = 0.3

@@ -25,7 +25,6 @@ from codesign.network.supernet import recalibrate_batch_norm
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from codesign.train import assess, make_model
-from codesign.train.assess import depth_response
 from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image.sensor import Sensor
 
@@ -107,15 +106,18 @@ plt.legend()
 test = EyeScenes(settings, 9.0, 2000.0, seed=0, stream=TEST)
 for name, (trainer, _) in runs.items():
     net = trainer.model.net
-    seen = assess.sensor_frames(trainer, test, 6)
-    error = (
-        (assess.predict_frames(net, member, seen, trainer.inner).slip_mm - seen.slip_mm)
-        .abs()
-        .mean(0)
+    seen, shifted = (
+        assess.sensor_frames(trainer, test, 6, shift_um=um)
+        for um in (0, assess.SHIFT_UM)
     )
-    response = depth_response(trainer, test, net, member, batches=4)
+    read, moved = (
+        assess.predict_frames(net, member, frames, trainer.inner).slip_mm
+        for frames in (seen, shifted)
+    )
+    error = (read - seen.slip_mm).abs().mean(0)
+    response, _ = assess.depth_response(read[:, 2], moved[:, 2])
     print(
-        f"{name}: axial {error[2]:.2f} mm, lateral {error[:2].mean():.2f} mm, {response.mean:.2f} mm per mm of PSF depth"
+        f"{name}: axial {error[2]:.2f} mm, lateral {error[:2].mean():.2f} mm, {response:.2f} mm per mm of PSF depth"
     )
 
 # %% [markdown]

@@ -3,14 +3,14 @@ the next mask should draw.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from characterize.next_mask import MaskCorrection, NextMask, PredictedLens, table_rows
-from codesign.adapt.train import LensPsfs, RetrainingOutcome
+from characterize.next_mask import NextMask, table_rows
+from codesign.adapt.train import RetrainingOutcome
 from metalens.core import report
 from metalens.core.report import Figure, KeyFigure, Section, Table
 
@@ -27,18 +27,17 @@ CASES = {
 class RetrainingResults:
     """Content of the page.
 
-    apart: PSF errors of the fitted lens and of the judging lens, relative to the
-    nominal one. curves: {job: (step, loss)}. proposals: states of the next lens with
-    their PSF and slippage errors, mm. cautions: in words.
+    psf_errors: of the fitted lens and of the judging lens, relative to the nominal one.
+    drawn: lenses of the posterior that training saw. known: whether the truth judges.
+    mask: correction of the next mask. cautions: in words.
     """
 
     outcome: RetrainingOutcome
-    lenses: LensPsfs
-    apart: tuple[float, float]
-    curves: dict[str, tuple[list[int], list[float]]]
+    psf_errors: tuple[float, float]
+    drawn: int
+    known: bool
     mask: NextMask
-    proposals: Sequence[tuple[PredictedLens, float, float]]
-    cautions: Sequence[str] = field(default_factory=tuple)
+    cautions: Sequence[str] = ()
 
 
 def write_retraining_page(path: Path, story: RetrainingResults) -> None:
@@ -60,11 +59,22 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     ]
     judge = (
         "the true lens of the virtual bench"
-        if story.lenses.known
+        if story.known
         else "lenses of the posterior not seen before"
     )
     lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
-    sections = [_accuracy_section(story), _psf_section(story), _mask_section(story)]
+    text = (
+        "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
+        "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
+        "is formed at a quarter of the run's tolerance: a ratio near 1 says that results do not depend on it.\n\nPSFs of "
+        f"the fitted lens differ from the nominal ones by {story.psf_errors[0]:.1%} (relative L2 over all depths), those "
+        f"of the lens that judges by {story.psf_errors[1]:.1%}. Training drew {story.drawn} lenses from the posterior."
+    )
+    bars = Figure(plot_error_bars(outcome), "Slippage error, with its 95 % interval.")
+    sections = [
+        Section("Accuracy", text, [bars, accuracy_table(outcome)]),
+        _mask_section(story.mask),
+    ]
     if story.cautions:
         sections.append(Section("Read with care", "\n\n".join(story.cautions)))
     report.write_report(
@@ -110,27 +120,6 @@ def accuracy_table(outcome: RetrainingOutcome) -> Table:
     return Table(head, rows, digits=3)
 
 
-def _accuracy_section(story: RetrainingResults) -> Section:
-    """Accuracy of all cases as bars and table, and training curves."""
-    text = (
-        "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
-        "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
-        "is formed at a quarter of the run's tolerance: a ratio near 1 says that results do not depend on it."
-    )
-    return Section(
-        "Accuracy",
-        text,
-        [
-            Figure(
-                plot_error_bars(story.outcome),
-                "Slippage error, with its 95 % interval.",
-            ),
-            accuracy_table(story.outcome),
-            Figure(_loss_picture(story), "Loss while training on."),
-        ],
-    )
-
-
 def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
     """PNG of a bar chart: slippage error of every case with its 95 % interval.
 
@@ -160,85 +149,11 @@ def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
     return report.figure_png(figure)
 
 
-def _loss_picture(story: RetrainingResults) -> bytes:
-    """PNG of the task loss of every job over the step, moving average of a
-    twentieth.
-    """
-    labels = {
-        "nominal": "nominal lens",
-        "retrained": "as built",
-        "known": "truth known",
-    }
-    figure, axes = report.make_figure(size=(6.4, 2.4))
-    for name, (step, loss) in story.curves.items():
-        width = max(1, len(loss) // 20)
-        smooth = np.convolve(loss, np.ones(width) / width, mode="valid")
-        axes.plot(step[width - 1 :], smooth, label=labels[name])
-    axes.set(xlabel="step", ylabel="task loss")
-    axes.legend()
-    return report.figure_png(figure)
-
-
-def _psf_section(story: RetrainingResults) -> Section:
-    """PSF differences of fitted and judging lens, and their pictures."""
-    fitted, judged = story.apart
-    text = (
-        f"PSFs of the fitted lens differ from the nominal ones by {fitted:.1%} (relative L2 over all depths), those of "
-        f"the lens that judges by {judged:.1%}. Training drew {len(story.lenses.drawn)} lenses from the posterior."
-    )
-    caption = "Square root of the PSFs on the samples of training, by depth: nominal, fitted, and the lens that judges."
-    return Section("Light", text, [Figure(_psf_picture(story), caption, wide=True)])
-
-
-def _psf_picture(story: RetrainingResults) -> bytes:
-    """PNG of PSFs (square root) at seven depths: nominal, fitted and judging lens."""
-    lenses = story.lenses
-    rows = (
-        ("nominal", lenses.nominal),
-        ("as built", lenses.best),
-        ("true" if lenses.known else "a draw", lenses.judges[0]),
-    )
-    depth_indices = np.unique(
-        np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int)
-    )
-    figure, axes = report.make_figure(
-        len(rows),
-        len(depth_indices),
-        size=(1.15 * len(depth_indices), 3.6),
-        squeeze=False,
-    )
-    for column, depth in enumerate(depth_indices):
-        peak = max(float(s.intensity[depth].max()) for _, s in rows)
-        for row, (label, stack) in enumerate(rows):
-            axes[row, column].imshow(
-                stack.intensity[depth].clamp_min(0).sqrt().numpy(),
-                vmin=0,
-                vmax=peak**0.5,
-            )
-            axes[row, column].set(xticks=[], yticks=[])
-            axes[row, column].grid(visible=False)
-            axes[row, 0].set_ylabel(label)
-        axes[0, column].set_title(
-            f"{float(lenses.nominal.depths_um[depth]) * 1e-3:.1f} mm"
-        )
-    return report.figure_png(figure)
-
-
-def _mask_section(story: RetrainingResults) -> Section:
+def _mask_section(mask: NextMask) -> Section:
     """Gain of each step of the next mask, and its bias table; or why there is none."""
-    gain_columns = (
-        "next lens",
-        "PSF error",
-        "Strehl ratio",
-        "light",
-        "slippage error / mm, network not retrained",
-    )
-    rows = [
-        (p.name, error, p.strehl, p.light, slip) for p, error, slip in story.proposals
-    ]
     gain = Table(
-        gain_columns,
-        rows,
+        ("next lens", "Strehl ratio", "light"),
+        [(step.name, step.strehl, step.light) for step in mask.steps],
         "Simulated with the lens that judges as the truth; Strehl and light against the design.",
         digits=3,
     )
@@ -252,8 +167,8 @@ def _mask_section(story: RetrainingResults) -> Section:
     note = "bias.toml holds the new table for PROCESS.toml."
     table = Table(
         columns,
-        table_rows(story.mask.plan),
-        "Written to no file: see above." if story.mask.refused else note,
+        table_rows(mask.plan),
+        "Written to no file: see above." if mask.refused else note,
     )
     text = (
         "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
@@ -261,26 +176,8 @@ def _mask_section(story: RetrainingResults) -> Section:
         "varies over the lens; draw it with the new table. The spacer is no matter of the mask: the last row sets it "
         "right as well."
     )
-    if story.mask.uneven and not story.mask.refused:
-        text += f"\n\nNo lens_corrected.h5 is written: {story.mask.uneven}."
-    if story.mask.refused:
-        text = f"{story.mask.refused[0].upper()}{story.mask.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
-    return Section(
-        "The next mask",
-        text,
-        [
-            gain,
-            Figure(_bias_picture(story.mask.plan), "Bias: made less drawn diameter."),
-            table,
-        ],
-    )
-
-
-def _bias_picture(plan: MaskCorrection) -> bytes:
-    """PNG of present and new bias over drawn diameter."""
-    figure, axes = report.make_figure(size=(5.2, 2.6))
-    axes.plot(plan.drawn_nm, plan.old_nm, "--", color="#888", label="present table")
-    axes.plot(plan.drawn_nm, plan.bias_nm, "o-", label="new table")
-    axes.set(xlabel="drawn diameter / nm", ylabel="bias / nm")
-    axes.legend()
-    return report.figure_png(figure)
+    if mask.uneven and not mask.refused:
+        text += f"\n\nNo lens_corrected.h5 is written: {mask.uneven}."
+    if mask.refused:
+        text = f"{mask.refused[0].upper()}{mask.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
+    return Section("The next mask", text, [gain, table])

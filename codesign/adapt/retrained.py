@@ -53,7 +53,7 @@ def relative_inputs(
     """
     paths = {"run": run, "asbuilt": built, "truth": truth}
     return {
-        name: None if path is None else _relative_path(folder, path)
+        name: os.path.relpath(path.resolve(), folder.resolve()) if path else None
         for name, path in paths.items()
     }
 
@@ -101,30 +101,20 @@ def load_retrained(path: Path) -> FinishedRun:
     job = "retrained" if path == folder else path.stem
     transaction.check_manifest(folder)
     recipe = config.load(folder / RECIPE, RetrainingRecipe)
-    paths = _input_paths(folder)
-    for name, sha in (
-        ("run", recipe.weights),
-        ("asbuilt", recipe.asbuilt),
-        ("truth", recipe.truth),
-    ):
-        _check_unchanged(folder, name, paths[name], sha)
-    source = load_finished_run(
-        _existing(paths["run"]), budget_mmacs=recipe.settings.budget_mmacs
+    run_dir = _unchanged(folder, "run", recipe.weights)
+    built = asbuilt.load(_unchanged(folder, "asbuilt", recipe.asbuilt))
+    truth = None
+    if recipe.truth:
+        truth = config.load(_unchanged(folder, "truth", recipe.truth), HiddenLens)
+    source = load_finished_run(run_dir, budget_mmacs=recipe.settings.budget_mmacs)
+    design = lenses.load_plain(
+        lens_file(run_dir, source.settings, source.row["budget_mmacs"])
     )
-    built = asbuilt.load(_existing(paths["asbuilt"]))
-    truth = None if paths["truth"] is None else config.load(paths["truth"], HiddenLens)
-    run_dir = _existing(paths["run"])
-    budget = source.row["budget_mmacs"]
-    design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
     made = MadeLens(design, source.settings.optics, response=built.response)
     psfs = retraining.lens_psfs(made, built, recipe.settings, truth)
-    if (
-        job not in retraining.available_jobs(psfs)
-        or not (folder / f"{job}.safetensors").is_file()
-    ):
-        available = ", ".join(
-            f"{name}.safetensors" for name in retraining.available_jobs(psfs)
-        )
+    jobs = retraining.available_jobs(psfs)
+    if job not in jobs or not (folder / f"{job}.safetensors").is_file():
+        available = ", ".join(f"{name}.safetensors" for name in jobs)
         raise TrainingError(
             f"{path}: no network of this retraining; it holds {available}"
         )
@@ -137,27 +127,6 @@ def load_retrained(path: Path) -> FinishedRun:
 
 def _folder(path: Path) -> Path:
     return path.parent if path.suffix == ".safetensors" else path
-
-
-def _existing(path: Path | None) -> Path:
-    """The path itself.
-
-    Raises:
-        TrainingError: None.
-    """
-    if path is None:
-        raise TrainingError(
-            "a retraining without a run or a fit: made by another version; retrain again"
-        )
-    return path
-
-
-def _relative_path(folder: Path, path: Path) -> str:
-    """Path relative to a folder; absolute where they are on different drives."""
-    try:
-        return os.path.relpath(path.resolve(), folder.resolve())
-    except ValueError:  # on another drive
-        return str(path.resolve())
 
 
 def _input_paths(folder: Path) -> dict[str, Path | None]:
@@ -181,18 +150,15 @@ def _input_paths(folder: Path) -> dict[str, Path | None]:
     }
 
 
-def _check_unchanged(folder: Path, name: str, path: Path | None, sha: str) -> None:
-    """Refuse an input that is missing or whose SHA-256 differs.
+def _unchanged(folder: Path, name: str, sha: str) -> Path:
+    """Path of an input of a retraining, whose SHA-256 is the one that it noted.
 
     Raises:
-        TrainingError: with its name and path.
+        TrainingError: the input is missing or another, with its name and path.
     """
-    file = (
-        path / "checkpoint.safetensors" if path is not None and name == "run" else path
-    )
-    if file is None and not sha:
-        return
-    if file is None or not file.is_file():
+    path = _input_paths(folder)[name]
+    file = path / "checkpoint.safetensors" if path and name == "run" else path
+    if path is None or file is None or not file.is_file():
         raise TrainingError(
             f"{folder}: its {name} is no longer at {path}; put it back, or retrain from where it is"
         )
@@ -200,3 +166,4 @@ def _check_unchanged(folder: Path, name: str, path: Path | None, sha: str) -> No
         raise TrainingError(
             f"{folder}: {file} is not what it was retrained from; give it back, or retrain"
         )
+    return path

@@ -69,29 +69,18 @@ class NetworkAccuracy:
         """Mean error across."""
         return float(self.error_mm[:, :2].mean())
 
-    def interval_mm(self, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
-        """95 % interval of ``slip_mm`` by a bootstrap over frames.
-
-        Args:
-            draws: resamples of the bootstrap. seed: of the random generator.
-        """
-        low, high = assess.bootstrap_interval(
-            self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed
-        )
-        return low, high
-
-    def _finer_values(self, fine: "NetworkAccuracy") -> dict[str, float]:
-        """Errors on the finer images, and their ratio to those on the usual ones."""
-        return {
-            "finer_slip_mm": fine.slip_mm,
-            "finer_axial_mm": fine.axial_mm,
-            "finer_ratio": fine.slip_mm / self.slip_mm,
-        }
-
     def values(self) -> dict[str, float]:
-        """The numbers by name, for tables and JSON."""
-        low, high = self.interval_mm()
-        fine = {} if self.finer is None else self._finer_values(self.finer)
+        """The numbers by name, for tables and JSON: ``slip_mm`` with its 95 % interval
+        by a bootstrap over frames, and errors on the finer images with their ratio.
+        """
+        low, high = assess.bootstrap_interval(self.error_mm.mean(1).double().numpy())
+        fine = {}
+        if self.finer is not None:
+            fine = {
+                "finer_slip_mm": self.finer.slip_mm,
+                "finer_axial_mm": self.finer.axial_mm,
+                "finer_ratio": self.finer.slip_mm / self.slip_mm,
+            }
         return fine | {
             "slip_mm": self.slip_mm,
             "slip_low_mm": low,
@@ -118,17 +107,6 @@ class LensPsfs:
     known: bool
 
 
-def gap_sigma_mm(worse: NetworkAccuracy, better: NetworkAccuracy) -> float:
-    """Standard error of the difference of two mean slippage errors, mm, over shared
-    frames.
-
-    Args:
-        worse: case with the larger error. better: case with the smaller error.
-    """
-    difference = (worse.error_mm - better.error_mm).mean(1)
-    return float(difference.std()) / math.sqrt(len(difference))
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrainingOutcome:
     """Accuracy of every case of a retraining.
@@ -152,8 +130,9 @@ class RetrainingOutcome:
 
     @property
     def gap_sigma_mm(self) -> float:
-        """Standard error of the gap."""
-        return gap_sigma_mm(self.before, self.nominal)
+        """Standard error of the gap, over the frames that both cases share."""
+        difference = (self.before.error_mm - self.nominal.error_mm).mean(1)
+        return float(difference.std()) / math.sqrt(len(difference))
 
     @property
     def recovered(self) -> float | None:
@@ -400,12 +379,17 @@ def retraining_outcome(
     frames = render_test_frames(source, config)
     untouched = make_trainer(source, config, nominal)
 
-    def judge(trainer: Trainer, stacks: Sequence[PixelPsfStack]) -> NetworkAccuracy:
-        return judge_network(trainer, source, config, stacks, frames=frames)
+    def judge(
+        trainer: Trainer, stacks: Sequence[PixelPsfStack], *, finer: bool = True
+    ) -> NetworkAccuracy:
+        return judge_network(
+            trainer, source, config, stacks, frames=frames, finer=finer
+        )
 
+    # how finer images change errors behind the nominal lens stands in the run's result
     return RetrainingOutcome(
-        designed=judge(untouched, nominal),
-        nominal=judge(trained["nominal"], nominal),
+        designed=judge(untouched, nominal, finer=False),
+        nominal=judge(trained["nominal"], nominal, finer=False),
         before=judge(trained["nominal"], training_psfs.judges),
         after=judge(trained["retrained"], training_psfs.judges),
         known=judge(trained["known"], training_psfs.judges)

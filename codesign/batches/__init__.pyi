@@ -16,7 +16,6 @@ from .scenes import TRAINING as TRAINING
 from .scenes import VALIDATION as VALIDATION
 from .scenes import EyeScenes as EyeScenes
 from .scenes import SceneConfig as SceneConfig
-from .scenes import StateScenes as StateScenes
 from .scenes import as_batch as as_batch
 from .scenes import augmented_frames as augmented_frames
 from .scenes import draw_depth_scales as draw_depth_scales

@@ -13,7 +13,6 @@ from codesign.batches.batch import EyePose, FrameBatch
 from codesign.eye import (
     POPULATION,
     CameraRig,
-    DrawnAugmentations,
     EyeStates,
     MotionRanges,
     PinholeCamera,
@@ -60,9 +59,9 @@ class SceneConfig:
         lashes, brow, pupil and its size, glints, ambient light, exposure, opening of
         the lids. 1 is the population as
         published, bare; from there to 2 and more come spectacles with reflections,
-        make-up, uneven light, shadows,
-        movement and other views (:mod:`codesign.eye.worn`): for faces, lamps and
-        cameras that nobody modelled.
+        make-up, uneven light, shadows
+        and movement (:mod:`codesign.eye.worn`): for faces and lamps that nobody
+        modelled.
     pool: frames that training draws from again and again, at another scale each time; 0
     renders every frame anew.
     """
@@ -200,37 +199,6 @@ class EyeScenes:
             size: frames of a step.
         """
         return as_batch(self.rendered(step, size), self.margin)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class StateScenes:
-    """Frames of given states with their augmentations, batch after batch.
-
-    scenes: rig, camera and margin. stream: of the noise.
-    """
-
-    scenes: EyeScenes
-    states: EyeStates
-    worn: DrawnAugmentations
-    stream: int
-
-    @property
-    def margin(self) -> int:
-        """Samples around the frame that are blurred in but not seen."""
-        return self.scenes.margin
-
-    def batch(self, step: int, size: int) -> FrameBatch:
-        """Frames of a step; fewer, or none, where the states end.
-
-        Args:
-            size: frames of a step.
-        """
-        rows = slice(step * size, (step + 1) * size)
-        rig, camera = self.scenes.rig, self.scenes.camera
-        rendered = render_dressed(
-            self.states[rows], self.worn[rows], rig=rig, camera=camera
-        )
-        return as_batch(rendered, self.margin)
 
 
 def augmented_frames(

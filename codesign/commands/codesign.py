@@ -2,14 +2,12 @@
 under compute budgets.
 """
 
-import io
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib import image as plt_image
 
 from codesign.adapt import lens_file, weights_file
 from codesign.batches import parallel
@@ -101,7 +99,7 @@ def _train_and_search(
     for record in console.track(records, total=steps_left, label="training"):
         checkpoint.append_entry(folder / LOG, {"kind": "step", **asdict(record)})
         if event_writer:
-            _write_events(event_writer, going, record)
+            _write_events(event_writer, record)
         if (limit := going.trainer.pitch_held_um) is not None and not pitch_reported:
             pitch_reported = True
             console.say(f"step {record.step}: {_of_pitch(going, limit)}")
@@ -220,15 +218,11 @@ def _event_writer(folder: Path, step: int) -> Any:
     return make(str(folder), purge_step=step + 1 if step else None)
 
 
-def _write_events(writer: Any, codesign_run: CodesignRun, record: LogRecord) -> None:
-    """Write a step to TensorBoard, and pictures every ``checkpoint_every`` steps."""
+def _write_events(writer: Any, record: LogRecord) -> None:
+    """Write a step's scalars to TensorBoard."""
     for name, value in asdict(record).items():
         if name != "step":
             writer.add_scalar(name, float(value), record.step)
-    if record.step % codesign_run.settings.checkpoint_every == 0:
-        for name, picture in results.run_pictures(codesign_run).items():
-            image = plt_image.imread(io.BytesIO(picture))
-            writer.add_image(name, image, record.step, dataformats="HWC")
     writer.flush()
 
 
@@ -279,7 +273,6 @@ def _write_results(
         "steps": settings.inner.steps,
         "rows": rows,
     }
-    record |= {"bound": results.window_depth_bound(codesign_run)}
     record |= {"frozen": list(settings.run.frozen), "image": said}
     record |= {"pitch_held_um": codesign_run.trainer.pitch_held_um}
     record |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}

@@ -15,7 +15,7 @@ PARTS: dict[str, tuple[str, str]] = {
     ),
     "experiment": (
         "codesign.commands.options.experiment",
-        "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 9 to 11)",
+        "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 10 and 11)",
     ),
     "paper": (
         "codesign.commands.options.paper",

@@ -128,7 +128,8 @@ def _measure(
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *remarks])) from error
     tables = [
-        *evaluate_optics.format_tables(axial, scenes, setting, spread=remarks),
+        evaluate_optics.axial_table(axial, setting, remarks),
+        evaluate_optics.scene_table(scenes),
         *field_page.field_tables(over_field),
     ]
     values = evaluate_optics.table_values(axial, scenes, setting)

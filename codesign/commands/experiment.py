@@ -1,4 +1,4 @@
-"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each
+"""RUN_DIR... to Figs. 10 and 11: gaze and slippage of synthetic subjects before each
 run's lens and network (Sec. 5).
 """
 
@@ -22,7 +22,6 @@ from metalens.core import reading, report, store
 from metalens.core.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
-PLACED = {"random": "drawn at random", "spread": "spread over the field"}
 GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-range"}
 
 
@@ -63,12 +62,15 @@ def run(options: Options) -> int:
         values = experiment_summary(results, config) | {
             "images": image_summary(options.runs, names),
             "lenses": lenses,
+            "beyond_training_mm": {
+                name: _beyond_training(source, config)
+                for name, source in zip(names, sources, strict=True)
+            },
         }
         values["failures"] = [
             f"{result.name}: {result.above}" for result in results if result.above
         ]
         pictures = {
-            "samples.png": plots.plot_samples(sources[0], config),
             "ambiguity.png": plots.plot_ambiguity(results[0]),
             "errors.png": plots.plot_gaze_errors(results),
         }
@@ -142,16 +144,10 @@ def experiment_summary(
     subject_means = [_subject_means(r) for r in results]
     rows = []
     for result, means in zip(results, subject_means, strict=True):
-        row: dict[str, Any] = {
-            "name": result.name,
-            "mmacs": result.mmacs,
-            **_beyond(result),
-        }
+        row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs}
         for quantity, values in means.items():
-            # nan: a network without a mask has no overlap
-            finite = bool(np.isfinite(values).all())
-            row[quantity] = float(values.mean()) if finite else None
-            if finite and len(values) > 1:
+            row[quantity] = float(values.mean())
+            if len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap_interval(values))
         rows.append(row | _finer_image_errors(result, row))
     ratios = []
@@ -183,42 +179,21 @@ def _finer_image_errors(result: RunResult, row: dict[str, Any]) -> dict[str, Any
     if result.finer is None:
         return {f"finer_{name}": None for name in (*FINER, "ratio")}
     means = _subject_means(result.finer)
-    errors = {}
-    for name in FINER:
-        value = float(means[name].mean())
-        errors[f"finer_{name}"] = value if np.isfinite(value) else None
+    errors = {f"finer_{name}": float(means[name].mean()) for name in FINER}
     ratio = errors["finer_gaze_axial_deg"] / row["gaze_axial_deg"]
     return errors | {"finer_ratio": ratio}
 
 
-def _beyond(result: RunResult) -> dict[str, Any]:
-    """Slippages outside the range of training, that range, and axial errors in and
-    outside.
-
-    Empty where none is outside.
+def _beyond_training(
+    source: FinishedRun, config: ExperimentConfig
+) -> list[list[float]]:
+    """Slippages (x, y, z) of the experiment in mm outside the range of a run's
+    training.
     """
-    within = result.within
-    if within.all():
-        return {}
-    axial = result.slip_error_mm[:, 2]
-    slips = np.unique(result.trial.slip_mm[~within], axis=0)
-    return {
-        "trained_to_mm": list(result.reach_mm), "beyond_training_mm": slips.tolist(),
-        "slip_axial_within_mm": float(axial[within].mean()), "slip_axial_beyond_mm": float(axial[~within].mean()),
-    }  # fmt: skip
-
-
-def _of_reach(row: dict[str, Any]) -> str:
-    """Sentence on the slippages of :func:`_beyond`."""
-    beyond = ", ".join(
-        "(" + ", ".join(f"{v:g}" for v in slip) + ")"
-        for slip in row["beyond_training_mm"]
-    )
-    range_mm = ", ".join(f"{v:g}" for v in row["trained_to_mm"])
-    return (
-        f"{row['name']}: trained on slippage up to ({range_mm}) mm; {beyond} mm lie outside of what it saw: axial error "
-        f"{row['slip_axial_beyond_mm']:.2f} mm there, {row['slip_axial_within_mm']:.2f} mm within (scenes.slip_mm)"
-    )
+    slips = config.slips_mm
+    outside = (np.abs(slips) > source.settings.scenes.slip_mm).any(1)
+    beyond: list[list[float]] = slips[outside].tolist()
+    return beyond
 
 
 def _subject_means(result: RunResult) -> dict[str, Any]:
@@ -229,11 +204,9 @@ def _subject_means(result: RunResult) -> dict[str, Any]:
         "gaze_lateral_deg": result.per_subject(
             result.gaze_deg, result.trial.group(LATERAL)
         ),
-        "gaze_told_slip_deg": result.per_subject(result.told_deg, axial),
         "slip_mm": result.per_subject(error.mean(1)),
         "slip_axial_mm": result.per_subject(error[:, 2]),
         "slip_lateral_mm": result.per_subject(error[:, :2].mean(1)),
-        "slip_rest_mm": result.per_subject(result.slip_rest_mm.mean(1)),
         "iou": result.per_subject(result.iou),
     }
 
@@ -268,7 +241,11 @@ def _remarks(values: dict[str, Any]) -> list[str]:
         for name, lens in values["lenses"].items()
         if lens != "as designed"
     ]
-    return made + [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
+    for name, slips in values["beyond_training_mm"].items():
+        places = ", ".join("({:g}, {:g}, {:g})".format(*slip) for slip in slips)
+        if slips:
+            made.append(f"{name}: slippages {places} mm lie outside its training")
+    return made
 
 
 def experiment_text(values: dict[str, Any]) -> str:
@@ -304,18 +281,15 @@ COLUMNS = {
     "finer_gaze_axial_deg": "finer image / deg",
     "finer_ratio": "ratio",
     "gaze_lateral_deg": "gaze, lateral slip / deg",
-    "gaze_told_slip_deg": "slip told / deg",
     "slip_mm": "slip / mm",
     "finer_slip_mm": "finer image / mm",
     "slip_axial_mm": "axial slip / mm",
     "slip_lateral_mm": "lateral slip / mm",
-    "slip_rest_mm": "from calibration / mm",
     "iou": "IoU",
 }
 CAPTIONS = {
     "errors.png": "Mean gaze error at every stimulus: area of the markers (paper Fig. 11).",
     "ambiguity.png": "Pupil centres under slippage (paper Fig. 10): one place, many gazes.",
-    "samples.png": "Eyes by slippage state, pupil as it is (green) and as read (red) (paper Fig. 9).",
 }
 
 
@@ -346,12 +320,11 @@ def _method_text(about: dict[str, Any]) -> str:
     """Paragraph on subjects, calibration and intervals."""
     return (
         f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each is calibrated on "
-        f"{about['share']:.0%} of the stimuli, {PLACED[about['points']]}, and judged on the rest: what is read (axis, "
+        f"{about['share']:.0%} of the stimuli, drawn at random, and judged on the rest: what is read (axis, "
         f"pupil, slippage) becomes gaze by a linear mixed model learned from {about['people']} other people, or, of a "
         "network that tells no axis, by a sphere and a regressor of one hidden layer. Subjects "
-        f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
-        "error under axial slip is that of pupil, sphere and regressor alone. From calibration: the slip error beside "
-        f"its mean over the frames that calibrated a subject. Intervals are over subjects. {_light_text(about)}"
+        f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. Intervals are over subjects. "
+        f"{_light_text(about)}"
     )
 
 

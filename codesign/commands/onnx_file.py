@@ -11,26 +11,6 @@ from codesign.train import CodesignRun
 from metalens.psf import pixel_count
 
 
-def scale_of(run: CodesignRun) -> exported.OutputScale:
-    """What a run's networks answer in."""
-    inner = run.settings.inner
-    pitch = float(run.trainer.model.pitch_um.detach())
-    return exported.OutputScale(
-        frame_mm=pixels_of(run) * pitch * 1e-3,
-        slip_mm=inner.slip_scale_mm,
-        elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
-        axis=inner.axis_weight > 0,
-        points=inner.point_weight > 0,
-    )
-
-
-def pixels_of(run: CodesignRun) -> int:
-    """Pixels along a side of the run's sensor."""
-    settings = run.settings
-    pitch = float(run.trainer.model.pitch_um.detach())
-    return pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
-
-
 def write_network_file(
     path: Path, run: CodesignRun, net: Supernet, architecture: Architecture
 ) -> None:
@@ -43,11 +23,15 @@ def write_network_file(
     Raises:
         OSError: the target cannot be written.
     """
-    pitch = float(run.trainer.model.pitch_um.detach())
-    exported.write_onnx(
-        path,
-        Subnet(net, architecture),
-        scale_of(run),
-        size=pixels_of(run),
-        pitch_um=pitch,
+    inner, settings = run.settings.inner, run.settings
+    pitch_um = float(run.trainer.model.pitch_um.detach())
+    size = pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch_um)
+    scale = exported.OutputScale(
+        frame_mm=size * pitch_um * 1e-3,
+        slip_mm=inner.slip_scale_mm,
+        elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
+        axis=inner.axis_weight > 0,
+        points=inner.point_weight > 0,
     )
+    subnet = Subnet(net, architecture)
+    exported.write_onnx(path, subnet, scale, size=size, pitch_um=pitch_um)

@@ -18,7 +18,7 @@ from codesign.settings import ExperimentConfig
 from metalens.core import report, store
 from metalens.core.errors import ConfigError
 
-JSON, PAGE, GAZE = "paper.json", "report.html", "gaze.json"
+JSON, PAGE = "paper.json", "report.html"
 DIM_DB = 15.0
 
 
@@ -115,19 +115,14 @@ def collect_measurements(
         measured |= paper.of_dim(experiment, dim)
     if optics.is_file():
         measured |= paper.of_optics(optics)
-    if (folder / GAZE).is_file():
-        measured |= paper.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
     rows = {role: finished.rows_of(path) for role, path in runs.items()}
-    measured |= paper.of_runs(rows)
-    return measured | paper.of_ablations(
-        rows.get("proposed", []), dict(paper.frozen_rows(others))
-    )
+    ours = rows.get("proposed", [])
+    measured |= paper.of_runs(rows) | paper.of_gaze(ours)
+    return measured | paper.of_ablations(ours, dict(paper.frozen_rows(others)))
 
 
 def _run_measurements(options: Options, folder: Path) -> None:
-    """Run the experiments, gaze and optics evaluations that are missing in the
-    folder.
-    """
+    """Run the experiments and the optics evaluation that are missing in the folder."""
     names = ROLES[: len(options.runs)]
     config = ExperimentConfig(subjects=options.subjects)
     for name, settings in (
@@ -140,7 +135,6 @@ def _run_measurements(options: Options, folder: Path) -> None:
                 options.runs, folder / name, names, settings, quiet=True, force=True
             )
             command_experiment.run(experiment)
-    _measure_gaze(options, folder / GAZE)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
         order = sorted(
@@ -162,17 +156,6 @@ def _run_measurements(options: Options, folder: Path) -> None:
             force=True,
         )
         command_evaluate_optics.run(optics)
-
-
-def _measure_gaze(options: Options, path: Path) -> None:
-    """Gaze of the proposed run; not measured again where it is in the file."""
-    measured = json.loads(path.read_text("utf-8")) if path.is_file() else {}
-    folder = options.runs[0]
-    if str(folder) in measured:
-        return
-    options.console.say(f"measuring: gaze of {folder}")
-    measured[str(folder)] = {"rows": paper.gaze_rows(folder)}
-    store.write_text(path, json.dumps(measured, indent=1) + "\n")
 
 
 def _copy_lens(folder: Path, name: str, run_dir: Path) -> Path:

@@ -93,31 +93,13 @@ def _retrain_and_correct(
         )
         true_parameters = list(draws)[-1]
     mask = next_mask.plan_next_mask(result, old=old, truths=[true_parameters])
-    proposals = []
-    frames = retraining.render_test_frames(source, options.settings)
-    for step in console.track(mask.steps, total=len(mask.steps), label="next lens"):
-        stack = made.redrawn(step.lens).stack(step.parameters)
-        error = retraining.judge_network(
-            trained["nominal"],
-            source,
-            options.settings,
-            (stack,),
-            frames=frames,
-            finer=False,
-        )
-        proposals.append((step, psf_error(stack, psfs.nominal), error.slip_mm))
-    psf_errors = (
-        psf_error(psfs.best, psfs.nominal),
-        psf_error(psfs.judges[0], psfs.nominal),
-    )
     results = retrain_report.RetrainingResults(
         outcome,
-        psfs,
-        psf_errors,
-        _curves(folder, psfs),
+        (psf_error(psfs.best, psfs.nominal), psf_error(psfs.judges[0], psfs.nominal)),
+        len(psfs.drawn),
+        psfs.known,
         mask,
-        proposals,
-        _cautions(result, psfs),
+        _cautions(result, known=psfs.known),
     )
     if not mask.refused:
         next_mask.write_correction(folder, mask.plan, evened=not mask.uneven)
@@ -189,21 +171,7 @@ def _train(
     return trainer
 
 
-def _curves(
-    folder: Path, lens_psfs: LensPsfs
-) -> dict[str, tuple[list[int], list[float]]]:
-    """{job: (steps, task losses)} of the log."""
-    entries = checkpoint.read_entries(folder / LOG)
-    return {
-        name: (
-            [e["step"] for e in entries if e["job"] == name],
-            [e["task"] for e in entries if e["job"] == name],
-        )
-        for name in retraining.available_jobs(lens_psfs)
-    }
-
-
-def _cautions(result: asbuilt.AsBuilt, lens_psfs: LensPsfs) -> list[str]:
+def _cautions(result: asbuilt.AsBuilt, *, known: bool) -> list[str]:
     """Warnings about the fit and its use, in words."""
     words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
@@ -211,7 +179,7 @@ def _cautions(result: asbuilt.AsBuilt, lens_psfs: LensPsfs) -> list[str]:
         words.append(
             f"the as-built record was made by release {release}, this is {__version__}"
         )
-    if not lens_psfs.known:
+    if not known:
         words.append(
             "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
         )
@@ -243,15 +211,9 @@ def _values(
 ) -> dict[str, Any]:
     """Content of result.json."""
     outcome, folder = story.outcome, options.output
-    states = [
-        {
-            "name": p.name,
-            "psf_error": error,
-            "strehl": p.strehl,
-            "light": p.light,
-            "slip_mm": slip,
-        }
-        for p, error, slip in story.proposals
+    steps = [
+        {"name": step.name, "strehl": step.strehl, "light": step.light}
+        for step in story.mask.steps
     ]
     return {
         "folder": str(folder),
@@ -267,9 +229,9 @@ def _values(
         "gap_mm": outcome.gap_mm,
         "gap_sigma_mm": outcome.gap_sigma_mm,
         "recovered": outcome.recovered,
-        "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
-        "truth_known": story.lenses.known,
-        "next_lens": states,
+        "psf_error": dict(zip(("fitted", "judge"), story.psf_errors, strict=True)),
+        "truth_known": story.known,
+        "next_lens": steps,
         "correction_refused": story.mask.refused,
         "map_refused": story.mask.uneven,
     }
@@ -285,9 +247,7 @@ def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
         else f"{o.recovered:.0%} won back"
     )
     lines.append(f"gap {o.gap_mm:.3f} +- {o.gap_sigma_mm:.3f} mm, {won}")
-    for p, error, slip in story.proposals:
-        lines.append(
-            f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"
-        )
+    for step in story.mask.steps:
+        lines.append(f"next lens, {step.name:<26} Strehl {step.strehl:.3f}")
     lines.append(f"next mask: {story.mask.summary}")
     return "\n".join([*lines, f"open {folder / 'report.html'}"])

@@ -40,7 +40,7 @@ class SceneSettings:
     unchanged image).
     variety: of the looks, as of training's frames: 1 the population as published, bare;
     2 with spectacles, make-up,
-        uneven light, shadows, movement and other views as well.
+        uneven light, shadows and movement as well.
     layer_mm: thickness of the depth layers that are written; at most 0.5.
     """
 
@@ -222,44 +222,24 @@ def _write_layers(
 def _labels_csv(rendered: RenderedFrames) -> str:
     """Labels as comma-separated values, a frame a line."""
     labels = rendered.labels
-    landmark_columns = [
-        f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"
-    ]
-    names = [
-        "slip x um",
-        "slip y um",
-        "slip z um",
-        "optic x",
-        "optic y",
-        "optic z",
-        "visual x",
-        "visual y",
-        "visual z",
-    ]
-    names += [
-        "pupil x um",
-        "pupil y um",
-        "pupil z um",
-        "pupil x px",
-        "pupil y px",
-        "visible",
-        *landmark_columns,
-    ]
-    columns = [
-        labels.slip_um,
-        labels.optic_axis,
-        labels.visual_axis,
-        labels.pupil_um,
-        labels.pupil_px,
-    ]
-    columns += [labels.visible[:, None], labels.landmarks_px.flatten(1)]
-    rows = torch.cat(columns, 1).tolist()
-    return (
-        "\n".join(
-            [",".join(names), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
-        )
-        + "\n"
+    parts = (
+        ("slip", "xyz", " um", labels.slip_um),
+        ("optic", "xyz", "", labels.optic_axis),
+        ("visual", "xyz", "", labels.visual_axis),
+        ("pupil", "xyz", " um", labels.pupil_um),
+        ("pupil", "xy", " px", labels.pupil_px),
+        ("visible", ("",), "", labels.visible[:, None]),
+        *(
+            (name, "xy", " px", labels.landmarks_px[:, k])
+            for k, name in enumerate(landmarks.NAMES)
+        ),
     )
+    head = [
+        f"{name} {axis}{unit}".strip() for name, axes, unit, _ in parts for axis in axes
+    ]
+    rows = torch.cat([values for *_, values in parts], 1).tolist()
+    lines = [",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
+    return "\n".join(lines) + "\n"
 
 
 def contact_sheet(
@@ -275,21 +255,16 @@ def contact_sheet(
     import cv2
 
     light = rendered.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)
-    frames = list((light * 255).numpy().astype(np.uint8))
     depth = (rendered.frames.depth_um * rendered.frames.coverage).sum(1)[:columns]
-    low, high = float(depth.min()), float(depth.max())
-    shades = 255 * (high - depth) / max(high - low, 1e-9)
-    if len(frames) % columns == 0:
-        frames += list(shades.numpy().astype(np.uint8))
-    if len(frames) % columns == 0:
-        frames += list((rendered.pupil[:columns] * 255).numpy().astype(np.uint8))
-    blank = np.zeros_like(frames[0])
-    frames += [blank] * (-len(frames) % columns)
-    rows = [
-        np.concatenate(frames[k : k + columns], 1)
-        for k in range(0, len(frames), columns)
-    ]
-    encoded, coded = cv2.imencode(".png", np.concatenate(rows, 0))
+    nearness = (depth.max() - depth) / (depth.max() - depth.min()).clamp_min(1e-9)
+    size = light.shape[-1]
+    rows = []
+    for pictures in (light, nearness, rendered.pupil[:columns]):
+        blank = torch.zeros(-len(pictures) % columns, size, size)
+        tiles = torch.cat([pictures, blank]).unflatten(0, (-1, columns))
+        rows.append(tiles.transpose(1, 2).reshape(-1, columns * size))
+    sheet = (255 * torch.cat(rows)).numpy().astype(np.uint8)
+    encoded, coded = cv2.imencode(".png", sheet)
     if not encoded:
         raise OSError(f"{path}: the picture could not be encoded")
     store.write_bytes(path, coded.tobytes())

@@ -1,5 +1,5 @@
-"""Panels of a co-design run (training, searches, networks, answers, bound, lens), of
-rendered eyes, of a budget.
+"""Panels of a co-design run (training, searches, networks, answers, lens), of rendered
+eyes, of a budget.
 """
 
 import json
@@ -35,8 +35,8 @@ ANSWERS = "answers.h5"
 def run_panels(path: Path) -> list[Panel]:
     """Panels of a run's folder, finished or not.
 
-    Training curves, searched networks, results, test frames with predictions, bound and
-    lens, as far as their files exist.
+    Training curves, searched networks, results, test frames with predictions and lens,
+    as far as their files exist.
 
     Args:
         path: of the folder.
@@ -56,7 +56,6 @@ def run_panels(path: Path) -> list[Panel]:
     ]
     if (path / ANSWERS).is_file():
         panels += prediction_panels(path / ANSWERS)
-    panels += _bound_panels(result)
     if (path / LENS).is_file():
         panels += lens_panels(path / LENS)
     return panels
@@ -102,37 +101,12 @@ def _training_panels(entries: list[dict[str, Any]]) -> list[Panel]:
         name: np.array([entry.get(name, np.nan) for entry in steps], float)
         for name in names
     }
-    titles = {name: report.in_words(name) for name in names}
-    varying = [name for name in names if np.ptp(values[name]) > 0]
-    budgets = list(
-        dict.fromkeys(
-            entry["budget_mmacs"] for entry in entries if "budget_mmacs" in entry
-        )
-    )
-    curves_by_name = {name: {titles[name]: values[name]} for name in varying}
-    if "mmacs" in curves_by_name and len(budgets) > 1:
-        curves_by_name["mmacs"] = _curves_by_budget(x, values["mmacs"], budgets)
     return [
-        CurvePanel(f"Training: {titles[name]}", x, "step", curves, "")
-        for name, curves in curves_by_name.items()
+        CurvePanel(f"Training: {title}", x, "step", {title: curve}, "")
+        for name, curve in values.items()
+        if np.ptp(curve) > 0
+        for title in [report.in_words(name)]
     ]
-
-
-def _curves_by_budget(
-    step: Array, values: Array, budgets: list[float]
-) -> dict[str, Array]:
-    """(steps,) curve of each budget, of a value that belongs to one budget in turn.
-
-    Step s belongs to budget (s - 1) mod len(budgets). Between its steps the last value
-    is repeated; before the first it is nan.
-    """
-    curves = {}
-    for i, budget in enumerate(budgets):
-        last = np.maximum.accumulate(
-            np.where((step - 1) % len(budgets) == i, np.arange(len(step)), -1)
-        )
-        curves[f"budget {budget:g}"] = np.where(last >= 0, values[last], np.nan)
-    return curves
 
 
 def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
@@ -149,12 +123,8 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     ]
     if not births:
         return []
-    candidates = [
-        EvaluatedCandidate(
-            _architecture(e.get("architecture", {})), e["error"], e["mmacs"]
-        )
-        for e in births
-    ]
+    whichever = Architecture((), (), ())  # the front asks for error and cost alone
+    candidates = [EvaluatedCandidate(whichever, e["error"], e["mmacs"]) for e in births]
     front = [
         next(i for i, candidate in enumerate(candidates) if candidate is best)
         for best in pareto_front(candidates)
@@ -178,19 +148,6 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     ]
 
 
-def _architecture(values: dict[str, Any]) -> Architecture:
-    """Architecture from its entry in a log; empty sizes where the entry lacks them."""
-    sizes = {
-        name: tuple(values.get(name, ()))
-        for name in ("depths", "kernels", "expansions")
-    }
-    return Architecture(
-        **sizes,
-        width=values.get("width", 1.0),
-        resolution=values.get("resolution", 1.0),
-    )
-
-
 def _layer_rows(architecture: dict[str, Any]) -> list[tuple[str, str]]:
     """(property, value) rows of a network: input scale, channels, blocks of each stage.
 
@@ -212,36 +169,10 @@ def _layer_rows(architecture: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _bound_panels(result: dict[str, Any]) -> list[Panel]:
-    """Cramér-Rao bound on the depth of a window over the depth; [] where the run has
-    none.
-    """
-    bound = result.get("bound")
-    if not bound:
-        return []
-    depth_mm = np.array(bound["depth_mm"])
-    sigma_mm = np.array(bound["window_depth_mm"])
-    caption = (
-        "Least standard deviation of any reader of the blur of one window, on axis: 1/f texture as wide as the PSFs, "
-        "noise a thousandth of its power. Readers of real frames collect less."
-    )
-    return [
-        CurvePanel(
-            "Bound on the depth of a window",
-            depth_mm,
-            "depth / mm",
-            {"bound": sigma_mm},
-            "mm",
-            caption=caption,
-            scale="log",
-        )
-    ]
-
-
 def prediction_panels(path: Path) -> list[Panel]:
     """Test frames, and predictions of the networks next to the truth.
 
-    Pupil mask and window depths as images that alternate; a table of slippages in mm.
+    Pupil masks as images that alternate; a table of slippages in mm.
 
     Args:
         path: of the file.
@@ -253,46 +184,28 @@ def prediction_panels(path: Path) -> list[Panel]:
         str(stored.attributes[f"network_{i}"])
         for i in range(len(arrays["told_slip_um"]))
     ]
-    axes = [
-        SliderAxis("network", names),
-        SliderAxis("frame", list(range(count))),
-        SliderAxis("shown", ["truth", "answer"], blink=True),
-    ]
+    frames = SliderAxis("frame", list(range(count)))
     panels: list[Panel] = [
-        ImagePanel(
+        _pixels(
             "Frames of the test",
             arrays["frames"],
-            axes[1:2],
-            1.0,
+            [frames],
             "of its spread",
-            across="pixels",
             from_least=True,
         )
     ]
-    for title, truth, predicted, unit in _PAIRS:
-        if predicted in arrays:
-            repeated = np.broadcast_to(arrays[truth], arrays[predicted].shape)
-            pair = np.stack([repeated, arrays[predicted]], axis=2)
-            scaled = pair * (1e-3 if unit == "mm" else 1.0)
-            panels.append(
-                ImagePanel(
-                    title,
-                    scaled,
-                    axes,
-                    1.0,
-                    unit,
-                    across="cells",
-                    from_least=unit == "mm",
-                )
-            )
+    predicted = arrays["told_pupil"]
+    truth = np.broadcast_to(arrays["pupil"], predicted.shape)
+    choice = SliderAxis("shown", ["truth", "answer"], blink=True)
+    axes = [SliderAxis("network", names), frames, choice]
+    pair = np.stack([truth, predicted], axis=2)
+    panels.append(_pixels("Pupil", pair, axes, "share of the pixel"))
     rows = []
     for i, name in enumerate(names):
         slips = np.stack(
             [arrays["slip_um"], arrays["told_slip_um"][i]], axis=2
         ).reshape(count, 6)
-        half_widths = [
-            1e-3 * v if v == v else "–" for v in arrays["interval_um"][i].tolist()
-        ]
+        half_widths = (1e-3 * arrays["interval_um"][i]).tolist()
         rows += [
             (name, k, *(1e-3 * slips[k]).tolist(), half_widths[k]) for k in range(count)
         ]
@@ -310,7 +223,7 @@ def prediction_panels(path: Path) -> list[Panel]:
 
 
 def _network_panels(result: dict[str, Any]) -> list[Panel]:
-    """Tables of the results and of the layers of every network; [] without a result."""
+    """Table of the results; [] without a result."""
     if not result:
         return []
     rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
@@ -323,27 +236,18 @@ def _network_panels(result: dict[str, Any]) -> list[Panel]:
         }
     )
     table = [[row.get(name, "") for name in names] for row in rows]
-    panels: list[Panel] = [
+    return [
         TablePanel(
             "Networks of the run", [report.in_words(name) for name in names], table
         )
     ]
-    layers_of_budgets = [
-        (f"budget {row['budget_mmacs']:g}", _layer_rows(architecture))
-        for row in rows
-        if (architecture := row.get("architecture"))
-    ]
-    if layers_of_budgets:
-        columns = ["", *(name for name, _ in layers_of_budgets)]
-        lines = [
-            [what, *(layers[i][1] for _, layers in layers_of_budgets)]
-            for i, (what, _) in enumerate(layers_of_budgets[0][1])
-        ]
-        caption = (
-            "Blocks of each stage: side of the kernel × expansion of the channels."
-        )
-        panels.append(TablePanel("Layers of the networks", columns, lines, caption))
-    return panels
+
+
+def _pixels(
+    title: str, values: Array, axes: list[SliderAxis], unit: str, **more: Any
+) -> ImagePanel:
+    """Pictures on the pixels of a frame."""
+    return ImagePanel(title, values, axes, 1.0, unit, across="pixels", **more)
 
 
 def scene_panels(path: Path) -> list[Panel]:
@@ -376,7 +280,7 @@ def scene_panels(path: Path) -> list[Panel]:
     columns = [
         f"{report.in_words(name)}{axis}"
         for name, v in shown_labels.items()
-        for axis in ([""] if v.ndim == 1 else _XYZ)
+        for axis in ([""] if v.ndim == 1 else (", x", ", y", ", z"))
     ]
     rows = [
         [
@@ -387,32 +291,12 @@ def scene_panels(path: Path) -> list[Panel]:
         ]
         for i in range(count)
     ]
+    radiance = arrays["radiance"].sum(1, dtype=float) / full
+    pupil = arrays["pupil"] / full
     return [
-        ImagePanel(
-            "Rendered eyes",
-            arrays["radiance"].sum(1, dtype=float) / full,
-            frames,
-            1.0,
-            "of full light",
-            across="pixels",
-        ),
-        ImagePanel(
-            "Depth",
-            depth_mm,
-            frames,
-            1.0,
-            "mm from the lens",
-            across="pixels",
-            from_least=True,
-        ),
-        ImagePanel(
-            "Pupil",
-            arrays["pupil"] / full,
-            frames,
-            1.0,
-            "share of the pixel",
-            across="pixels",
-        ),
+        _pixels("Rendered eyes", radiance, frames, "of full light"),
+        _pixels("Depth", depth_mm, frames, "mm from the lens", from_least=True),
+        _pixels("Pupil", pupil, frames, "share of the pixel"),
         TablePanel(
             "Labels",
             ("frame", *columns),
@@ -431,23 +315,10 @@ def layer_panels(path: Path) -> list[Panel]:
     """
     arrays = store.load(path, "layers").arrays
     axis = [SliderAxis("layer at", (1e-3 * arrays["depth_um"]).tolist(), "mm")]
+    covered = arrays["coverage"]
     return [
-        ImagePanel(
-            "Light of a layer",
-            arrays["radiance"],
-            axis,
-            1.0,
-            "of full light",
-            across="pixels",
-        ),
-        ImagePanel(
-            "What a layer covers",
-            arrays["coverage"],
-            axis,
-            1.0,
-            "share of the pixel",
-            across="pixels",
-        ),
+        _pixels("Light of a layer", arrays["radiance"], axis, "of full light"),
+        _pixels("What a layer covers", covered, axis, "share of the pixel"),
     ]
 
 
@@ -506,37 +377,5 @@ def budget_panels(path: Path) -> list[Panel]:
     Args:
         path: of the file.
     """
-    rows = [
-        (
-            row.link,
-            row.phase_rad,
-            row.psf,
-            math.degrees(row.gaze_rad),
-            "yes" if row.counted else "no",
-            row.method,
-        )
-        for row in budgets.load_budget(path)
-    ]
-    cells = [
-        tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row)
-        for row in rows
-    ]
-    head = (
-        "link",
-        "phase / rad",
-        "PSF, relative L2",
-        "gaze / deg",
-        "in the sum",
-        "how",
-    )
-    caption = (
-        "The last row is the root of the sum of squares of those that are in the sum."
-    )
-    return [TablePanel("Error of every link", head, cells, caption)]
-
-
-_PAIRS = (
-    ("Pupil", "pupil", "told_pupil", "share of the pixel"),
-    ("Depth of the windows", "window_um", "told_window_um", "mm"),
-)
-_XYZ = (", x", ", y", ", z")
+    table = budgets.budget_table(budgets.load_budget(path))
+    return [TablePanel("Error of every link", table.head, table.rows, table.caption)]

@@ -13,19 +13,18 @@ from codesign.adapt import FinishedRun
 from codesign.batches import EXPERIMENT
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.eye import PinholeCamera, RenderedFrames, render
-from codesign.gaze import CalibratedPerson, NetworkReadings, PersonCalibrator, angle_deg
+from codesign.gaze import NetworkReadings, PersonCalibrator, angle_deg
 from codesign.optics import MadeLens, OpticsConfig, formed
 from codesign.settings import ExperimentConfig
-from codesign.train import assess
 from metalens.cell import Incidence
 from metalens.core.arrays import Array
-from metalens.core.errors import CellError, LensError, PropagationError, SceneError
+from metalens.core.errors import CellError, LensError
 from metalens.design import neighbours as supercell
 from metalens.fabrication import Printed, State, draw_lenses
 from metalens.image import Imager, Optics, node_light, normalise_psfs, with_psfs
 from metalens.lens import Lens, NeighbourRows
 from metalens.library import PillarLibrary, engines
-from metalens.psf import SpectralNodes, among
+from metalens.psf import among
 
 NONE = math.nan
 TOTAL, MEASURED = "all links", "measured, all at once"
@@ -116,95 +115,54 @@ def image_difference(one: Imager, other: Imager) -> float:
     return float((one.stack - other.stack).norm() / other.stack.norm())
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class ImagingDevice:
-    """Lens plane, films and sensor, with their imager.
-
-    Imagers of changed optics share field points, depths, wavelengths and kernels with
-    it, so that they differ by the change alone.
+@torch.no_grad()
+def image_through(optics: Optics, base: Imager) -> Imager:
+    """Imager of other optics at the field points, depths, wavelengths and kernels of
+    ``base``, so that the two differ by the optics alone.
     """
+    light = node_light(optics, base.plan).detach()
+    return with_psfs(base, *normalise_psfs(light, optics, base.plan))
 
-    optics: Optics
-    whole: Imager
 
-    @torch.no_grad()
-    def image(self, optics: Optics) -> Imager:
-        """Imager of other optics at the same field points and depths."""
-        light = node_light(optics, self.whole.plan).detach()
-        return with_psfs(self.whole, *normalise_psfs(light, optics, self.whole.plan))
+@torch.no_grad()
+def both_polarisations(optics: Optics, base: Imager) -> Imager:
+    """Imager by the flux of both polarisations through the sensor, in place of the
+    intensity of a scalar field.
 
-    def one_psf(self) -> Imager:
-        """Imager with the PSFs of the middle of the field everywhere."""
-        stack = self.whole.stack
-        rows, columns = (n // 2 for n in stack.shape[:2])
-        middle = stack[rows, columns].expand_as(stack).contiguous()
-        return with_psfs(self.whole, middle, self.whole.energy)
+    The difference of the two is small and smooth: it is computed at 5 x 5 field points
+    at most, interpolated bilinearly, and added to the scalar PSFs.
 
-    def evenly_lit(self) -> Imager:
-        """Imager with the same light from every direction: without cos⁴ and vignetting."""
-        even = self.whole.energy.mean().expand_as(self.whole.energy).contiguous()
-        return with_psfs(self.whole, self.whole.stack, even)
-
-    @torch.no_grad()
-    def one_wavelength(self, wavelength_um: float) -> Imager:
-        """Imager in light of one wavelength.
-
-        Args:
-            wavelength_um: wavelength of the light.
-        """
-        waves = SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
-        plan = replace(self.whole.plan, waves=waves)
-        light = node_light(self.optics, plan).detach()
-        return with_psfs(self.whole, *normalise_psfs(light, self.optics, plan))
-
-    @torch.no_grad()
-    def both_polarisations(self) -> Imager:
-        """Imager by the flux of both polarisations through the sensor, in place of the
-        intensity of a scalar field.
-
-        The difference of the two is small and smooth: it is computed at 5 x 5 field
-        points at most, interpolated bilinearly, and added to the scalar PSFs.
-        """
-        plan = self.whole.plan
-        optics = self.optics
-        if plan.window.components:
-            return self.whole
-        coarse_y, coarse_x = (
-            torch.linspace(float(a[0]), float(a[-1]), min(5, len(a)), dtype=a.dtype)
-            for a in (plan.y_um, plan.x_um)
+    Args:
+        optics: lens plane, films and sensor distance. base: its scalar imager.
+    """
+    plan = base.plan
+    if plan.window.components:
+        return base
+    coarse = [
+        torch.linspace(float(a[0]), float(a[-1]), min(5, len(a)), dtype=a.dtype)
+        for a in (plan.y_um, plan.x_um)
+    ]
+    at_coarse = replace(plan, y_um=coarse[0], x_um=coarse[1])
+    scalar, vectorial = (
+        node_light(
+            optics, replace(at_coarse, window=replace(plan.window, components=count))
         )
-        scalar, vectorial = (
-            node_light(
-                optics,
-                replace(
-                    plan,
-                    y_um=coarse_y,
-                    x_um=coarse_x,
-                    window=replace(plan.window, components=count),
-                ),
-            )
-            for count in (0, plan.window.whole)
-        )
-        weights_y, weights_x = (
-            (1 - (fine[:, None] - coarse).abs() / (coarse[1] - coarse[0])).clamp_min(0)
-            for fine, coarse in ((plan.y_um, coarse_y), (plan.x_um, coarse_x))
-        )
-        change = torch.einsum(
-            "ya,xb,abzhw->yxzhw",
-            weights_y.to(vectorial),
-            weights_x.to(vectorial),
-            vectorial - scalar,
-        )
-        light = node_light(optics, plan) + change
-        return with_psfs(self.whole, *normalise_psfs(light, optics, plan))
+        for count in (0, plan.window.whole)
+    )
+    weights = [
+        (1 - (fine[:, None] - few).abs() / (few[1] - few[0])).clamp_min(0).to(scalar)
+        for fine, few in zip((plan.y_um, plan.x_um), coarse, strict=True)
+    ]
+    change = torch.einsum("ya,xb,abzhw->yxzhw", *weights, vectorial - scalar)
+    light = node_light(optics, plan) + change
+    return with_psfs(base, *normalise_psfs(light, optics, plan))
 
 
 class NetworkReading:
     """A run's network with the frames of the virtual experiment, and the calibrated
     persons.
 
-    :meth:`path` calibrates the persons; :meth:`changed` and :meth:`turn_rad` need it
-    first.
+    :meth:`path` calibrates the persons; :meth:`turn_rad` needs it first.
     """
 
     def __init__(self, source: FinishedRun, config: ExperimentConfig) -> None:
@@ -230,21 +188,16 @@ class NetworkReading:
         judged = ~np.isin(np.arange(len(self.trial.subject)), calibration)
         self.judged = judged & self.trial.group(experiment.AXIAL)
         self.measured_rad = NONE
-        self._people: dict[int, CalibratedPerson] = {}
-        self._thin: list[RenderedFrames] = []
-        self._rows = np.empty(0, np.int64)
 
-    def path(
-        self, device: ImagingDevice, settings: OpticsConfig
-    ) -> Iterator[BudgetEntry]:
+    def path(self, image: Imager, settings: OpticsConfig) -> Iterator[BudgetEntry]:
         """Entries of the links from the true pupil to the predicted gaze.
 
         The chain starts at the true pupil and slippage and adds one link a state. A
         link's error is the growth of the gaze error in quadrature.
 
         Args:
-            device: the run's lens with its true image.
-            settings: optics that ``device`` was formed by.
+            image: true image of the run's lens.
+            settings: optics that ``image`` was formed by.
         """
         config, source = self.config, self.source
         sphere = experiment.sphere_calibrator(source, config)
@@ -268,48 +221,32 @@ class NetworkReading:
             f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
         )
         states = [
-            ("subject and calibration", self._error_rad(exact_fixed, sphere), NONE,
+            ("subject and calibration", self._error_rad(exact_fixed, sphere),
              f"true pupil and slippage; {people}"),
-            ("fixation", self._error_rad(exact, sphere), NONE,
+            ("fixation", self._error_rad(exact, sphere),
              f"scatter of {config.fixation_deg:g} deg about the stimulus"),
-            ("reader, pupil", min(pupil_error, quiet_error), NONE, net),
-            ("reader, slippage", quiet_error, NONE, net),
-            ("sensor noise", self._error_rad(noisy, calibrator), NONE,
-             "frames with noise"),
+            ("reader, pupil", min(pupil_error, quiet_error), net),
+            ("reader, slippage", quiet_error, net),
+            ("sensor noise", self._error_rad(noisy, calibrator), "frames with noise"),
         ]  # fmt: skip
-        for link, optics, psf, method in self._untrained(device, settings):
-            calibrator = experiment.run_calibrator(source, optics, config, self.sensor)
-            noisy = self._read(self.subjects, optics)
-            states.append((link, self._error_rad(noisy, calibrator), psf, method))
+        trained = source.run.trainer.optics
+        if (trained.image, trained.fwhm_nm) != (settings.image, settings.fwhm_nm):
+            calibrator = experiment.run_calibrator(source, image, config, self.sensor)
+            noisy = self._read(self.subjects, image)
+            method = "the whole field in light of {:g} nm; training had {} in {:g} nm"
+            method = method.format(
+                settings.fwhm_nm,
+                "one PSF for all" if trained.image == "uniform" else "it",
+                trained.fwhm_nm,
+            )
+            error = self._error_rad(noisy, calibrator)
+            states.append(("image of training", error, method))
         before = 0.0
-        for link, error, psf, method in states:
+        for link, error, method in states:
             added = quadrature_difference(error, before)
-            yield BudgetEntry(link, NONE, psf, added, method)
+            yield BudgetEntry(link, NONE, NONE, added, method)
             before = error
         self._store_people(noisy, calibrator)
-        yield from self._trained(device, settings)
-
-    def changed(
-        self,
-        link: str,
-        optics: Imager,
-        base: Imager,
-        method: str,
-        *,
-        phase_rad: float = NONE,
-    ) -> BudgetEntry:
-        """Entry of a change of the optics, with the persons calibrated before it.
-
-        Args:
-            link: name of the row.
-            optics: imager after the change.
-            base: imager before the change.
-            method: how the entry is determined.
-            phase_rad: phase error of the pillars.
-        """
-        gaze = self.turn_rad(optics, base)
-        psf = image_difference(optics, base)
-        return BudgetEntry(link, phase_rad, psf, gaze, method)
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
         """Mean angle in rad between the gaze predicted from noiseless frames through
@@ -344,46 +281,6 @@ class NetworkReading:
             *(torch.cat(values).double().numpy() for values in (pupil, slip))
         )
 
-    def _untrained(
-        self, device: ImagingDevice, settings: OpticsConfig
-    ) -> Iterator[tuple[str, Imager, float, str]]:
-        """(link, imager, PSF error, method) of each cause that training left out; every
-        imager has one cause more.
-        """
-        trained = self.source.run.trainer.optics
-        if trained.image == "uniform":
-            same_spectrum = device if not settings.fwhm_nm else replace(
-                device, whole=device.one_wavelength(settings.wavelength_nm * 1e-3)
-            )  # fmt: skip
-            psf = image_difference(same_spectrum.one_psf(), same_spectrum.whole)
-            method = "the whole field; training had the PSFs of one chief ray"
-            yield "field", same_spectrum.evenly_lit(), psf, method
-            method = "cos⁴ and vignetting; training had even light"
-            yield "radiometry", same_spectrum.whole, 0.0, method
-        if settings.fwhm_nm and trained.fwhm_nm != settings.fwhm_nm:
-            narrow = device.one_wavelength(settings.wavelength_nm * 1e-3)
-            psf = image_difference(narrow, device.whole)
-            method = f"{settings.fwhm_nm:g} nm; training had {trained.fwhm_nm:g} nm"
-            yield "spectrum", device.whole, psf, method
-
-    def _trained(
-        self, device: ImagingDevice, settings: OpticsConfig
-    ) -> Iterator[BudgetEntry]:
-        """Entries of the causes that training included, each switched off; not counted."""
-        trained_optics = self.source.run.trainer.optics
-        method = "trained with, switched off"
-        cases: list[tuple[str, Imager]] = []
-        if trained_optics.image == "true":
-            cases += [("field", device.one_psf()), ("radiometry", device.evenly_lit())]
-            if settings.fwhm_nm and trained_optics.fwhm_nm == settings.fwhm_nm:
-                narrow = device.one_wavelength(settings.wavelength_nm * 1e-3)
-                cases.append(("spectrum", narrow))
-        for link, optics in cases:
-            entry = self.changed(
-                link, optics, device.whole, f"{method}; not in the sum"
-            )
-            yield replace(entry, counted=False)
-
     def _store_people(
         self, read: NetworkReadings, calibrator: PersonCalibrator
     ) -> None:
@@ -396,15 +293,12 @@ class NetworkReading:
         self.measured_rad = self._error_rad(read, calibrator)
         rows = np.flatnonzero(self.judged)
         self._rows = rows[:: max(1, len(rows) // THINNED)]
-        frames_per_subject = len(self.trial.subject) // len(self.subjects)
+        each = len(self.trial.subject) // len(self.subjects)
         self._thin = [
             rendered.rows(
-                torch.from_numpy(
-                    self._rows[self._rows // frames_per_subject == subject]
-                    - subject * frames_per_subject
-                )
+                torch.from_numpy(self._rows[self._rows // each == n] - n * each)
             )
-            for subject, rendered in enumerate(self.subjects)
+            for n, rendered in enumerate(self.subjects)
         ]
 
     def _error_rad(self, read: NetworkReadings, calibrator: PersonCalibrator) -> float:
@@ -424,17 +318,13 @@ class NetworkReading:
         """Readings of the network from frames through an imager, with the noise of the
         experiment's seeds or ``quiet``.
         """
-        net = self.source.run.trainer.model.net
-        inner = self.source.settings.inner
         predictions = []
         for subject, rendered in enumerate(subjects):
             frames = experiment.image_frames(
                 self.source, rendered, optics, seed=experiment.NOISE + subject,
                 sensor=self.sensor, quiet=quiet,
             )  # fmt: skip
-            predictions.append(
-                assess.predict_frames(net, self.source.architecture, frames, inner)
-            )
+            predictions.append(experiment.predict_of_run(self.source, frames))
         return experiment.read_from(predictions, self.source)
 
 
@@ -463,12 +353,10 @@ class ErrorBudget:
         if given.mask is not None:
             given.mask.spread.check(lens.cell)
         self.lens, self.given = lens, given
-        self.smooth: ImagingDevice | None = None
         self.reading: NetworkReading | None = None
+        frame, margin = 80, 8
         if given.run is None:
             self.settings = settings_of(lens, given.fwhm_nm)
-            frame = 80
-            margin = 8
         else:
             trainer = given.run.run.trainer
             scenes = given.run.settings.scenes
@@ -478,25 +366,26 @@ class ErrorBudget:
             margin = scenes.margin
             frame = scenes.pixels + 2 * margin
             self.reading = NetworkReading(given.run, given.frames)
-            coefficients = trainer.model.coefficients_rad.detach()
-            plane = formed.optics_of(self.settings, coefficients)
-            self.smooth = self._device(plane, frame, margin)
+            self.smooth_rad = trainer.model.coefficients_rad.detach()
+            self.smooth = formed.make_imager(
+                self.settings, self.smooth_rad, frame, margin=margin
+            )
         self.made = MadeLens(lens, self.settings)
         self.coupling: Array | None = None
         if lens.neighbours is not None:
             self.coupling = self._coupling(lens.neighbours)
-        self.base = self._pillars()
-        self.device = self._device(self._optics(), frame, margin)
-        self._frame = frame, margin
+        self.base = self._pillars(self.made, State.of(), self.coupling)
+        plane = self.made.plane(State.of(), factor=self.coupling)
+        self.optics = Optics(plane, lens.layers, lens.sensor_distance_um)
+        self.image = formed.imager_through(
+            self.settings, self.optics, frame, margin=margin
+        )
 
     @property
     def above(self) -> list[str]:
         """Sentences on images whose error exceeds the tolerance."""
-        devices = (self.device, self.smooth)
-        tolerance = self.settings.image_tolerance
-        return [
-            device.whole.above(tolerance) for device in devices if device is not None
-        ]
+        images = [self.image] + ([] if self.reading is None else [self.smooth])
+        return [image.above(self.settings.image_tolerance) for image in images]
 
     def entries(self) -> Iterator[BudgetEntry]:
         """The budget, link by link from gaze back to the pillars, ending with the sum.
@@ -506,7 +395,7 @@ class ErrorBudget:
         """
         rows: list[BudgetEntry] = []
         parts = (
-            self._network, self._image_tolerance, self._pillar_device, self._solver,
+            self._network, self._pillar_device, self._solver,
             self._neighbours, self._mask, self._process, self._calibration,
         )  # fmt: skip
         for part in parts:
@@ -519,36 +408,9 @@ class ErrorBudget:
             yield BudgetEntry(MEASURED, NONE, NONE, gaze, method, counted=False)
         yield quadrature_total(rows)
 
-    def _device(self, optics: Optics, frame: int, margin: int) -> ImagingDevice:
-        whole = formed.imager_through(self.settings, optics, frame, margin=margin)
-        return ImagingDevice(optics, whole)
-
-    def _optics(self, state: State | None = None, *, factor: Array | None = None,
-                lens_model: MadeLens | None = None, shift_um: float = 0.0) -> Optics:  # fmt: skip
-        """Lens plane, films and sensor for a changed lens.
-
-        Args:
-            state: process state; the design's without it.
-            factor: (y, x) factor on the pillars' transmission; the neighbour coupling
-                without it.
-            lens_model: manufactured lens in place of the designed one.
-            shift_um: shift of the sensor away from the lens.
-        """
-        pillar_factor = self.coupling if factor is None else factor
-        plane = (lens_model or self.made).plane(
-            state or State.of(), factor=pillar_factor
-        )
-        distance = self.lens.sensor_distance_um + shift_um
-        return Optics(plane, self.lens.layers, distance)
-
-    def _pillars(self, state: State | None = None, *, factor: Array | None = None,
-                 lens_model: MadeLens | None = None) -> Array:  # fmt: skip
-        pillar_factor = self.coupling if factor is None else factor
-        t = (
-            (lens_model or self.made)
-            .pillars(state or State.of(), factor=pillar_factor)
-            .numpy()
-        )
+    def _pillars(self, made: MadeLens, state: State, factor: Array | None) -> Array:
+        """(pillars,) complex t of a made lens in a process state."""
+        t = made.pillars(state, factor=factor).numpy()
         return np.asarray(t[self.lens.diameters.diameter_um > 0])
 
     def _coupling(self, rows: NeighbourRows) -> Array:
@@ -558,75 +420,69 @@ class ErrorBudget:
         return np.asarray(among.mean_coupling(alone, rows, pitch).numpy())
 
     def _entry(
-        self, link: str, optics: Imager, method: str, *, pillars: Array | None = None
-    ) -> BudgetEntry:
-        """Entry of a change of the device.
+        self, link: str, image: Imager, method: str, *, phase_rad: float = NONE,
+        base: Imager | None = None,
+    ) -> BudgetEntry:  # fmt: skip
+        """Entry of a change of the image: PSF difference, and turn of the gaze with a
+        network.
 
         Args:
             link: name of the row.
-            optics: imager after the change.
+            image: imager after the change.
             method: how the entry is determined.
-            pillars: (pillars,) complex t after the change; None without a phase error.
+            phase_rad: phase error of the pillars.
+            base: imager before the change; the designed device without it.
         """
-        phase = NONE if pillars is None else scatter_rad(pillars, self.base)
-        if self.reading is not None:
-            whole = self.device.whole
-            return self.reading.changed(link, optics, whole, method, phase_rad=phase)
-        psf = image_difference(optics, self.device.whole)
-        return BudgetEntry(link, phase, psf, NONE, method)
+        base = base or self.image
+        turn = NONE if self.reading is None else self.reading.turn_rad(image, base)
+        return BudgetEntry(link, phase_rad, image_difference(image, base), turn, method)
 
-    def _changed(self, link: str, method: str, state: State | None = None, *,
-                 factor: Array | None = None, lens_model: MadeLens | None = None,
-                 shift_um: float = 0.0) -> BudgetEntry:  # fmt: skip
-        """Entry of changed pillars or a shifted sensor; arguments as :meth:`_optics`."""
-        pillar_changes = {"factor": factor, "made": lens_model}
-        optics = self._optics(state, shift_um=shift_um, **pillar_changes)  # type: ignore[arg-type]
-        pillars = self._pillars(state, **pillar_changes)  # type: ignore[arg-type]
-        return self._entry(link, self.device.image(optics), method, pillars=pillars)
+    def _changed(
+        self, link: str, method: str, state: State | None = None, *,
+        factor: Array | None = None, made: MadeLens | None = None, shift_um: float = 0.0,
+    ) -> BudgetEntry:  # fmt: skip
+        """Entry of changed pillars or a shifted sensor.
+
+        Args:
+            link: name of the row. method: how the entry is determined.
+            state: process state; the design's without it.
+            factor: (y, x) factor on the pillars' transmission; the neighbour coupling
+                without it.
+            made: manufactured lens in place of the designed one.
+            shift_um: shift of the sensor away from the lens.
+        """
+        made, state = made or self.made, state or State.of()
+        factor = self.coupling if factor is None else factor
+        distance_um = self.lens.sensor_distance_um + shift_um
+        optics = Optics(made.plane(state, factor=factor), self.lens.layers, distance_um)
+        phase_rad = scatter_rad(self._pillars(made, state, factor), self.base)
+        image = image_through(optics, self.image)
+        return self._entry(link, image, method, phase_rad=phase_rad)
 
     def _network(self) -> Iterator[BudgetEntry]:
-        if self.reading is None or self.smooth is None:
+        if self.reading is None:
             method = "not known: no run was given (--run)"
             yield BudgetEntry("reader", NONE, NONE, NONE, method)
             return
         yield from self.reading.path(self.smooth, self.settings)
 
-    def _image_tolerance(self) -> Iterator[BudgetEntry]:
-        """Entry of the image at its tolerance against one at a quarter of it."""
-        link = "image tolerance"
-        fine = assess.finer_image(self.settings)
-        if self.reading is None or self.smooth is None or fine is None:
-            return
-        tolerances = fine.image_tolerance, self.settings.image_tolerance
-        method = "image formed at {:g} in place of {:g}".format(*tolerances)
-        frame, margin = self._frame
-        try:
-            fine_image = formed.imager_through(
-                fine, self.smooth.optics, frame, margin=margin
-            )
-        except (SceneError, PropagationError) as problem:
-            yield BudgetEntry(link, NONE, NONE, NONE, f"not known: {problem}")
-            return
-        turn = self.reading.turn_rad(fine_image, self.smooth.whole)
-        yield BudgetEntry(link, NONE, NONE, turn, method)
-
     def _pillar_device(self) -> Iterator[BudgetEntry]:
         """Entries of discrete pillars, of the films and of both polarisations."""
-        if self.reading is not None and self.smooth is not None:
+        if self.reading is not None:
             method = (
                 "pillars of the lens file; training had a smooth phase without films"
             )
-            smooth = self.device.image(self.smooth.optics)
-            whole = self.device.whole
-            yield self.reading.changed("pillars on a lattice", whole, smooth, method)
+            smooth = formed.optics_of(self.settings, self.smooth_rad)
+            base = image_through(smooth, self.image)
+            yield self._entry("pillars on a lattice", self.image, method, base=base)
         layers = self.lens.layers
         if layers.films:
-            optics = self.device.optics
-            bare = replace(optics, layers=replace(layers, front=(), behind=()))
+            bare = replace(self.optics, layers=replace(layers, front=(), behind=()))
             method = f"{len(layers.films)} films of the lens file taken away"
-            yield self._entry("glass", self.device.image(bare), method)
+            yield self._entry("glass", image_through(bare, self.image), method)
         method = "flux of both polarisations through the sensor in place of one scalar"
-        yield self._entry("polarisation", self.device.both_polarisations(), method)
+        image = both_polarisations(self.optics, self.image)
+        yield self._entry("polarisation", image, method)
 
     def _solver(self) -> Iterator[BudgetEntry]:
         """Entries of pillar solver and proxy, against a solver with a tolerance
@@ -677,19 +533,15 @@ class ErrorBudget:
         if lens.neighbours is not None:
             doubted = lens.neighbours.doubted(turning_sine(lens))
             entries = [self._of_rows(other, "") for other in doubted]
-            values = [(entry.phase_rad, entry.psf, entry.gaze_rad) for entry in entries]
-            rms = [math.hypot(*column) for column in zip(*values, strict=True)]
             method = "rows of the lens file: another truncation, a row left out, zones that get shorter"
-            yield BudgetEntry("neighbours", rms[0], rms[1], rms[2], method)
+            total = quadrature_total(entries)
+            yield replace(total, link="neighbours", method=method)
             return
         try:
             rows_of = supercell.estimate_neighbour_coupling(lens)
         except CellError:
             return  # films or tilted walls: rows of those are not solved
-        counts = ", ".join(map(str, row_lengths(rows_of, lens.cell.pitch_um)))
-        yield self._of_rows(
-            rows_of, f"rows of {counts} unlike pillars solved as one cell"
-        )
+        yield self._of_rows(rows_of, "rows of unlike pillars solved as one cell")
 
     def _of_rows(self, rows: NeighbourRows, method: str) -> BudgetEntry:
         return self._changed("neighbours", method, factor=self._coupling(rows))
@@ -704,7 +556,7 @@ class ErrorBudget:
         on_mask = replace(designed, diameter_um=rounded.astype(np.float32))
         drawn = self.made.redrawn(replace(self.lens, diameters=on_mask))
         method = f"every diameter rounded to {step_um * 1e3:g} nm"
-        yield self._changed("mask grid", method, lens_model=drawn)
+        yield self._changed("mask grid", method, made=drawn)
 
     def _process(self) -> Iterator[BudgetEntry]:
         """Entry of the process spread, rms over draws; a fit of the built lens removes
@@ -752,11 +604,14 @@ class ErrorBudget:
             self._changed(link, method, state, shift_um=shift)
             for state, shift in lenses
         ]
-        values = np.array(
-            [(entry.phase_rad, entry.psf, entry.gaze_rad) for entry in rows]
+        total, root = quadrature_total(rows), math.sqrt(len(rows))
+        return BudgetEntry(
+            link,
+            total.phase_rad / root,
+            total.psf / root,
+            total.gaze_rad / root,
+            method,
         )
-        rms = np.sqrt((values**2).mean(0)).tolist()
-        return BudgetEntry(link, rms[0], rms[1], rms[2], method)
 
 
 def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:
@@ -839,21 +694,6 @@ def stored_response(
         for part in (np.abs(t), np.unwrap(np.angle(t)))
     )
     return np.asarray(level * np.exp(1j * phase))
-
-
-def row_lengths(rows: NeighbourRows, pitch_um: float) -> list[int]:
-    """Number of pillars of every row along the lattice: wavelength / (sine * pitch).
-
-    Over the length of a row the phase changes by one wave.
-
-    Args:
-        rows: rows of unequal pillars.
-        pitch_um: lattice constant.
-    """
-    return [
-        round(length)
-        for length in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um
-    ]
 
 
 def turning_sine(lens: Lens) -> Array:

@@ -30,7 +30,7 @@ from codesign.gaze import (
     face_angles,
     shared,
 )
-from codesign.optics import formed
+from codesign.optics import OpticsConfig, formed
 from codesign.settings import ExperimentConfig
 from codesign.train import Predictions, SensorFrames, assess
 from metalens.core.arrays import Array
@@ -76,10 +76,6 @@ class RunResult:
     slip_mm: (n, 3) slippage read by the network.
     centre: (n, 2) pupil read, fraction of the image. iou: (n,) overlap of the mask.
     gaze_deg: (n,) error of the calibrated gaze, nan for calibration frames.
-    predicted_deg: (n, 2) calibrated gaze.
-    told_deg: (n,) gaze error of sphere and regressor at the pupil as read and the true
-    slippage: the error due to the pupil alone.
-    reach_mm: largest slippage along x, y, z in the run's training.
     how: calibrator of the subjects.
     above: why the error of the images exceeds the run's tolerance; empty otherwise.
     finer: result on images formed at a quarter of the tolerance, with a calibration of
@@ -93,17 +89,9 @@ class RunResult:
     centre: Array
     iou: Array
     gaze_deg: Array
-    predicted_deg: Array
-    told_deg: Array
-    reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     how: PersonCalibrator | None = None
     above: str = ""
     finer: "RunResult | None" = None
-
-    @property
-    def within(self) -> Array:
-        """(n,) True for frames whose slippage lies within that of training."""
-        return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
 
     def gaze(self, kind: str) -> float:
         """Mean gaze error over the judged frames of a group, deg.
@@ -117,24 +105,6 @@ class RunResult:
     def slip_error_mm(self) -> Array:
         """(n, 3) absolute errors of the slippage."""
         return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
-
-    @property
-    def slip_rest_mm(self) -> Array:
-        """(n, 3) absolute slippage errors less the subject's mean error over the
-        calibration frames; nan for calibration frames.
-
-        Constant errors of a person (size of the face, turn of the camera on it) are no
-        slippage: a device is zeroed where its wearer calibrates.
-        """
-        error = self.slip_mm - self.trial.slip_mm
-        judged = np.isfinite(self.gaze_deg)
-        result = np.full_like(error, math.nan)
-        for subject in np.unique(self.trial.subject):
-            of_subject = self.trial.subject == subject
-            result[of_subject & judged] = np.abs(
-                error[of_subject & judged] - error[of_subject & ~judged].mean(0)
-            )
-        return result
 
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
         """(subjects,) mean of each subject's finite values; nan for a subject without
@@ -357,54 +327,54 @@ def run_experiment(
     _check_sources(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[ExperimentTrials] = []
-    predictions: list[list[Predictions]] = [[] for _ in sources]
-    fine_predictions: list[list[Predictions]] = [[] for _ in sources]
-    imagers = [prepare_run(source, image=config.image) for source in sources]
-    fine_imagers = [finer_imager(source) for source in sources]
+    images = [
+        (prepare_run(source, image=config.image), finer_imager(source))
+        for source in sources
+    ]
+    predictions: list[tuple[list[Predictions], list[Predictions]]] = [
+        ([], []) for _ in sources
+    ]
     sensors = experiment_sensors(sources, config)
     calibrators = [
         run_calibrator(source, imager, config, sensor)
-        for source, imager, sensor in zip(sources, imagers, sensors, strict=True)
+        for source, (imager, _), sensor in zip(sources, images, sensors, strict=True)
     ]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         rendered = render_subject(states, config, subject, scenes)
         trials.append(trial)
-        passes = [
-            *zip(predictions, sources, imagers, sensors, strict=True),
-            *zip(fine_predictions, sources, fine_imagers, sensors, strict=True),
-        ]
-        for outputs, source, imager, sensor in passes:
-            if imager is None:
-                continue
-            sensor_frames = image_frames(
-                source, rendered, imager, seed=NOISE + subject, sensor=sensor
-            )
-            outputs.append(_predict(source, sensor_frames))
+        for source, imagers, outputs, sensor in zip(
+            sources, images, predictions, sensors, strict=True
+        ):
+            for imager, output in zip(imagers, outputs, strict=True):
+                if imager is not None:
+                    frames = image_frames(
+                        source, rendered, imager, seed=NOISE + subject, sensor=sensor
+                    )
+                    output.append(predict_of_run(source, frames))
         if subject + 1 < config.subjects:
             yield subject + 1, []
     all_trials = join_subjects(trials)
-    labels = names or [f"run {i + 1}" for i in range(len(sources))]
-    above = [
-        formed.image_tolerance_problem(source.run.trainer.optics, imager)
-        for source, imager in zip(sources, imagers, strict=True)
-    ]
     results = []
-    for i, (label, source, calibrator) in enumerate(
-        zip(labels, sources, calibrators, strict=True)
-    ):
-        result = _result(label, source, predictions[i], all_trials, config, calibrator)
-        fine_result = (
-            _result(label, source, fine_predictions[i], all_trials, config, calibrator)
-            if fine_predictions[i]
-            else None
-        )
-        results.append(replace(result, above=above[i], finer=fine_result))
+    for i, (source, calibrator) in enumerate(zip(sources, calibrators, strict=True)):
+        name = names[i] if names else f"run {i + 1}"
+        about = all_trials, config, calibrator
+        result = _result(name, source, predictions[i][0], *about)
+        fine = None
+        if predictions[i][1]:
+            fine = _result(name, source, predictions[i][1], *about)
+        settings = source.run.trainer.optics
+        above = formed.image_tolerance_problem(settings, images[i][0])
+        results.append(replace(result, above=above, finer=fine))
     yield config.subjects, results
 
 
-def _predict(source: FinishedRun, frames: SensorFrames) -> Predictions:
-    """Pupil, slippage and axis that a run's network reads from sensor frames."""
+def predict_of_run(source: FinishedRun, frames: SensorFrames) -> Predictions:
+    """Pupil, slippage and axis that a run's network reads from sensor frames.
+
+    Args:
+        source: finished run: its network, lens and sensor. frames: of the sensor.
+    """
     return assess.predict_frames(
         source.run.trainer.model.net, source.architecture, frames, source.settings.inner
     )
@@ -477,17 +447,9 @@ def prepare_run(
     """
     trainer = source.run.trainer
     assess.recalibrate_network(trainer, source.architecture)
-    settings = trainer.optics
-    scenes = source.settings.scenes
-    image_settings = replace(settings, image="true") if image == "true" else settings
-    size = scenes.pixels + 2 * scenes.margin
-    return formed.make_imager(
-        image_settings,
-        trainer.model.coefficients_rad,
-        size,
-        margin=scenes.margin,
-        made=source.made,
-    )
+    if image == "trained":
+        return _imager_of(source, trainer.optics)
+    return _imager_of(source, replace(trainer.optics, image="true"))
 
 
 def finer_imager(source: FinishedRun) -> Imager | None:
@@ -500,19 +462,22 @@ def finer_imager(source: FinishedRun) -> Imager | None:
         source: finished run: its network, lens and sensor.
     """
     settings = assess.finer_image(source.run.trainer.optics)
-    if settings is None:
-        return None
-    scenes = source.settings.scenes
     try:
-        return formed.make_imager(
-            settings,
-            source.run.trainer.model.coefficients_rad,
-            scenes.pixels + 2 * scenes.margin,
-            margin=scenes.margin,
-            made=source.made,
-        )
+        return None if settings is None else _imager_of(source, settings)
     except (SceneError, PropagationError):
         return None
+
+
+def _imager_of(source: FinishedRun, settings: OpticsConfig) -> Imager:
+    """Imager of the lens of a run or retraining, formed as the settings say."""
+    scenes = source.settings.scenes
+    return formed.make_imager(
+        settings,
+        source.run.trainer.model.coefficients_rad,
+        scenes.pixels + 2 * scenes.margin,
+        margin=scenes.margin,
+        made=source.made,
+    )
 
 
 def sphere_calibrator(
@@ -566,7 +531,7 @@ def run_calibrator(
         sensor_frames = image_frames(
             source, rendered, imager, seed=2 * NOISE + person, sensor=sensor
         )
-        predictions.append(_predict(source, sensor_frames))
+        predictions.append(predict_of_run(source, sensor_frames))
         stimuli_deg.append(trial.stimulus_deg[rows])
         if predictions[0].axis is None:
             return sphere_calibrator(source, config)
@@ -612,23 +577,11 @@ def _result(
 ) -> RunResult:
     """Result of one run from the predictions of all subjects.
 
-    Gaze errors are nan for calibration frames. ``true_slip_error`` is that of sphere
-    and regressor at the true slippage.
+    Gaze errors are nan for calibration frames.
     """
     readings = read_from(predictions, source)
     predicted, judged = calibrated_gaze(readings, trial, config, calibrator)
-    true_slip_gaze, _ = calibrated_gaze(
-        replace(readings, slip_mm=trial.slip_mm),
-        trial,
-        config,
-        sphere_calibrator(source, config),
-    )
-    error, true_slip_error = (
-        np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
-        for p in (predicted, true_slip_gaze)
-    )
-    mmacs = float(source.row["mmacs"])
-    reach = source.settings.scenes.slip_mm
+    error = np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
     centre, iou = (
         torch.cat([getattr(prediction, f) for prediction in predictions])
         .double()
@@ -637,15 +590,12 @@ def _result(
     )
     return RunResult(
         name,
-        mmacs,
+        float(source.row["mmacs"]),
         trial,
         readings.slip_mm,
         centre,
         iou,
         error,
-        predicted,
-        true_slip_error,
-        reach,
         calibrator,
     )
 
@@ -716,11 +666,8 @@ def predicted_gaze(
 
 
 def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Array:
-    """Numbers of the calibration frames: a share of every subject's stimuli, in all
-    slippage states.
-
-    The stimuli are spread by :func:`farthest_points` from a random first one, or drawn
-    at random, as ``config.points`` says.
+    """Numbers of the calibration frames: a share of every subject's stimuli, drawn at
+    random, in all slippage states.
 
     Args:
         trial: subject, stimulus and slippage of every frame.
@@ -732,27 +679,6 @@ def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Arr
         points = np.unique(trial.stimulus[rows])
         rng = np.random.default_rng([config.seed, int(subject), POINTS])
         count = round(config.share * len(points))
-        if config.points == "spread":
-            chosen = farthest_points(
-                config.stimuli_deg[points], count, first=int(rng.integers(len(points)))
-            )
-        else:
-            chosen = rng.choice(len(points), count, replace=False)
+        chosen = rng.choice(len(points), count, replace=False)
         frames.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
     return np.concatenate(frames)
-
-
-def farthest_points(places: Array, count: int, *, first: int) -> Array:
-    """(count,) numbers of points by farthest-point sampling: each next point is the one
-    farthest from all chosen before.
-
-    Args:
-        places: (n, 2) points.
-        count: points to choose.
-        first: number of the first point.
-    """
-    chosen = [first]
-    while len(chosen) < count:
-        gaps = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)
-        chosen.append(int(gaps.argmax()))
-    return np.array(chosen)

@@ -485,84 +485,53 @@ def table_failures(
     ]
 
 
-def format_tables(
-    axial: Mapping[str, AxialInformation],
-    scenes: Mapping[str, SceneEnergy],
-    setting: ResolvedSettings,
-    *,
-    spread: Sequence[str] = (),
-) -> list[Table]:
-    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1.
-
-    Args:
-        axial: axial information by name of the lens.
-        scenes: scene sensitivity by name of the lens.
-        setting: how the lenses were measured.
-        spread: lines of the caption on lenses that do not focus.
-    """
-    return [_axial_table(axial, setting, spread), _scene_table(scenes)]
-
-
-def _axial_table(
+def axial_table(
     axial: Mapping[str, AxialInformation],
     setting: ResolvedSettings,
-    spread: Sequence[str],
+    remarks: Sequence[str] = (),
 ) -> Table:
     """Table 3: mean I(z) at every angle, a row for each lens and binning, and the least
     encircled energy on axis and at all angles.
+
+    Args:
+        axial: axial information by name of the lens.
+        setting: how the lenses were measured.
+        remarks: lines of the caption, on lenses that do not focus.
     """
     low, high = setting.depths_mm
     caption = (
         f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
         f"normalisation, averaged over sub-pixel positions; pixels of {setting.pixel_um:g} µm. Light: the least share "
         f"within {setting.radius_um:g} µm over the depths."
-        + "".join(f"\n{line}." for line in spread)
+        + "".join(f"\n{line}." for line in remarks)
     )
-    head = (
-        "lens",
-        "binning",
-        *(f"{angle:g}°" for angle in setting.angles_deg),
-        "light on axis",
-        "light at all angles",
-    )
+    angles = [f"{angle:g}°" for angle in setting.angles_deg]
+    head = ("lens", "binning", *angles, "light on axis", "light at all angles")
     rows: list[tuple[str, ...]] = []
     for name, measured in axial.items():
+        light = (measured.encircled[0].min(), measured.encircled.min())
+        shares = [f"{float(share):.2f}" for share in light]
         for k, binning in enumerate(setting.binnings):
-            means = [
-                f"{float(mean):.3g}" for mean in measured.information[:, k].mean(-1)
-            ]
-            shares = (
-                [
-                    f"{float(measured.encircled[0].min()):.2f}",
-                    f"{float(measured.encircled.min()):.2f}",
-                ]
-                if k == 0
-                else []
-            )
-            rows.append(
-                (
-                    name if k == 0 else "",
-                    f"{binning} × {binning}",
-                    *means,
-                    *(shares or ["", ""]),
-                )
-            )
+            means = measured.information[:, k].mean(-1).tolist()
+            words = [f"{mean:.3g}" for mean in means]
+            rows.append((name, f"{binning} × {binning}", *words, *shares))
+            name, shares = "", ["", ""]
     return Table(head, rows, caption)
 
 
-def _scene_table(scenes: Mapping[str, SceneEnergy]) -> Table:
+def scene_table(scenes: Mapping[str, SceneEnergy]) -> Table:
     """Table 1: ratios to the first lens with 95 % intervals, span angle, image
     error.
+
+    Args:
+        scenes: scene sensitivity by name of the lens.
     """
     first = next(iter(scenes))
     caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
     rows: list[tuple[str, ...]] = []
     for name, ratios in lens_ratios(scenes).items():
         energy = scenes[name]
-        intervals = [
-            f"{value:.2f} [{low:.2f}, {high:.2f}]"
-            for value, low, high in ratios.values()
-        ]
+        intervals = ["{:.2f} [{:.2f}, {:.2f}]".format(*r) for r in ratios.values()]
         angle = float(torch.rad2deg(energy.angle_rad).mean())
         rows.append((name, *intervals, f"{angle:.1f}°", f"{energy.image_error:.3f}"))
     return Table(("lens", *KINDS, "span angle", "image error"), rows, caption)

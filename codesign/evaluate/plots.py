@@ -1,5 +1,5 @@
 """Pictures of lenses side by side (Figs. 5 and 7 of the paper), and of runs in the
-experiment (Figs. 9 to 11).
+experiment (Figs. 10 and 11).
 """
 
 from collections.abc import Mapping, Sequence
@@ -7,20 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from codesign.adapt import FinishedRun
-from codesign.batches import EXPERIMENT
-from codesign.evaluate.gaze_experiment import (
-    AXIAL,
-    LATERAL,
-    RunResult,
-    experiment_sensors,
-    image_frames,
-    prepare_run,
-    render_subject,
-    states_of,
-)
+from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, RunResult
 from codesign.evaluate.optics import AxialInformation, ResolvedSettings, SceneEnergy
-from codesign.settings import ExperimentConfig
 from metalens.core.report import figure_png, make_figure
 from metalens.psf import pixel_weights
 
@@ -148,66 +136,6 @@ def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
             if number == 0:
                 panel.set_title(title)
         row[0].set_ylabel(name, fontsize=8)
-    return figure_png(figure)
-
-
-@torch.no_grad()
-def plot_samples(
-    source: FinishedRun, config: ExperimentConfig, *, subjects: int = 4
-) -> bytes:
-    """Fig. 9 b: sensor frames of a few subjects in every slippage state, with the
-    outlines of the true (green) and the predicted (red) pupil.
-
-    Args:
-        source: finished run: its network, lens and sensor.
-        config: subjects, stimuli, slippage and calibration.
-    """
-    scenes = source.run.scenes(EXPERIMENT)
-    net = source.run.trainer.model.net
-    imager = prepare_run(source, image=config.image)
-    slips = config.slips_mm
-    sensor = experiment_sensors([source], config)[0]
-    points = len(config.stimuli_deg)
-    rows_shown = min(subjects, config.subjects)
-    figure, axes = make_figure(
-        rows_shown,
-        len(slips),
-        size=(1.25 * len(slips), 1.3 * rows_shown),
-        squeeze=False,
-    )
-    net.eval()
-    for subject in range(rows_shown):
-        rows = torch.arange(len(slips)) * points + (points // 2 + 5 * subject) % points
-        states, _ = states_of(config, subject, scenes)
-        rendered = render_subject(states[rows], config, subject, scenes)
-        frames = image_frames(source, rendered, imager, seed=subject, sensor=sensor)
-        logits = net(frames.frames, source.architecture).mask_logits
-        for column, slip in enumerate(slips):
-            panel = axes[subject, column]
-            panel.imshow(
-                frames.frames[column, 0].numpy(), cmap="gray", extent=(0, 1, 1, 0)
-            )
-            for mask, level, colour in (
-                (frames.mask[column], 0.5, "#39d353"),
-                (logits[column], 0.0, "#ff4d4d"),
-            ):
-                if mask.numel() and float(mask.min()) < level < float(
-                    mask.max()
-                ):  # some networks give no mask
-                    side = mask.shape[-1]
-                    centres = (np.arange(side) + 0.5) / side
-                    panel.contour(
-                        centres,
-                        centres,
-                        mask.numpy(),
-                        [level],
-                        colors=colour,
-                        linewidths=1,
-                    )
-            panel.set(xticks=[], yticks=[])
-            panel.grid(visible=False)
-            if subject == 0:
-                panel.set_title(f"dx {slip[0]:g}, dz {slip[2]:g}", fontsize=7)
     return figure_png(figure)
 
 

@@ -1,5 +1,5 @@
-"""Sets of states: moved ones for the Fisher matrix, pairs that share a pupil position,
-and shards of frames on disk.
+"""Sets of states: by number, moved ones for the Fisher matrix, and shards of frames on
+disk.
 """
 
 from collections.abc import Sequence
@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from codesign.eye import population as eye
-from codesign.eye.population import CameraRig, EyeStates, MotionRanges
-from codesign.eye.renderer import PinholeCamera, RenderedFrames, render
+from codesign.eye.population import EyeStates, MotionRanges
+from codesign.eye.renderer import RenderedFrames
 from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.errors import SceneError
 from metalens.core.store import Provenance
 
 
@@ -31,11 +30,6 @@ def states_at(
         motion: ranges of the states; the defaults without it.
     """
     parts = [eye.draw_states(1, (seed, int(i)), motion=motion) for i in indices]
-    return _joined(parts)
-
-
-def _joined(parts: Sequence[EyeStates]) -> EyeStates:
-    """States one after the other."""
     return EyeStates(
         *(
             torch.cat([getattr(part, name) for part in parts])
@@ -60,118 +54,6 @@ def moved_states(
         values[:, axis] += step
         out.append(replace(states, **{name: values}))
     return out
-
-
-def ambiguity_pairs(
-    count: int,
-    seed: int,
-    *,
-    rig: CameraRig | None = None,
-    camera: PinholeCamera | None = None,
-    motion: MotionRanges | None = None,
-) -> EyeStates:
-    """Pairs of states of one subject whose visible pupils have one centroid (Sec. 3.6).
-
-    Slip and gaze of a pair differ; centroids agree within 0.1 pixels. The second state
-    has a new slip, 0.8 mm or more away; its gaze is solved on the rendered masks to
-    restore the centroid. Pairs that need a gaze outside the range, or whose pupil is
-    cut by lid or frame, are left out.
-
-    Args:
-        count: number of pairs. seed: of the random generator.
-        rig: pose of camera and lamps; the default without it.
-        camera: pixel grid; the default without it.
-        motion: ranges of the states; the defaults without it.
-
-    Returns:
-        2 ``count`` states, the two of a pair consecutive.
-
-    Raises:
-        SceneError: fewer than one pair in fifty is possible in these ranges.
-    """
-    rig = rig or CameraRig()
-    camera = camera or PinholeCamera()
-    motion = motion or MotionRanges()
-    states: list[EyeStates] = []
-    pairs = tried = 0
-    while pairs < count:
-        if tried > 50 * max(pairs, 64):
-            raise SceneError(
-                f"{pairs} pairs in {tried} tries: widen the gaze range or narrow the slip range"
-            )
-        batch = max(32, count - pairs)
-        first, second = (
-            eye.draw_states(batch, (seed, tried, part), motion=motion)
-            for part in (0, 1)
-        )
-        tried += batch
-        second = replace(first, slip_um=second.slip_um)
-        second, good = _with_matching_gaze(first, second, rig=rig, camera=camera)
-        limits = torch.tensor([motion.gaze_x_rad, motion.gaze_y_rad])
-        good &= (second.gaze_rad.abs() <= limits).all(1)
-        good &= (second.slip_um - first.slip_um).norm(dim=1) >= 800.0
-        for row in torch.nonzero(good)[: count - pairs]:
-            states += [first[row], second[row]]
-        pairs = len(states) // 2
-    return _joined(states)
-
-
-def _with_matching_gaze(
-    first: EyeStates,
-    second: EyeStates,
-    *,
-    rig: CameraRig,
-    camera: PinholeCamera,
-    tolerance_px: float = 0.1,
-) -> tuple[EyeStates, Tensor]:
-    """``second`` with the gaze whose pupil centroid is that of ``first``, and where it
-    is.
-
-    Newton steps on rendered masks with a Jacobian by central differences, computed once
-    and regularised where nearly singular.
-
-    Returns:
-        states, and (n,) whether centroids agree and both pupils are visible.
-    """
-    goal = render(first, rig=rig, camera=camera).labels
-    gaze, step = second.gaze_rad, 2e-3
-    jacobian = torch.stack(
-        [
-            (
-                _centroids(second, gaze + step * way, rig, camera)[0]
-                - _centroids(second, gaze - step * way, rig, camera)[0]
-            )
-            / (2 * step)
-            for way in torch.eye(2, dtype=torch.float64)
-        ],
-        2,
-    )
-    determinant = (
-        jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
-    )
-    jacobian = jacobian + torch.where(determinant.abs() < 1.0, 1e3, 0.0)[
-        :, None, None
-    ] * torch.eye(2, dtype=torch.float64)
-    for _ in range(6):
-        centroid, visible = _centroids(second, gaze, rig, camera)
-        error = goal.centroid_px - centroid
-        if bool((error.norm(dim=1) < 0.3 * tolerance_px).all()):
-            break
-        gaze = gaze + torch.linalg.solve(jacobian, error[..., None])[..., 0].clamp(
-            -0.25, 0.25
-        )
-    centroid, visible = _centroids(second, gaze, rig, camera)
-    distance = (goal.centroid_px - centroid).norm(dim=1)
-    matches = (distance <= tolerance_px) & (visible > 0.97) & (goal.visible > 0.97)
-    return replace(second, gaze_rad=gaze), matches
-
-
-def _centroids(
-    states: EyeStates, gaze_rad: Tensor, rig: CameraRig, camera: PinholeCamera
-) -> tuple[Tensor, Tensor]:
-    """(n, 2) pupil centroid in pixels and (n,) visible share, of states at a gaze."""
-    labels = render(replace(states, gaze_rad=gaze_rad), rig=rig, camera=camera).labels
-    return labels.centroid_px, labels.visible
 
 
 def write_shard(

@@ -3,8 +3,10 @@ their states of gaze and slip.
 """
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 
 import numpy as np
 import torch
@@ -12,7 +14,6 @@ from torch import Tensor
 
 from codesign.eye import model
 from codesign.eye.textures import KINDS, VARIANTS
-from codesign.eye.view import CameraView, face_axes, seen_axes
 from metalens.core.errors import SceneError
 
 
@@ -27,127 +28,10 @@ class SubjectTrait:
     source: str = ""
 
 
+_DATA = resources.files("codesign").joinpath("data", "population.toml")
 POPULATION: Mapping[str, SubjectTrait] = {
-    "size": SubjectTrait(
-        1.0,
-        0.03,
-        0.9,
-        1.1,
-        "common factor of all radii: axial length 24.2 +- 0.85 mm (Le Grand; Olsen 2007)",
-    ),
-    "sclera_radius_um": SubjectTrait(
-        12000, 200, 11300, 12700, "Le Grand full theoretical eye: 12.3 mm; 24 mm globe"
-    ),
-    "cornea_radius_um": SubjectTrait(
-        7800, 200, 7000, 8600, "Gullstrand 7.7, Le Grand 7.8; +- 0.25 mm in adults"
-    ),
-    "limbus_radius_um": SubjectTrait(
-        5900, 150, 5400, 6400, "visible iris 11.8 +- 0.4 mm (Caroline and Andre 2002)"
-    ),
-    "pupil_radius_um": SubjectTrait(
-        1900, 500, 900, 3600, "2-7 mm pupils; Watson and Yellott 2012"
-    ),
-    "pupil_behind_um": SubjectTrait(
-        3600,
-        150,
-        3100,
-        4200,
-        "pupil behind the corneal apex (Gullstrand 3.6 mm; G&E K = 4.2 mm)",
-    ),
-    "index": SubjectTrait(
-        1.3375,
-        0.0,
-        1.3375,
-        1.3375,
-        "cornea and aqueous as one (Guestrin and Eizenman 2006)",
-    ),
-    "kappa_x_rad": SubjectTrait(
-        math.radians(5.0),
-        math.radians(1.5),
-        0.0,
-        0.17,
-        "visual axis nasal of the optic axis (G&E)",
-    ),
-    "kappa_y_rad": SubjectTrait(
-        math.radians(1.5),
-        math.radians(1.0),
-        -0.05,
-        0.1,
-        "visual axis above the optic axis (G&E)",
-    ),
-    "depth_um": SubjectTrait(
-        0,
-        1000,
-        -3000,
-        3000,
-        "pupil depth beside the rig's; the paper's 16-26 mm is 3 sigma with slip",
-    ),
-    "lid_thickness_um": SubjectTrait(
-        950, 150, 600, 1400, "lid shell outside the globe"
-    ),
-    "fissure_upper_um": SubjectTrait(
-        5000,
-        700,
-        3300,
-        6800,
-        "fissure height 10 mm (Farkas 1994), above the pupil's centre",
-    ),
-    "fissure_lower_um": SubjectTrait(
-        5900, 500, 4700, 7000, "lower margin at or just below the limbus"
-    ),
-    "fissure_half_um": SubjectTrait(
-        11600,
-        350,
-        10700,
-        12400,
-        "half chord between the canthi: 30 mm along the curve (Farkas)",
-    ),
-    "fissure_skew_um": SubjectTrait(
-        850, 400, -500, 2000, "peak of the upper margin nasal, of the lower temporal"
-    ),
-    "fissure_middle_um": SubjectTrait(
-        400, 350, -600, 1400, "the temporal canthus is farther from the pupil"
-    ),
-    "crease_um": SubjectTrait(2600, 700, 900, 4500, "upper lid fold above the margin"),
-    "plane_um": SubjectTrait(
-        7000, 800, 5000, 9500, "face plane behind the corneal apex"
-    ),
-    "iris": SubjectTrait(
-        0.34,
-        0.09,
-        0.14,
-        0.6,
-        "albedo at 850 nm: dark irises are bright in the near infrared",
-    ),
-    "iris_contrast": SubjectTrait(0.34, 0.10, 0.1, 0.7, "texture, relative"),
-    "sclera": SubjectTrait(0.62, 0.06, 0.45, 0.8, "albedo at 850 nm"),
-    "veins": SubjectTrait(0.16, 0.06, 0.02, 0.4, "vessels are faint beyond 800 nm"),
-    "skin": SubjectTrait(
-        0.52,
-        0.08,
-        0.3,
-        0.72,
-        "albedo at 850 nm, 0.4-0.65: melanin hardly absorbs (Angelopoulou 2001)",
-    ),
-    "pores": SubjectTrait(0.10, 0.03, 0.03, 0.22, "texture, relative"),
-    "lashes": SubjectTrait(0.9, 0.25, 0.1, 1.5, "opacity of the lash picture"),
-    "brow": SubjectTrait(0.8, 0.3, 0.0, 1.5, "opacity of the brow"),
-    "pupil": SubjectTrait(
-        0.018, 0.008, 0.004, 0.06, "off-axis lamps: hardly any red-eye light"
-    ),
-    "glint": SubjectTrait(
-        0.5,
-        0.2,
-        0.0,
-        1.2,
-        "tear-film reflection of the flood LEDs; not used by the tracker",
-    ),
-    "ambient": SubjectTrait(
-        0.12, 0.08, 0.0, 0.5, "diffuse light in units of a LED at 20 mm"
-    ),
-    "exposure": SubjectTrait(
-        0.5, 0.08, 0.3, 0.75, "level set by the automatic exposure"
-    ),
+    name: SubjectTrait(**row)
+    for name, row in tomllib.loads(_DATA.read_text("utf-8")).items()
 }
 TEXTURES = ("iris", "vein", "skin", "fine", "lash", "offset_x", "offset_y", "turn")
 
@@ -188,6 +72,18 @@ class CameraRig:
             )
         if len(self.lamps_um) != model.LED_COUNT:
             raise SceneError(f"{len(self.lamps_um)} lamps, need {model.LED_COUNT}")
+
+
+def face_axes(elevation_rad: float) -> Tensor:
+    """(3, 3) rows right, down and out of the face in the frame of a camera below it.
+
+    Args:
+        elevation_rad: of the face's normal above the camera's direction.
+    """
+    s, c = math.sin(elevation_rad), math.cos(elevation_rad)
+    return torch.tensor(
+        [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -319,7 +215,6 @@ def model_parameters(
     *,
     pixel_rad: float,
     exposed: EyeStates | None = None,
-    view: CameraView | None = None,
 ) -> Tensor:
     """(n, COUNT) renderer parameters of :mod:`codesign.eye.model`, float64.
 
@@ -332,7 +227,6 @@ def model_parameters(
         pixel_rad: angle of a pixel, which sets the softness of edges.
         exposed: states that the automatic exposure was set at; by default these,
             without following their derivatives.
-        view: other cameras than the rig's.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
@@ -341,10 +235,10 @@ def model_parameters(
     sclera = t["sclera_radius_um"] * size
     limbus_plane, cornea_centre = _limbus_and_cornea_um(sclera, cornea, limbus)
     pupil_plane = cornea_centre + cornea - t["pupil_behind_um"] * size
-    face = _face(rig, states, view)
+    face = _face(rig, states)
     axis, across, down = _rotated_axes(face, states)
     centre = (
-        _turn(_nominal_centre(rig, t["depth_um"], pupil_plane, view), states.mount_rad)
+        _turn(_nominal_centre(rig, t["depth_um"], pupil_plane), states.mount_rad)
         + states.slip_um
     )
     plane = centre + face[2] * (cornea_centre + cornea - t["plane_um"])[:, None]
@@ -361,10 +255,9 @@ def model_parameters(
     )
     half_width = t["fissure_half_um"] * size
     exposed_states = states if exposed is None else exposed
-    depth = _exposure_depth(rig, t["depth_um"], pupil_plane, exposed_states, view)
+    depth = _exposure_depth(rig, t["depth_um"], pupil_plane, exposed_states)
     gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
-    angle = pixel_rad if view is None else pixel_rad * view.wide
-    edge = 0.6 * angle * depth.clamp_min(2000.0) + 25.0
+    edge = 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0
     parameters = {
         model.CENTRE: centre, model.FACE_X: face[0], model.FACE_Y: face[1], model.FACE_Z: face[2], model.AXIS: axis,
         model.IRIS_X: across, model.IRIS_Y: down, model.PLANE: plane, model.LED: lamps,
@@ -469,18 +362,15 @@ def _limbus_and_cornea_um(
     return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
 
 
-def eye_axes(
-    states: EyeStates, rig: CameraRig, view: CameraView | None = None
-) -> tuple[Tensor, Tensor]:
+def eye_axes(states: EyeStates, rig: CameraRig) -> tuple[Tensor, Tensor]:
     """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors.
 
     The visual axis is the optic axis tilted by the angles kappa, nasal and upwards.
 
     Args:
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
-        view: other cameras than the rig's.
     """
-    axis, across, down = _rotated_axes(_face(rig, states, view), states)
+    axis, across, down = _rotated_axes(_face(rig, states), states)
     tan_x = torch.tan(states.trait("kappa_x_rad"))
     tan_y = torch.tan(states.trait("kappa_y_rad"))
     visual = (
@@ -489,56 +379,36 @@ def eye_axes(
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
-def _face_axes(rig: CameraRig, view: CameraView | None) -> Tensor:
-    """(3, 1 or n, 3) axes of the face (right, down, out) in the camera's frame.
-
-    For the rig's camera, or for each of the n cameras of a view.
-    """
-    return (
-        face_axes(rig.elevation_rad)[:, None]
-        if view is None
-        else seen_axes(rig.elevation_rad, view).transpose(0, 1)
-    )
-
-
-def _face(
-    rig: CameraRig, states: EyeStates, view: CameraView | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+def _face(rig: CameraRig, states: EyeStates) -> tuple[Tensor, Tensor, Tensor]:
     """(n, 3) axes right, down and out of the face in the camera's frame, after the
     mount.
     """
     right, down, out = (
         _turn(row.expand(len(states), 3), states.mount_rad)
-        for row in _face_axes(rig, view)
+        for row in face_axes(rig.elevation_rad)
     )
     return right, down, out
 
 
-def _nominal_centre(
-    rig: CameraRig, depth_um: Tensor, behind_um: Tensor, view: CameraView | None = None
-) -> Tensor:
+def _nominal_centre(rig: CameraRig, depth_um: Tensor, behind_um: Tensor) -> Tensor:
     """(n, 3) rotation centre of each eye without slip or mounting turn, um.
 
     ``behind_um``: distance of the pupil before the centre.
     """
-    out = _face_axes(rig, view)[2]
+    out = face_axes(rig.elevation_rad)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out
 
 
 def _exposure_depth(
-    rig: CameraRig,
-    depth_um: Tensor,
-    behind_um: Tensor,
-    states: EyeStates,
-    view: CameraView | None,
+    rig: CameraRig, depth_um: Tensor, behind_um: Tensor, states: EyeStates
 ) -> Tensor:
     """(n,) depth in um of the eye's front for exposure and edge width, without
     gradient.
     """
     centre = (
-        _turn(_nominal_centre(rig, depth_um, behind_um, view), states.mount_rad)
+        _turn(_nominal_centre(rig, depth_um, behind_um), states.mount_rad)
         + states.slip_um
     )
     return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)

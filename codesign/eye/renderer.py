@@ -16,7 +16,6 @@ from codesign.eye.population import (
     eye_axes,
     model_parameters,
 )
-from codesign.eye.view import CameraView
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
 from metalens.image import Frames
@@ -120,7 +119,6 @@ def render(
     camera: PinholeCamera | None = None,
     texture_seed: int = 0,
     exposed: EyeStates | None = None,
-    view: CameraView | None = None,
 ) -> RenderedFrames:
     """Render states with labels, pupil masks and depth, float32, on all threads of
     numba.
@@ -129,97 +127,58 @@ def render(
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
         camera: pixel grid; the defaults without both. texture_seed: of the textures.
         exposed: states that the automatic exposure was set at; by default these.
-        view: other cameras than the rig's. A picture that is ``wide`` times as wide
-            equals that of an eye smaller by that factor across, at the same depth,
-            before the rig's camera: lateral positions of its labels shrink with it.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
     """
     rig, camera = rig or CameraRig(), camera or PinholeCamera()
     p = model_parameters(
-        states,
-        rig,
-        pixel_rad=camera.pitch_um / rig.sensor_distance_um,
-        exposed=exposed,
-        view=view,
+        states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed
     )
-    wide = np.ones(len(states)) if view is None else view.wide.numpy()
-    frames, mask = _render_arrays(p, states.scale, rig, camera, texture_seed, wide)
+    frames, mask = _render_arrays(p, states.scale, rig, camera, texture_seed)
     return RenderedFrames(
-        frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view)
+        frames, mask, _labels(states, p, mask, rig=rig, camera=camera)
     )
 
 
 def _render_arrays(
-    p: Tensor,
-    scale: Tensor,
-    rig: CameraRig,
-    camera: PinholeCamera,
-    seed: int,
-    wide: Array,
+    p: Tensor, scale: Tensor, rig: CameraRig, camera: PinholeCamera, seed: int
 ) -> tuple[Frames, Tensor]:
     """Frames and pupil masks from renderer parameters, by the compiled kernel in
     float32.
 
-    Consecutive frames of one picture width are rendered together.
-
     Args:
         p: (n, COUNT) parameters. scale: (n,) factor of the depths.
-        wide: (n,) picture width over that of the rig's camera.
     """
     n, size = len(p), camera.pixels
     light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
     pupil = np.empty((n, 1, size, size), np.float32)
     values, scales = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    run_ends = [
-        *np.flatnonzero(np.diff(wide)) + 1,
-        n,
-    ]  # of runs of frames that are as wide
-    for first, end in zip([0, *run_ends], run_ends, strict=False):
-        tangents = (camera.tangents(rig) * wide[first]).astype(np.float32)
-        run = slice(first, end)
-        out = (light[run], cover[run], depth[run], pupil[run])
-        kernel.render_rows(
-            values[run],
-            scales[run],
-            textures.packed_bank(seed),
-            tangents,
-            tangents,
-            *out,
-        )
+    rays = camera.tangents(rig).astype(np.float32)
+    bank = textures.packed_bank(seed)
+    kernel.render_rows(values, scales, bank, rays, rays, light, cover, depth, pupil)
     sheets = Frames(*map(torch.from_numpy, (light, cover, depth)))
     return sheets, torch.from_numpy(pupil[:, 0])
 
 
 def _labels(
-    states: EyeStates,
-    p: Tensor,
-    mask: Tensor,
-    *,
-    rig: CameraRig,
-    camera: PinholeCamera,
-    view: CameraView | None,
+    states: EyeStates, p: Tensor, mask: Tensor, *, rig: CameraRig, camera: PinholeCamera
 ) -> FrameLabels:
     """Labels of frames from states, renderer parameters and pupil masks.
 
-    Lengths across the axis shrink by the width of the view. The visible share is the
-    mask's area over that of the refracted pupil's outline (shoelace formula).
+    The visible share is the mask's area over that of the refracted pupil's outline
+    (shoelace formula).
 
     Args:
         p: (n, COUNT) parameters. mask: (n, y, x) visible share of pupil.
     """
     p = p.detach()
     scale = states.scale[:, None]
-    wide = torch.ones_like(states.scale) if view is None else view.wide
-    shrink = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
     centre = p[:, model.CENTRE : model.CENTRE + 3]
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
-    optic, visual = eye_axes(states, rig, view)
+    optic, visual = eye_axes(states, rig)
     nominal = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
-    middle_and_rim = camera.position_px(
-        iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig
-    )
+    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
@@ -231,17 +190,16 @@ def _labels(
     ]
     centroid = torch.where(visible_area[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return FrameLabels(
-        slip_um=scale * shrink * (nominal + states.slip_um) - nominal,
-        shift_um=scale * shrink * (_unslipped_place_um(states, rig) + states.slip_um)
-        - nominal,
+        slip_um=scale * (nominal + states.slip_um) - nominal,
+        shift_um=scale * (_unslipped_place_um(states, rig) + states.slip_um) - nominal,
         optic_axis=optic.detach(),
         visual_axis=visual.detach(),
-        centre_um=scale * shrink * centre,
-        pupil_um=scale * shrink * pupil,
+        centre_um=scale * centre,
+        pupil_um=scale * pupil,
         pupil_px=middle,
         centroid_px=centroid,
         visible=(visible_area / area.clamp_min(1e-6)).clamp(0, 1),
-        landmarks_px=camera.position_px(landmark_points(p) / wide[:, None, None], rig),
+        landmarks_px=camera.position_px(landmark_points(p), rig),
     )
 
 

@@ -8,28 +8,56 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches import EyeScenes, StateScenes
-from codesign.eye import FrameLabels, drawn_of_people, render
+from codesign.batches import EyeScenes, FrameBatch, as_batch
+from codesign.eye import (
+    DrawnAugmentations,
+    EyeStates,
+    FrameLabels,
+    drawn_of_people,
+    render,
+    render_dressed,
+)
 from codesign.eye import population as eye
-from codesign.gaze import shared
 from codesign.gaze.personal import SphereCalibrator, angle_deg
 from codesign.gaze.readings import NetworkReadings, PersonCalibrator, face_angles
-from metalens.core.arrays import Array
-
-STREAM = 7  # of the noise
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class PeopleFrames(StateScenes):
-    """Frames of ``people`` people, equally many of each, one person after the other."""
+class PeopleFrames:
+    """Frames of ``people`` people, equally many of each, one person after the other.
 
+    scenes: rig, camera and margin. stream: of the noise.
+    """
+
+    scenes: EyeScenes
+    states: EyeStates
+    worn: DrawnAugmentations
     labels: FrameLabels
     people: int
+    stream: int = 7
 
     @property
     def each(self) -> int:
         """Frames of a person."""
         return len(self.states) // self.people
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frame that are blurred in but not seen."""
+        return self.scenes.margin
+
+    def batch(self, step: int, size: int) -> FrameBatch:
+        """Frames of a step; fewer, or none, where the people end.
+
+        Args:
+            size: frames of a step.
+        """
+        rows = slice(step * size, (step + 1) * size)
+        rig, camera = self.scenes.rig, self.scenes.camera
+        rendered = render_dressed(
+            self.states[rows], self.worn[rows], rig=rig, camera=camera
+        )
+        return as_batch(rendered, self.margin)
 
 
 def simulate_people(
@@ -57,54 +85,19 @@ def simulate_people(
     )
     augmentations = drawn_of_people(rows.numpy(), scenes.settings.variety, (seed, 23))
     labels = render(states, rig=scenes.rig, camera=camera).labels
-    return PeopleFrames(scenes, states, augmentations, STREAM, labels, count)
+    return PeopleFrames(scenes, states, augmentations, labels, count)
 
 
-def read_of(
-    test: PeopleFrames, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None
-) -> NetworkReadings:
+def read_of(test: PeopleFrames, centre: Tensor, slip_mm: Tensor) -> NetworkReadings:
     """Predictions of a network for frames of people, in the units of gaze calibration.
 
     Args:
         test: people, their frames and gaze.
         centre: (n, 2) pupil centre, fraction of the frame from its centre.
         slip_mm: (n, 3) of the head.
-        axis: (n, 3) optic axis in the camera's frame; None of a network without one.
     """
     edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
-    angles = None
-    if axis is not None:
-        angles = face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
-    return NetworkReadings(
-        centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles
-    )
-
-
-def looked_deg(test: PeopleFrames) -> Array:
-    """(n, 2) angles of the visual axes, across and down in the frame of the face, deg.
-
-    Args:
-        test: people, their frames and gaze.
-    """
-    return face_angles(test.labels.visual_axis.numpy(), test.scenes.rig.elevation_rad)
-
-
-def learn_from_people(
-    before: PeopleFrames, read: NetworkReadings
-) -> shared.PopulationPrior:
-    """Population prior of gaze from the frames of other people, by which a person is
-    calibrated.
-
-    Args:
-        before: people who calibrated before.
-        read: pupil, slippage and axis as a network reads them.
-
-    Raises:
-        TrainingError: too few people or frames, or readings without an axis.
-    """
-    return shared.learn_population(
-        read, looked_deg(before), np.arange(len(read)) // before.each
-    )
+    return NetworkReadings(centre.double().numpy() * edge_mm, slip_mm.double().numpy())
 
 
 def calibrated_error_deg(
@@ -125,9 +118,10 @@ def calibrated_error_deg(
             (paper Sec. 3.3).
         share: of each person's frames that calibrates, 3 frames at least.
     """
-    how = how or SphereCalibrator(test.scenes.rig)
+    rig = test.scenes.rig
+    how = how or SphereCalibrator(rig)
     calibrating = max(3, round(share * test.each))
-    true_deg = looked_deg(test)
+    true_deg = face_angles(test.labels.visual_axis.numpy(), rig.elevation_rad)
     errors = []
     for first in range(0, test.people * test.each, test.each):
         calibration = np.arange(first, first + calibrating)

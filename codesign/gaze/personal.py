@@ -130,7 +130,8 @@ def calibrate_person(
 
     Minimises |gaze error / reading|² + |parameters / SPREAD|² twice, the second time
     with the residual of the first as reading error. The regressor learns the remaining
-    errors.
+    errors; its penalty is 1 where there are no more points than parameters of the
+    sphere, else cross-validated.
 
     Args:
         pupil_mm: (n, 2) pupil on the sensor, from the lens axis.
@@ -165,9 +166,11 @@ def calibrate_person(
     sphere_deg = person.sphere(pupil, slip)
     features = np.concatenate([sphere_deg, slip], 1)
     errors = gaze_deg - sphere_deg
-    penalty = _cross_validated_penalty(
-        features, errors, gaze_deg, hidden=hidden, seed=seed
-    )
+    penalty = 1.0
+    if len(pupil) > len(SPREAD):
+        penalty = _cross_validated_penalty(
+            features, errors, gaze_deg, hidden=hidden, seed=seed
+        )
     rest = regressor.fit_regressor(
         features, errors, hidden=hidden, penalty=penalty, seed=seed
     )

@@ -76,13 +76,11 @@ def uncertainty_loss(prediction: Prediction, truth: Tensor) -> Tensor:
     """Gaussian negative log likelihood e² / (2 σ²) + log σ with detached slippage
     errors e.
 
-    It trains the uncertainty alone; 0 for a network without one.
+    It trains the uncertainty alone.
 
     Args:
         prediction: of the network. truth: (batch, 3) slippage in units of its scale.
     """
-    if prediction.slip_log_sd is None:
-        return prediction.slip.new_zeros(())
     error = (prediction.slip - truth).detach()
     return (
         0.5 * error**2 * torch.exp(-2 * prediction.slip_log_sd) + prediction.slip_log_sd
@@ -99,17 +97,12 @@ def task_loss(
 ) -> Tensor:
     """Task loss L_seg + lambda_slip L_calib (paper Eq. 8).
 
-    For a network without a mask L_seg is the loss of the pupil's centre.
-
     Args:
         prediction: of the network. mask: (batch, y, x) coverage of the pupil.
         slip_mm: (batch, 3) true slippage.
         scale_mm: (3,) unit of the network's slippage. slip_weight: of the slippage.
     """
-    if prediction.mask_logits.numel():
-        perception = segmentation_loss(prediction.mask_logits, mask)
-    else:
-        perception = position_loss(prediction.centre, mask)
+    perception = segmentation_loss(prediction.mask_logits, mask)
     return perception + slip_weight * slip_loss(prediction.slip, slip_mm, scale_mm)
 
 
@@ -131,9 +124,7 @@ def depth_reading_loss(
             slippage.
         depth_weight: of the depths of windows.
     """
-    depth_term = prediction.slip.new_zeros(())
-    if prediction.depth is not None:
-        depth_term = depth_weight * depth_loss(prediction.depth, vergence)
+    depth_term = depth_weight * depth_loss(prediction.depth, vergence)
     return depth_term + SPREAD_WEIGHT * uncertainty_loss(prediction, slip_mm / scale_mm)
 
 
@@ -147,15 +138,11 @@ def pose_loss(
 ) -> Tensor:
     """Weighted Huber losses of the landmarks inside the image and of the optic axis.
 
-    0 for a network without them.
-
     Args:
         prediction: of the network. axis: (batch, 3) unit vectors.
         points: (batch, points, 2) as a fraction of the image from its centre.
         axis_weight: of the optic axis. point_weight: of the landmarks.
     """
-    if prediction.points is None or prediction.axis is None:
-        return prediction.slip.new_zeros(())
     inside = (points.abs() < 0.5).all(-1)
     point_error = F.smooth_l1_loss(
         prediction.points / POINT_UNIT,
@@ -168,34 +155,6 @@ def pose_loss(
         prediction.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=AXIS_KNEE
     )
     return axis_weight * axis_loss + point_weight * point_loss
-
-
-def position_loss(
-    centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3
-) -> Tensor:
-    """Huber loss of the pupil's centre from the centroid of its mask, in units of
-    ``unit``.
-
-    Mean over the masks that are not empty, 0 where all are.
-
-    Args:
-        centre: (batch, 2) x, y as a fraction of the frame from its centre.
-        mask: (batch, y, x) coverage. unit: fraction of the frame that errors are
-            divided by.
-        knee: beyond which the loss is linear, in units.
-    """
-    total = mask.sum((1, 2))
-    y, x = (
-        (torch.arange(n, dtype=mask.dtype, device=mask.device) + 0.5) / n - 0.5
-        for n in mask.shape[-2:]
-    )
-    moments = torch.stack([(mask.sum(1) * x).sum(1), (mask.sum(2) * y).sum(1)], -1)
-    truth = moments / total.clamp_min(1e-6)[:, None]
-    error = F.smooth_l1_loss(
-        centre / unit, truth / unit, beta=knee, reduction="none"
-    ).mean(1)
-    visible = total > 0.5
-    return (error * visible).sum() / visible.sum().clamp_min(1)
 
 
 def over_budget(macs: Tensor, budget: float) -> Tensor:
@@ -262,7 +221,7 @@ def at_pixels(logits: Tensor, mask: Tensor, pixels: int) -> tuple[Tensor, Tensor
 def mask_iou(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tensor:
     """(batch,) intersection over union of the masks thresholded at 1/2.
 
-    1 where both are empty, nan without logits.
+    1 where both are empty.
 
     Args:
         logits: (batch, y, x) log odds. mask: (batch, y, x) coverage.
@@ -270,8 +229,6 @@ def mask_iou(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tens
             coverage averaged. The sensor's pixels score what a user of the mask gets;
             without it the grid of the logits serves.
     """
-    if not logits.numel():
-        return torch.full((len(mask),), float("nan"))
     if pixels is not None:
         logits, mask = at_pixels(logits, mask, pixels)
     predicted = logits > 0

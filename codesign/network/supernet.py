@@ -35,11 +35,9 @@ from metalens.core.errors import TrainingError
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Prediction:
-    """Predictions of the network for a batch of frames. Fields that it does not predict
-    are None.
+    """Predictions of the network for a batch of frames.
 
-    mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a
-    network without a mask.
+    mask_logits: (batch, y, x) at a quarter of the input resolution.
     centre: (batch, 2) pupil centre x, y as a fraction of the image from its centre,
     -0.5 at the left and top edge.
     slip: (batch, 3) camera displacement in units of the scale that the loss divides by
@@ -55,10 +53,10 @@ class Prediction:
     mask_logits: Tensor
     centre: Tensor
     slip: Tensor
-    depth: Tensor | None = None
-    slip_log_sd: Tensor | None = None
-    points: Tensor | None = None
-    axis: Tensor | None = None
+    depth: Tensor
+    slip_log_sd: Tensor
+    points: Tensor
+    axis: Tensor
 
 
 def apply_activation(x: Tensor, kind: Activation | None) -> Tensor:

@@ -13,17 +13,13 @@ from scipy import stats
 from torch import Tensor
 
 from codesign.batches import (
-    EyeScenes,
     FrameBatch,
     SceneSource,
     SingleSurfaceFrames,
-    StateScenes,
     depth_um,
-    draw_depth_scales,
     frame_samples,
     sensor_irradiance,
 )
-from codesign.eye import ambiguity_pairs, draw_augmentations
 from codesign.gaze import bench
 from codesign.network import (
     Architecture,
@@ -47,8 +43,7 @@ class SensorFrames:
     frames: (n, 1, y, x) standardised. mask: (n, y, x) pupil over the whole frame.
     slip_mm: (n, 3). batch: frames at a time.
     wide: the frame's width over the image's (:func:`frame_wide`).
-    vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`;
-    None where it is not known.
+    vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`.
     above: why the error of their images is above ``optics.image_tolerance``
     (:func:`codesign.optics.formed.image_tolerance_problem`); empty where it is not.
     """
@@ -57,13 +52,14 @@ class SensorFrames:
     mask: Tensor
     slip_mm: Tensor
     batch: int
-    vergence: Tensor | None = None
+    vergence: Tensor
     wide: float = 1.0
     above: str = ""
 
 
 SAME = 1.05  # ratio of errors up to which a result does not depend on the tolerance
 FINER = 4  # by which the image that checks a result is formed more precisely
+SHIFT_UM = 1000.0  # of the depth of the PSFs, to see whether a network reads them
 
 
 def finer_image(settings: OpticsConfig) -> OpticsConfig | None:
@@ -207,8 +203,7 @@ def displace_frames(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Predictions:
-    """Predictions of a network for n frames. Fields that a network does not predict are
-    None.
+    """Predictions of a network for n frames.
 
     slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its centre.
     iou: (n,) of the pupil's mask, at the sensor's pixels.
@@ -216,17 +211,17 @@ class Predictions:
     depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its
     standard deviation.
     mask: (n, y, x) logits of the pupil on the network's own grid.
-    axis: (n, 3) optic axis in the camera's frame, a unit vector; None too where
-    training gave it no weight.
+    axis: (n, 3) optic axis in the camera's frame, a unit vector; None where training
+    gave it no weight.
     """
 
     slip_mm: Tensor
     centre: Tensor
     iou: Tensor
-    slip_sd_mm: Tensor | None = None
-    depth: Tensor | None = None
-    mask: Tensor | None = None
-    axis: Tensor | None = None
+    slip_sd_mm: Tensor
+    depth: Tensor
+    mask: Tensor
+    axis: Tensor | None
 
 
 @torch.no_grad()
@@ -246,22 +241,20 @@ def predict_frames(
     net.eval()
     predictions = [net(frames, architecture) for frames in batched_frames(seen)]
     net.train(was_training)
-    slip_scale = torch.tensor(inner.slip_scale_mm)
-    slip = torch.cat([f.slip for f in predictions]) * slip_scale
+    slip, centre, mask, log_sd, depth, axis = (
+        torch.cat([getattr(prediction, name) for prediction in predictions])
+        for name in ("slip", "centre", "mask_logits", "slip_log_sd", "depth", "axis")
+    )
+    scale = torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
-    mask = torch.cat([f.mask_logits for f in predictions])
-    iou = losses.mask_iou(mask, seen.mask, pixels=pixels)
-    log_sd = [f.slip_log_sd for f in predictions if f.slip_log_sd is not None]
-    depth = [f.depth for f in predictions if f.depth is not None]
-    axis = [f.axis for f in predictions if f.axis is not None and inner.axis_weight]
     return Predictions(
-        slip,
-        torch.cat([f.centre for f in predictions]) * seen.wide,
-        iou,
-        torch.cat(log_sd).exp() * slip_scale if log_sd else None,
-        torch.cat(depth) if depth else None,
-        mask if mask.numel() else None,
-        torch.nn.functional.normalize(torch.cat(axis), dim=1) if axis else None,
+        slip * scale,
+        centre * seen.wide,
+        losses.mask_iou(mask, seen.mask, pixels=pixels),
+        log_sd.exp() * scale,
+        depth,
+        mask,
+        torch.nn.functional.normalize(axis, dim=1) if inner.axis_weight else None,
     )
 
 
@@ -305,85 +298,20 @@ def recalibrate_network(trainer: Trainer, architecture: Architecture) -> None:
     recalibrate_batch_norm(trainer.model.net, architecture, frames)
 
 
-def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> StateScenes:
-    """Test frames on which only the blur shows depth (paper Sec. 3.6).
+def depth_response(at_rest_mm: Tensor, shifted_mm: Tensor) -> tuple[float, float]:
+    """Change of the predicted axial slippage per mm of added blur depth: mean over
+    frames, and its standard error.
 
-    The two states of a pair have the same pupil position, and every state a random
-    scale, so that sizes carry no depth.
-
-    Args:
-        scenes: rig, camera, ranges and looks. pairs: how many.
-        seed: of states and scales.
-
-    Raises:
-        SceneError: the ranges of ``scenes`` contain hardly any pair.
-    """
-    states = ambiguity_pairs(
-        pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion
-    )
-    scale = draw_depth_scales(
-        scenes.rig.distance_um + states.slip_um[:, 2],
-        scenes.depths_um,
-        scenes.settings.scale,
-        np.random.default_rng((seed, 8)),
-    )
-    generator = np.random.default_rng((seed, scenes.stream, 10))
-    augmentations = draw_augmentations(len(states), scenes.settings.variety, generator)
-    return StateScenes(
-        scenes,
-        replace(states, scale=scale),
-        augmentations.from_one_view(),
-        scenes.stream,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class DepthResponse:
-    """mm of predicted axial slippage per mm of PSF depth: 1 for a network that measures
-    by the blur alone.
-
-    mean, standard_error: over frames. frames: how many.
-    """
-
-    mean: float
-    standard_error: float
-    frames: int
-
-
-def depth_response(
-    trainer: Trainer,
-    scenes: SceneSource,
-    net: Supernet,
-    architecture: Architecture,
-    *,
-    batches: int,
-    shift_um: float = 1000.0,
-) -> DepthResponse:
-    """Change of the predicted axial slippage per mm of added blur depth, mean over
-    frames.
-
-    The PSFs alone are shifted in depth; the noise is the same in both. A network that
-    reads depth from apparent size has response 0, at any score on natural frames. The
-    batch statistics must be measured
-    (:func:`codesign.network.supernet.recalibrate_batch_norm`).
+    1 for a network that measures by the blur alone; 0 for one that reads depth from
+    apparent size, at any score on natural frames.
 
     Args:
-        trainer: with lens, sensor and network as they are. scenes: frames by number.
-        net: elastic network. architecture: member of the search space.
-        batches: number of batches. shift_um: of the depth of the PSFs.
+        at_rest_mm, shifted_mm: (n,) axial slippage predicted from the same frames with
+            the same noise, in the latter with the PSFs shifted by SHIFT_UM in depth
+            (:func:`sensor_frames`).
     """
-    at_rest, shifted = (
-        predict_frames(
-            net,
-            architecture,
-            sensor_frames(trainer, scenes, batches, shift_um=shift),
-            trainer.inner,
-        ).slip_mm[:, 2]
-        for shift in (0.0, shift_um)
-    )
-    response = (shifted - at_rest) / (shift_um * 1e-3)
-    error = float(response.std() / len(response) ** 0.5)
-    return DepthResponse(float(response.mean()), error, len(response))
+    response = (shifted_mm - at_rest_mm) / (SHIFT_UM * 1e-3)
+    return float(response.mean()), float(response.std() / len(response) ** 0.5)
 
 
 def frames_of(trainer: Trainer, people: bench.PeopleFrames) -> SensorFrames:

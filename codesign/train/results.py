@@ -1,8 +1,5 @@
-"""What a run reached: the network of every budget on test frames, on frames where only
-blur tells depth, and what they show.
-"""
+"""What a run reached: the network of every budget on test frames, and what they show."""
 
-import copy
 import json
 import math
 from dataclasses import dataclass, replace
@@ -12,18 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches import CALIBRATION, TEST, VALIDATION, SceneSource
+from codesign.batches import CALIBRATION, TEST
 from codesign.gaze.bench import PeopleFrames
-from codesign.network import blur, losses, recalibrate_batch_norm, smallest_architecture
-from codesign.optics import stack as lens
+from codesign.network import blur, losses, recalibrate_batch_norm
 from codesign.train import assess, evolution
 from codesign.train.assess import Predictions, SensorFrames
 from codesign.train.evolution import EvaluatedCandidate, EvolutionState
 from codesign.train.run import CodesignRun
 from codesign.train.search import people_of, specialise_candidate
-from codesign.train.separability import depth_information
 from codesign.train.trainer import Trainer
-from metalens.core import report
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
 
@@ -34,15 +28,14 @@ class BudgetResult:
 
     row: of the result. trainer: with the final model, lens, pitch and weights of its
     own where that is configured. seen, answers: test frames, and predictions for them.
-    interval_mm: (n,) half width of the 90 % intervals of the axial slippage; None of a
-    network without an uncertainty.
+    interval_mm: (n,) half width of the 90 % intervals of the axial slippage.
     """
 
     row: dict[str, Any]
     trainer: Trainer
     seen: SensorFrames
     answers: Predictions
-    interval_mm: Tensor | None
+    interval_mm: Tensor
 
 
 def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
@@ -84,40 +77,32 @@ def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
 class _TestFrames:
     """Frames through one lens, for every budget that shares it.
 
-    tests: by prefix of their columns. fine: on the finer image. people: for gaze.
+    test: that judge. fine: the same on the finer image. people: for gaze.
     measured: to measure batch statistics on. apart: to calibrate intervals with.
-    response: scenes of the depth response.
+    shifted: the first of the test, with the PSFs shifted in depth.
     """
 
-    tests: dict[str, SensorFrames]
+    test: SensorFrames
     fine: SensorFrames | None
     people: SensorFrames
     measured: list[Tensor]
     apart: SensorFrames
-    response: SceneSource
+    shifted: SensorFrames
 
 
 def _test_frames(run: CodesignRun, people: PeopleFrames) -> _TestFrames:
     """Test, calibration and training frames through the run's present lens."""
-    settings, trainer = run.settings, run.trainer
-    tests = {"": assess.sensor_frames(trainer, run.scenes(TEST), settings.test_batches)}
-    response: SceneSource = run.scenes(TEST)
-    if settings.ambiguity_pairs:
-        pairs = assess.ambiguous_pairs(
-            run.scenes(TEST), settings.ambiguity_pairs, settings.inner.seed
-        )
-        batches = max(1, len(pairs.states) // settings.inner.batch)
-        tests["ambiguous_"] = assess.sensor_frames(trainer, pairs, batches)
-        response = pairs
+    trainer, scenes = run.trainer, run.scenes(TEST)
+    batches = run.settings.test_batches
+    held_out = run.scenes(CALIBRATION)
+    some = max(1, batches // 4)
     return _TestFrames(
-        tests,
-        assess.finer_frames(trainer, run.scenes(TEST), settings.test_batches),
+        assess.sensor_frames(trainer, scenes, batches),
+        assess.finer_frames(trainer, scenes, batches),
         assess.frames_of(trainer, people),
         assess.training_frames(trainer),
-        assess.sensor_frames(
-            trainer, run.scenes(CALIBRATION), settings.validation_batches
-        ),
-        response,
+        assess.sensor_frames(trainer, held_out, run.settings.validation_batches),
+        assess.sensor_frames(trainer, scenes, some, shift_um=assess.SHIFT_UM),
     )
 
 
@@ -148,40 +133,25 @@ def _evaluate_budget(
     row["gaze_deg"] = assess.gaze_error_deg(
         trainer, architecture, people, frames.people
     )
-    calibration = assess.predict_frames(net, architecture, frames.apart, inner)
-    quantile = conformal_quantiles(calibration, frames.apart)
-    test_predictions = assess.predict_frames(net, architecture, frames.tests[""], inner)
-    for name, seen in frames.tests.items():
-        predictions = (
-            assess.predict_frames(net, architecture, seen, inner)
-            if name
-            else test_predictions
-        )
-        row |= _errors(name, predictions, seen) | uncertainty_summary(
-            name, predictions, seen, quantile
-        )
+
+    def predict(seen: SensorFrames) -> Predictions:
+        return assess.predict_frames(net, architecture, seen, inner)
+
+    quantile = conformal_quantiles(predict(frames.apart), frames.apart)
+    answers = predict(frames.test)
+    half_width = quantile * answers.slip_sd_mm[:, 2]
+    row |= _errors("", answers, frames.test)
+    row |= uncertainty_summary(answers, frames.test, half_width)
     if frames.fine is not None:
-        fine_predictions = assess.predict_frames(net, architecture, frames.fine, inner)
-        row |= _errors("finer_", fine_predictions, frames.fine)
+        row |= _errors("finer_", predict(frames.fine), frames.fine)
         row["finer_ratio"] = row["finer_axial_slip_mm"] / row["axial_slip_mm"]
-    response = assess.depth_response(
-        trainer,
-        frames.response,
-        net,
-        architecture,
-        batches=max(1, settings.test_batches // 4),
+    shifted_mm = predict(frames.shifted).slip_mm[:, 2]
+    row["depth_response_mm_per_mm"], row["depth_response_error"] = (
+        assess.depth_response(answers.slip_mm[: len(shifted_mm), 2], shifted_mm)
     )
-    row["depth_response_mm_per_mm"] = response.mean
-    row["depth_response_error"] = response.standard_error
     state = json.loads(evolution.state_to_json(EvolutionState((best,))))
     row["architecture"] = state["history"][0]
-    return BudgetResult(
-        row,
-        trainer,
-        frames.tests[""],
-        test_predictions,
-        _half_widths_mm(test_predictions, quantile),
-    )
+    return BudgetResult(row, trainer, frames.test, answers, half_width)
 
 
 def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
@@ -204,131 +174,51 @@ def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
 
 def _errors(
     prefix: str, predictions: Predictions, frames: SensorFrames
-) -> dict[str, float | None]:
+) -> dict[str, float]:
     """Mean axial and lateral slippage error in mm, and mask IoU; keys begin with
     ``prefix``.
     """
     error = (predictions.slip_mm - frames.slip_mm).abs().mean(0)
-    iou = float(predictions.iou.mean())
     return {
         f"{prefix}axial_slip_mm": float(error[2]),
         f"{prefix}lateral_slip_mm": float(error[:2].mean()),
-        # nan of a network without a mask
-        f"{prefix}iou": iou if iou == iou else None,
+        f"{prefix}iou": float(predictions.iou.mean()),
     }
 
 
 def conformal_quantiles(
     answers: Predictions, frames: SensorFrames, *, share: float = 0.9
-) -> float | None:
+) -> float:
     """Split-conformal quantile of |axial error| / predicted standard deviation.
 
     The interval of so many standard deviations contains ``share`` of the axial
-    slippages, for any distribution of the errors. None of a network without an
-    uncertainty.
+    slippages, for any distribution of the errors.
 
     Args:
         answers: predictions for ``frames``. share: coverage of the interval.
         frames: of the sensor with labels, that training, search and test never use.
     """
-    if answers.slip_sd_mm is None:
-        return None
     ratio = (answers.slip_mm - frames.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
     rank = min(math.ceil(share * (len(ratio) + 1)), len(ratio))
     return float(ratio.sort().values[rank - 1])
 
 
-def _half_widths_mm(answers: Predictions, reach: float | None) -> Tensor | None:
-    """(n,) half width of the 90 % intervals of the axial slippage."""
-    if answers.slip_sd_mm is None or reach is None:
-        return None
-    return reach * answers.slip_sd_mm[:, 2]
-
-
 def uncertainty_summary(
-    name: str, answers: Predictions, frames: SensorFrames, reach: float | None
+    answers: Predictions, frames: SensorFrames, half_width_mm: Tensor
 ) -> dict[str, float]:
     """Coverage and mean half width in mm of the 90 % intervals, and window depth error
     in mm.
 
-    Columns that the network cannot give are left out.
-
     Args:
-        name: prefix of the keys. answers: of the network.
-        frames: frames of the sensor with their labels.
-        reach: conformal quantile, in standard deviations.
+        answers: of the network. frames: frames of the sensor with their labels.
+        half_width_mm: (n,) of the intervals of the axial slippage.
     """
-    row: dict[str, float] = {}
-    if (half_width := _half_widths_mm(answers, reach)) is not None:
-        axial_error = (answers.slip_mm - frames.slip_mm)[:, 2].abs()
-        row[f"{name}axial_coverage_90"] = float(
-            (axial_error <= half_width).float().mean()
-        )
-        row[f"{name}axial_interval_mm"] = float(half_width.mean())
-    if answers.depth is not None and frames.vergence is not None:
-        error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(frames.vergence)
-        row[f"{name}window_depth_mm"] = float(error.abs().mean())
-    return row
-
-
-@torch.no_grad()
-def run_pictures(run: CodesignRun) -> dict[str, bytes]:
-    """PNG pictures by name: psf, frames, masks.
-
-    The run stays as it is: masks come from a copy of the network, whose batch
-    statistics are measured in evaluation mode on the frames that are shown.
-    """
-    trainer = run.trainer
-    stack = lens.lens_psf_stack(trainer.optics, trainer.model.coefficients_rad)
-    indices = torch.linspace(0, len(stack.depths_um) - 1, 6).long().tolist()
-    titles = [f"{float(stack.depths_um[i]) * 1e-3:.0f} mm" for i in indices]
-    pictures = {
-        "psf": _picture_row(
-            [stack.intensity[i].clamp_min(0).sqrt() for i in indices], titles
-        )
-    }
-    frames = assess.sensor_frames(trainer, run.scenes(VALIDATION), 1)
-    shown = min(6, len(frames.frames))
-    pictures["frames"] = _picture_row(list(frames.frames[:shown, 0]), [""] * shown)
-    net = copy.deepcopy(trainer.model.net)  # the run's own statistics must not move
-    recalibrate_batch_norm(net, smallest_architecture(net.space), [frames.frames])
-    logits = net(frames.frames, smallest_architecture(net.space)).mask_logits.cpu()
-    if logits.numel():
-        pictures["masks"] = _picture_row(
-            list(torch.sigmoid(logits[:shown])), [""] * shown
-        )
-    return pictures
-
-
-def _picture_row(images: list[Tensor], titles: list[str]) -> bytes:
-    """PNG of images side by side with titles, in grey."""
-    figure, _ = report.make_figure(size=(1.6 * len(images), 1.8))
-    figure.clear()
-    for k, (image, title) in enumerate(zip(images, titles, strict=True)):
-        axes = figure.add_subplot(1, len(images), k + 1)
-        axes.imshow(image.numpy(), cmap="gray")
-        axes.set_title(title)
-        axes.set_axis_off()
-    return report.figure_png(figure)
-
-
-@torch.no_grad()
-def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
-    """Cramér-Rao bound, in mm, on the depth of one window from its blur, on axis, by
-    depth.
-
-    The window has 1/f texture and is as wide as the PSFs, with noise of a thousandth of
-    its power; see :func:`codesign.train.separability.depth_information`.
-
-    Args:
-        run: run with its model.
-    """
-    stack = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
-    information = depth_information(stack)
-    depth_um = (stack.depths_um[1:] + stack.depths_um[:-1]) / 2
+    axial_error = (answers.slip_mm - frames.slip_mm)[:, 2].abs()
+    window_error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(frames.vergence)
     return {
-        "depth_mm": (1e-3 * depth_um).tolist(),
-        "window_depth_mm": information.clamp_min(1e-12).rsqrt().tolist(),
+        "axial_coverage_90": float((axial_error <= half_width_mm).float().mean()),
+        "axial_interval_mm": float(half_width_mm.mean()),
+        "window_depth_mm": float(window_error.abs().mean()),
     }
 
 
@@ -341,40 +231,24 @@ def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Arr
     Returns:
         frames (n, y, x) as the network sees them; pupil (n, y, x) and slip_um (n, 3),
         true; told_pupil (networks, n, y, x) probability, told_slip_um (networks, n, 3);
-        interval_um (networks, n) half width of the 90 % interval of the distance, nan
-        without one; window_um (n, windows, windows) true depth and told_window_um
-        (networks, n, windows, windows). What no network predicts is left out.
+        interval_um (networks, n) half width of the 90 % interval of the distance.
     """
     frames = ends[0].seen
-    predictions = [end.answers for end in ends]
     pixels = int(frames.frames.shape[-1])
+    pairs = [
+        losses.at_pixels(end.answers.mask[:count], frames.mask[:count], pixels)
+        for end in ends
+    ]
     arrays = {
         "frames": frames.frames[:count, 0],
         "slip_um": 1e3 * frames.slip_mm[:count],
+        "told_slip_um": torch.stack(
+            [1e3 * end.answers.slip_mm[:count] for end in ends]
+        ),
+        "interval_um": torch.stack([1e3 * end.interval_mm[:count] for end in ends]),
+        "pupil": pairs[0][1],
+        "told_pupil": torch.stack([torch.sigmoid(logits) for logits, _ in pairs]),
     }
-    arrays["told_slip_um"] = torch.stack([1e3 * a.slip_mm[:count] for a in predictions])
-    missing = torch.full((min(count, len(frames.frames)),), torch.nan)
-    half_widths = [
-        missing if end.interval_mm is None else 1e3 * end.interval_mm[:count]
-        for end in ends
-    ]
-    arrays["interval_um"] = torch.stack(half_widths)
-    logits = [a.mask for a in predictions if a.mask is not None]
-    if len(logits) == len(predictions):
-        pairs = [
-            losses.at_pixels(mask[:count], frames.mask[:count], pixels)
-            for mask in logits
-        ]
-        arrays |= {
-            "pupil": pairs[0][1],
-            "told_pupil": torch.stack(
-                [torch.sigmoid(mask_logits) for mask_logits, _ in pairs]
-            ),
-        }
-    windows = [a.depth[:count, 0] for a in predictions if a.depth is not None]
-    if frames.vergence is not None and len(windows) == len(predictions):
-        arrays["window_um"] = 1e3 * blur.depth_mm(frames.vergence[:count])
-        arrays["told_window_um"] = 1e3 * blur.depth_mm(torch.stack(windows))
     return {
         name: np.asarray(value.cpu().numpy(), np.float32)
         for name, value in arrays.items()

@@ -87,8 +87,6 @@ class RunConfig:
 
     checkpoint_every: steps. validation_batches: judge architectures. test_batches:
     judge the result.
-    ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that
-    test out.
     preset: of what RUN.toml does not give: smoke (a minute), laptop (half an hour;
     without the key), paper (GPUs); none: the defaults of this record.
     scenes: what is looked at. optics: the lens and how its images are formed. sensor:
@@ -102,7 +100,6 @@ class RunConfig:
     checkpoint_every: int = 50
     validation_batches: int = 8
     test_batches: int = 32
-    ambiguity_pairs: int = 0
     scenes: SceneConfig = field(default_factory=SceneConfig)
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     sensor: Sensor = field(default_factory=Sensor)
@@ -116,10 +113,10 @@ class RunConfig:
             raise ConfigError(
                 "checkpoint_every, validation_batches and test_batches must be 1 or more"
             )
-        if 0 < self.scenes.pool < self.inner.batch or self.ambiguity_pairs < 0:
+        if 0 < self.scenes.pool < self.inner.batch:
             raise ConfigError(
-                f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}, ambiguity_pairs = "
-                f"{self.ambiguity_pairs}: need a pool of a batch or more (or 0), and pairs of 0 or more"
+                f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}: need a pool of a batch or more, "
+                "or 0"
             )
         near, far = (1e-3 * depth for depth in self.scenes.pupil_depths_um)
         if not self.optics.depths_mm[0] <= near <= far <= self.optics.depths_mm[1]:

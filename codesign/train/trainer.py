@@ -152,20 +152,13 @@ def make_model(
 
 
 def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether every gradient is finite, by its largest absolute value on each device.
-
-    Parameters without a gradient are left out. A device is read once.
+    """Whether every gradient is finite; parameters without one are left out.
 
     Args:
         parameters: with gradients.
     """
-    grads = [p.grad for p in parameters if p.grad is not None]
-    devices = {g.device for g in grads}
-    norms = (
-        nn.utils.get_total_norm([g for g in grads if g.device == device], math.inf)
-        for device in devices
-    )
-    return all(bool(torch.isfinite(norm)) for norm in norms)
+    grads = (p.grad for p in parameters if p.grad is not None)
+    return all(bool(torch.isfinite(grad).all()) for grad in grads)
 
 
 def align_moments(optimiser: torch.optim.Optimizer) -> None:
@@ -829,9 +822,7 @@ def follow_device(net: nn.Module, device: torch.device) -> None:
 
     def to_cpu(_: nn.Module, __: tuple[Any, ...], output: Prediction) -> Prediction:
         parts = (getattr(output, name) for name in Prediction.__slots__)
-        return Prediction(
-            *(part.cpu() if from_cpu and part is not None else part for part in parts)
-        )
+        return Prediction(*(part.cpu() if from_cpu else part for part in parts))
 
     net.register_forward_pre_hook(to_device)
     net.register_forward_hook(to_cpu)

@@ -29,8 +29,7 @@ class Options(CommonOptions):
             sensor's pixels in; pupil, slippage,
             landmarks in mm and the angles of the optic axis out, which gaze is
             calibrated from.
-        events: write TensorBoard events too (scalars of every step, pictures at every
-            checkpoint).
+        events: write TensorBoard events too (scalars of every step).
     """
 
     config: tyro.conf.Positional[Path]

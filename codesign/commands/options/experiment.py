@@ -1,4 +1,4 @@
-"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each
+"""RUN_DIR... to Figs. 10 and 11: gaze and slippage of synthetic subjects before each
 run's lens and network (Sec. 5).
 """
 
@@ -22,9 +22,8 @@ class Options(CommonOptions):
             of the others. A folder of
             metalens retrain shows its network before the lens as made;
             nominal.safetensors in it, the unwarned one.
-        output: folder for experiment.json, samples.png, ambiguity.png, errors.png,
-            report.html and, of every run that
-            tells the optic axis, people_1.h5 ...: what calibrates a wearer of that
+        output: folder for experiment.json, ambiguity.png, errors.png, report.html and,
+            of every run that tells the optic axis, people_1.h5 ...: what calibrates a wearer of that
             device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.
         settings: subjects, stimuli, slippage states, calibration.

@@ -65,7 +65,7 @@ def test_bars_of_a_gap_and_of_an_accuracy():
     assert told.gap_sigma_mm == pytest.approx(0.374 / math.sqrt(4000), rel=0.05)
     assert better.axial_mm - better.lateral_mm == pytest.approx(4.5, rel=1e-5)
     assert better.slip_mm == pytest.approx(4.5, abs=0.05)
-    low, high = better.interval_mm()
+    low, high = (better.values()[f"slip_{end}_mm"] for end in ("low", "high"))
     assert high - low == pytest.approx(
         2 * 1.96 * 3 / math.sqrt(12) / math.sqrt(4000), rel=0.1
     )  # 1000 draws: 3 %

@@ -130,7 +130,7 @@ def test_the_path_from_the_pupil_ends_where_the_experiment_does(run):
     counted = [row.gaze_rad for row in rows if row.counted]
     assert [row.link for row in rows] == [
         "subject and calibration", "fixation", "reader, pupil", "reader, slippage",
-        "sensor noise", "field", "radiometry",
+        "sensor noise", "image of training",
     ]  # fmt: skip
     assert math.degrees(math.hypot(*counted)) >= measured * (1 - 1e-9)
     whole = budget.device.whole

@@ -97,14 +97,6 @@ def test_a_liner_darkens_the_skin_beside_the_opening_alone():
     torch.testing.assert_close(rows, want, rtol=1e-6, atol=1e-7)
 
 
-def test_a_darkened_lid_lies_above_the_eye_and_fades():
-    rows = put_on(scene(), lid_shadow=0.5).pinhole()[0, :, 11]
-    assert float(rows[19]) < 0.3
-    assert float(rows[14]) < float(rows[10]) <= 0.5
-    assert rows[43:].tolist() == [0.5] * (N - 43)
-    assert rows[20:40].tolist() == pytest.approx([0.3] * 20)
-
-
 def test_glints_lie_on_the_eye_at_their_distance_from_the_pupil():
     draws = np.zeros(12)
     draws[3], draws[4], draws[6] = 0.0, 0.5, 0.9  # to +x, 5.5 % of the frame away

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
-from codesign.gaze import bench
+from codesign.gaze import bench, face_angles, shared
 from codesign.gaze.bench import calibrated_error_deg, simulate_people
 
 SCENES = EyeScenes(SceneConfig(pixels=64, margin=8), 18.0, 2000.0, 0, TEST)
@@ -66,9 +66,13 @@ def test_an_axis_that_is_read_is_calibrated_by_what_other_people_s_tells(group):
             len(true), 3, generator=rng
         )
         centre = torch.from_numpy(true.pupil_mm / (64 * 18e-3))
-        found.append(bench.read_of(who, centre, slip, 1.7 * axis))
+        tilt = SCENES.rig.elevation_rad
+        axis /= axis.norm(dim=1, keepdim=True)
+        angles = face_angles(axis.numpy(), tilt)
+        found.append(replace(bench.read_of(who, centre, slip), axis_deg=angles))
     theirs, read = found
-    prior = bench.learn_from_people(before, theirs)
+    looked = face_angles(before.labels.visual_axis.numpy(), tilt)
+    prior = shared.learn_population(theirs, looked, np.arange(len(looked)) // 60)
     # twelve points for a dozen terms of one's own
     assert calibrated_error_deg(group, read, how=prior) < 0.38 * 1.3
     assert calibrated_error_deg(group, read) > 1.2

@@ -1,5 +1,6 @@
 """Errors of a network's answers, from answers that are typed in."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -20,7 +21,10 @@ class Typed(torch.nn.Module):
     def forward(self, frames, architecture):
         part = slice(self.at, self.at + len(frames))
         self.at += len(frames)
-        return Prediction(self.logits[part], self.slip[part, :2], self.slip[part])
+        slip, depth = self.slip[part], torch.zeros(len(frames), 2, 7, 7)
+        return Prediction(
+            self.logits[part], slip[:, :2], slip, depth, slip, slip[:, None, :2], slip
+        )
 
 
 def test_answers_are_scaled_and_errors_are_means_over_frames():
@@ -33,9 +37,9 @@ def test_answers_are_scaled_and_errors_are_means_over_frames():
         1.0,
     )  # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[1, 0], mask[1, 0] = 1.0, 1.0
-    seen = SensorFrames(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
+    seen = SensorFrames(torch.zeros(3, 1, 5, 5), mask, truth, 2, torch.zeros(3, 7, 7))
     net = Typed((truth + off) / scale, logits)
-    inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
+    inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0)
     got = assess.predict_frames(net, None, seen, inner)
     error = (got.slip_mm - truth).abs().mean(0)
     assert float(error[2]) == pytest.approx((0.7 + 0.4 + 0.1) / 3)
@@ -60,28 +64,25 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
         def forward(self, frames, architecture):
             part = slice(self.at, self.at + len(frames))
             found = super().forward(frames, architecture)
-            return Prediction(
-                found.mask_logits, found.centre, found.slip, depth[part], log_sd[part]
-            )
+            return replace(found, depth=depth[part], slip_log_sd=log_sd[part])
 
     seen = SensorFrames(
-        torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
+        torch.zeros(3, 1, 5, 5),
+        torch.zeros(3, 5, 5),
+        torch.zeros(3, 3),
+        2,
+        torch.zeros(3, 7, 7),
     )
     net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
     got = assess.predict_frames(
-        net, None, seen, SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
+        net,
+        None,
+        seen,
+        SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0),
     )
     assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
     assert torch.allclose(got.slip_mm, scale.expand(3, 3))
     assert torch.equal(got.depth, depth)
-    plain = assess.predict_frames(
-        Typed(torch.ones(3, 3), -torch.ones(3, 5, 5)),
-        None,
-        seen,
-        SimpleNamespace(slip_scale_mm=(1.0,) * 3),
-    )
-    assert plain.slip_sd_mm is None
-    assert plain.depth is None
 
 
 def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
@@ -89,10 +90,14 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
         def forward(self, frames, architecture):
             found = super().forward(frames, architecture)
             axis = torch.tensor([[0.3, -0.4, 1.2]]).expand(len(frames), 3)
-            return Prediction(found.mask_logits, found.centre, found.slip, axis=axis)
+            return replace(found, axis=axis)
 
     seen = SensorFrames(
-        torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
+        torch.zeros(3, 1, 5, 5),
+        torch.zeros(3, 5, 5),
+        torch.zeros(3, 3),
+        2,
+        torch.zeros(3, 7, 7),
     )
     told = [
         assess.predict_frames(

@@ -1,5 +1,5 @@
-"""Frames that nobody else uses: streams of calibration, selection and test; pairs with
-the looks of training; a mask that would be worse; a network and loss of one's own.
+"""Frames that nobody else uses: streams of calibration, selection and test; a mask that
+would be worse; a network and loss of one's own.
 """
 
 import itertools
@@ -13,8 +13,6 @@ import torch
 from codesign.adapt import correction
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
 from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
-from codesign.eye import render
-from codesign.train.assess import ambiguous_pairs
 from codesign.train.trainer import prefetch
 
 ROOT = Path(__file__).parents[3]
@@ -34,24 +32,6 @@ def test_no_two_streams_show_the_same_eye():
     for one, other in itertools.combinations(seen, 2):
         distance = torch.cdist(one, other)
         assert float(distance.min()) > 1e-6
-
-
-@pytest.mark.parametrize(("variety", "dressed"), [(1.0, False), (3.0, True)])
-def test_pairs_that_only_blur_tells_apart_have_the_looks_of_training(variety, dressed):
-    """Up to a variety of 1 the frames are bare; beyond it spectacles, shadows and
-    reflections change the light of the same states, and the pupil stays in its place.
-    """
-    settings = SceneConfig(pixels=64, margin=4, variety=variety)
-    scenes = EyeScenes(settings, 18.0, 2000.0, seed=1, stream=TEST)
-    pairs = ambiguous_pairs(scenes, 4, 5)
-    batch = pairs.batch(0, 8)
-    bare = render(pairs.states, rig=scenes.rig, camera=scenes.camera)
-    off = (batch.frames.radiance.sum(1) - bare.pinhole()).abs().mean((1, 2))
-    assert (float(off.max()) > 0.01) == dressed
-    if not dressed:
-        assert float(off.max()) == 0
-    slip = pairs.states.slip_um
-    assert float((slip[::2] - slip[1::2]).norm(dim=1).min()) >= 800.0
 
 
 def test_a_mask_that_its_own_table_shows_to_be_worse_is_refused_in_words():
