@@ -18,6 +18,7 @@ from pathlib import Path
 
 from IPython.display import Image, display
 
+from characterize import next_mask
 from characterize.bench import bench
 from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures import capture as captures
@@ -25,11 +26,8 @@ from characterize.commands import capture as command_capture
 from characterize.inference import asbuilt
 from characterize.inference.estimate import FitOptions, fit
 from characterize.model.parameters import KnownValue
-from codesign.adapt import correction
 from codesign.adapt import report as retrain_report
-from codesign.adapt import source as finished
 from codesign.adapt import train as retraining
-from codesign.optics import built
 from codesign.settings import RetrainConfig
 from metalens import lens as lenses
 from metalens.cli import main
@@ -125,21 +123,13 @@ display(Image(retrain_report.plot_error_bars(told)))
 # A new bias table and a corrected map, and what they would gain on the true lens.
 
 # %%
-optics = finished.load_finished_run(work / "run").settings.optics
-engine = built.MadeLens(design, optics)
-plan = correction.propose_correction(
-    design,
-    made.parameters(),
-    response=engine.response,
-    old=correction.present_bias(process),
-)
-correction.write_correction(work, plan)
+old = next_mask.present_bias(process)
+mask = next_mask.plan_next_mask(made, old=old, truths=[truth.vector()])
+next_mask.write_correction(work, mask.plan)
 print(tomllib.loads((work / "bias.toml").read_text())["bias"]["table_nm"][::4])
-goal = engine.stack()
-for state in correction.next_lenses(engine, plan, made.parameters(), truth.vector()):
-    print(
-        f"{state.name:<26} PSF error {built.psf_error(state.stack, goal):.3f}   Strehl {state.strehl:.3f}"
-    )
+for step in mask.steps:
+    print(f"{step.name:<26} Strehl {step.strehl:.3f}")
+print(mask.summary)
 
 # %% [markdown]
 # From the shell, the last two steps are one command, with its own report:
