@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from characterize.inference import AsBuilt
-from codesign.network import Architecture, check_architecture, subnet
+from codesign.network import Architecture, subnet
 from codesign.optics import PixelPsfStack
-from codesign.train import CodesignRun, RunConfig, checkpoint
+from codesign.train import CodesignRun, RunConfig, checkpoint, evolution
 from codesign.train import run as runs
 from metalens.core import transaction
 from metalens.core.errors import FitError, TrainingError
@@ -82,9 +82,15 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         raise TrainingError(
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {budgets}"
         )
-    architecture = architecture_of(selected[0]["architecture"], run, folder)
+    entry = selected[0].get("architecture")
+    try:
+        best = evolution.candidate_from_json(entry, settings.space)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise TrainingError(
+            f"{folder}/result.json: its network is of another version ({error})"
+        ) from None
     restore_network(run, selected[0], folder)
-    return FinishedRun(run, architecture, selected[0])
+    return FinishedRun(run, best.architecture, selected[0])
 
 
 def weights_file(folder: Path, budget_mmacs: float) -> Path:
@@ -172,30 +178,6 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     if not rows:
         raise TrainingError(f"{path}: holds no network; resume the run")
     return rows
-
-
-def architecture_of(
-    entry: dict[str, Any] | None, run: CodesignRun, folder: Path
-) -> Architecture:
-    """The architecture in a row of result.json.
-
-    Args:
-        entry: architecture in a row of result.json. folder: of the files.
-
-    Raises:
-        TrainingError: of another version, or outside the run's space.
-    """
-    values: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v
-        for k, v in (entry or {}).items()
-        if k not in ("error", "macs")
-    }
-    try:
-        return check_architecture(run.settings.space, Architecture(**values))
-    except TypeError as error:
-        raise TrainingError(
-            f"{folder}/result.json: its network is of another version ({error})"
-        ) from None
 
 
 def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:

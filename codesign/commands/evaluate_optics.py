@@ -97,36 +97,19 @@ def _measure(
             compared.append(lens)
     setting = settings.axial.about(compared[0])
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
-    pairs = options.console.track(
-        zip(names, compared, strict=True), total=len(compared), label="PSFs"
-    )
-    axial = {
-        name: evaluate_optics.measure_axial_information(lens, setting)
-        for name, lens in pairs
-    }
-    pairs = options.console.track(
-        zip(names, compared, strict=True), total=len(compared), label="field"
-    )
-    over_field = {
-        name: settings.over_field.of(lens, compared[0], setting.angles_deg)
-        for name, lens in pairs
-    }
-    spread = [
-        name
-        for name, lens in zip(names, compared, strict=True)
-        if not design.lens_has_focus(lens)
-    ]
+    axial, over_field, spread = {}, {}, []
+    pairs = zip(names, compared, strict=True)
+    for name, lens in options.console.track(pairs, total=len(compared), label="PSFs"):
+        axial[name] = evaluate_optics.measure_axial_information(lens, setting)
+        over_field[name] = settings.over_field.of(lens, compared[0], setting.angles_deg)
+        if not design.lens_has_focus(lens):
+            spread.append(name)
     remarks = [f"{name} {SPREAD}" for name in spread]
     try:
-        scenes = dict(
-            zip(
-                names,
-                evaluate_optics.scene_energies(compared, states, settings.scenes),
-                strict=True,
-            )
-        )
+        energies = evaluate_optics.scene_energies(compared, states, settings.scenes)
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *remarks])) from error
+    scenes = dict(zip(names, energies, strict=True))
     tables = [
         evaluate_optics.axial_table(axial, setting, remarks),
         evaluate_optics.scene_table(scenes),

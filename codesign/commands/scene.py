@@ -222,22 +222,15 @@ def _write_layers(
 def _labels_csv(rendered: RenderedFrames) -> str:
     """Labels as comma-separated values, a frame a line."""
     labels = rendered.labels
-    parts = (
-        ("slip", "xyz", " um", labels.slip_um),
-        ("optic", "xyz", "", labels.optic_axis),
-        ("visual", "xyz", "", labels.visual_axis),
-        ("pupil", "xyz", " um", labels.pupil_um),
-        ("pupil", "xy", " px", labels.pupil_px),
-        ("visible", ("",), "", labels.visible[:, None]),
-        *(
-            (name, "xy", " px", labels.landmarks_px[:, k])
-            for k, name in enumerate(landmarks.NAMES)
-        ),
-    )
-    head = [
-        f"{name} {axis}{unit}".strip() for name, axes, unit, _ in parts for axis in axes
-    ]
-    rows = torch.cat([values for *_, values in parts], 1).tolist()
+    vectors = (("slip", " um"), ("optic", ""), ("visual", ""), ("pupil", " um"))
+    head = [f"{name} {axis}{unit}" for name, unit in vectors for axis in "xyz"]
+    head += ["pupil x px", "pupil y px", "visible"]
+    head += [f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"]
+    columns = (
+        labels.slip_um, labels.optic_axis, labels.visual_axis, labels.pupil_um,
+        labels.pupil_px, labels.visible[:, None], labels.landmarks_px.flatten(1),
+    )  # fmt: skip
+    rows = torch.cat(columns, 1).tolist()
     lines = [",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
     return "\n".join(lines) + "\n"
 

@@ -268,29 +268,16 @@ def scene_panels(path: Path) -> list[Panel]:
         is_far, arrays["depth_um"][:, 1], arrays["depth_um"][:, 0]
     )
     labels = {
-        k.removeprefix("labels/"): v
-        for k, v in arrays.items()
-        if k.startswith("labels/")
-    }
-    shown_labels = {
-        name: value
+        name: arrays[f"labels/{name}"].reshape(count, -1)
         for name in ("slip_um", "pupil_um", "visible")
-        if (value := labels.get(name)) is not None
     }
     columns = [
-        f"{report.in_words(name)}{axis}"
-        for name, v in shown_labels.items()
-        for axis in ([""] if v.ndim == 1 else (", x", ", y", ", z"))
+        report.in_words(name) + (f", {axis}" if len(values[0]) > 1 else "")
+        for name, values in labels.items()
+        for axis, _ in zip("xyz", values[0], strict=False)
     ]
-    rows = [
-        [
-            i,
-            *np.concatenate(
-                [np.atleast_1d(v[i]) for v in shown_labels.values()]
-            ).tolist(),
-        ]
-        for i in range(count)
-    ]
+    table = np.concatenate(list(labels.values()), 1).tolist()
+    rows = [(i, *row) for i, row in enumerate(table)]
     radiance = arrays["radiance"].sum(1, dtype=float) / full
     pupil = arrays["pupil"] / full
     return [

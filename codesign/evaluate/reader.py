@@ -121,7 +121,6 @@ class ReaderResult:
     covered: share of frames within the calibrated 90 % interval of axial slippage.
     interval_mm: mean half width of that interval.
     image_error: relative L2 error of the images.
-    trusted_mm: mean depth error of the half of all windows of least predicted spread.
     """
 
     axial_mm: Tensor
@@ -131,7 +130,6 @@ class ReaderResult:
     covered: float
     interval_mm: float
     image_error: float
-    trusted_mm: float
 
     def values(self) -> dict[str, float]:
         """Mean errors by name, the axial one with its 95 % bootstrap interval over the
@@ -142,7 +140,7 @@ class ReaderResult:
             "axial_mm": float(self.axial_mm.mean()), "axial_low_mm": float(low), "axial_high_mm": float(high),
             "lateral_mm": float(self.lateral_mm.mean()), "window_mm": float(self.window_mm.mean()),
             "guess_mm": self.guess_mm, "covered": self.covered, "interval_mm": self.interval_mm,
-            "image_error": self.image_error, "trusted_mm": self.trusted_mm,
+            "image_error": self.image_error,
         }  # fmt: skip
 
 
@@ -209,23 +207,17 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
         raise ConfigError(
             f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
         )
-    eye_scenes = {
-        stream: EyeScenes(
+    sources = []
+    for stream in (EXPERIMENT, VALIDATION, TEST):
+        eyes = EyeScenes(
             scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream
         )
-        for stream in (EXPERIMENT, VALIDATION, TEST)
-    }
-    pools = {
-        stream: render_pool(
-            stream_scenes, config.test if stream != EXPERIMENT else config.pool
+        count = config.pool if stream == EXPERIMENT else config.test
+        pool = render_pool(eyes, count)
+        sources.append(
+            PoolScenes(pool, config.margin, scenes.scale, config.seed + stream)
         )
-        for stream, stream_scenes in eye_scenes.items()
-    }
-    sources = {
-        s: PoolScenes(pool, config.margin, scenes.scale, config.seed + s)
-        for s, pool in pools.items()
-    }
-    return JudgingScenes(sources[EXPERIMENT], sources[VALIDATION], sources[TEST])
+    return JudgingScenes(*sources)
 
 
 def train_reader(
@@ -270,29 +262,18 @@ def lens_frames(
         config: frames, sensor and light of the reader; seed of the noise.
         count: frames, a multiple of 32.
     """
-    pixels = []
-    vergence = []
-    slip = []
+    parts = []
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
     for number in range(count // BATCH):
         batch = scenes.batch(number, BATCH)
         light = sensor_irradiance(batch.frames, optics)
         noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
-        pixels.append(
-            read_out(
-                light,
-                config.pitch_um,
-                pitch,
-                config.sensor,
-                generator=noise,
-                exact=False,
-            )
+        pixels = read_out(
+            light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False
         )
-        vergence.append(
-            blur.window_vergence(depth_um(batch.frames, margin=config.margin))
-        )
-        slip.append(batch.slip_mm)
-    return LensFrames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
+        depths = depth_um(batch.frames, margin=config.margin)
+        parts.append((pixels, blur.window_vergence(depths), batch.slip_mm))
+    return LensFrames(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _train_depth(
@@ -365,11 +346,7 @@ def _training_batches(
 @torch.no_grad()
 def _features(reader: ReferenceReader, frames: LensFrames) -> Tensor:
     """(n, features) of the blur branch, 256 frames at a time."""
-    parts = [
-        reader.branch(frames.pixels[first : first + 256])[1]
-        for first in range(0, len(frames.pixels), 256)
-    ]
-    return torch.cat(parts)
+    return torch.cat([reader.branch(part)[1] for part in frames.pixels.split(256)])
 
 
 @torch.no_grad()
@@ -394,18 +371,9 @@ def _evaluate(
     ratios = (error[:, 2] / spread).sort().values
     factor = float(ratios[min(math.ceil(SHARE * (len(ratios) + 1)), len(ratios)) - 1])
     error, spread = slip(test)
-    predicted = torch.cat(
-        [
-            reader.branch(test.pixels[first : first + 256])[0]
-            for first in range(0, len(test.pixels), 256)
-        ]
-    )
+    depths = [reader.branch(part)[0] for part in test.pixels.split(256)]
     truth = blur.depth_mm(test.vergence)
-    depth = blur.depth_mm(predicted[:, 0])
-    window_error = (depth - truth).abs()
-    variance = depth**2 * predicted[:, 1].exp()
-    surest = variance.flatten().argsort()[: window_error.numel() // 2]
-    trusted = window_error.flatten()[surest]
+    window_error = (blur.depth_mm(torch.cat(depths)[:, 0]) - truth).abs()
     return ReaderResult(
         axial_mm=error[:, 2],
         lateral_mm=error[:, :2].mean(1),
@@ -414,7 +382,6 @@ def _evaluate(
         covered=float((error[:, 2] <= factor * spread).float().mean()),
         interval_mm=float((factor * spread).mean()),
         image_error=image_error,
-        trusted_mm=float(trusted.mean()),
     )
 
 
@@ -441,20 +408,16 @@ def reader_table(results: dict[str, ReaderResult], config: ReaderConfig) -> Tabl
     )
     rows = []
     for name, result in results.items():
-        values = result.values()
-        axial = f"{values['axial_mm']:.2f} [{values['axial_low_mm']:.2f}, {values['axial_high_mm']:.2f}]"
-        interval = f"±{values['interval_mm']:.2f} mm"
-        covered = f"{100 * values['covered']:.0f} %"
-        windows = f"{values['window_mm']:.2f} ({values['guess_mm']:.2f})"
+        v = result.values()
         rows.append(
             (
                 name,
-                axial,
-                interval,
-                covered,
-                f"{values['lateral_mm']:.2f}",
-                windows,
-                f"{values['image_error']:.3f}",
+                f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]",
+                f"±{v['interval_mm']:.2f} mm",
+                f"{100 * v['covered']:.0f} %",
+                f"{v['lateral_mm']:.2f}",
+                f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})",
+                f"{v['image_error']:.3f}",
             )
         )
     return Table(head, rows, caption)
@@ -481,25 +444,7 @@ def judge_lenses(
     scenes = render_scenes(config, sensor_distance_um=next(iter(distances.values())))
     nearest, farthest = config.depths_mm
     options = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
+    depths_um = nearest * 1e3, farthest * 1e3
     for name, lens in lenses.items():
-        yield (
-            name,
-            train_reader(
-                lens_imager(
-                    lens, config.camera, (nearest * 1e3, farthest * 1e3), **options
-                ),
-                scenes,
-                config,
-            ),
-        )
-
-
-__all__ = [
-    "ReaderConfig",
-    "ReaderResult",
-    "ReferenceReader",
-    "judge_lenses",
-    "reader_table",
-    "render_scenes",
-    "train_reader",
-]
+        optics = lens_imager(lens, config.camera, depths_um, **options)
+        yield name, train_reader(optics, scenes, config)

@@ -1,5 +1,6 @@
 from . import assess as assess
 from . import checkpoint as checkpoint
+from . import evolution as evolution
 from . import results as results
 from . import run as run
 from . import search as search

@@ -21,7 +21,7 @@ from codesign.network import (
     sample_architecture,
     smallest_architecture,
 )
-from metalens.core.errors import TrainingError, nearest_name_hint
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,7 +407,7 @@ def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
     """
     try:
         raw = json.loads(text)
-        history = tuple(_candidate_from_json(entry, space) for entry in raw["history"])
+        history = tuple(candidate_from_json(entry, space) for entry in raw["history"])
         return EvolutionState(history, raw["generator"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise TrainingError(
@@ -415,26 +415,19 @@ def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
         ) from error
 
 
-def _candidate_from_json(
+def candidate_from_json(
     entry: dict[str, Any], space: SearchSpace
 ) -> EvaluatedCandidate:
-    """Evaluated candidate from its entry in the state's JSON.
+    """Evaluated candidate from its entry in the state's JSON or in result.json.
+
+    Args:
+        entry: sizes of the architecture, error and cost. space: that it belongs to.
 
     Raises:
-        TrainingError: an unknown entry. ConfigError: not of this space.
+        KeyError, TypeError: a missing or an unknown entry. ConfigError: not of this
+            space.
     """
-    values = dict(entry)
-    error, macs = values.pop("error"), values.pop("macs")
-    fields = {f.name for f in dataclasses.fields(Architecture)}
-    for name in values:
-        if name not in fields:
-            raise TrainingError(
-                f"unknown entry {name!r} of an architecture{nearest_name_hint(name, fields)}"
-            )
-    sizes: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-    }
-    architecture = Architecture(**sizes)
-    return EvaluatedCandidate(
-        check_architecture(space, architecture), float(error), float(macs)
-    )
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()}
+    error, macs = float(values.pop("error")), float(values.pop("macs"))
+    architecture = check_architecture(space, Architecture(**values))
+    return EvaluatedCandidate(architecture, error, macs)
