@@ -310,8 +310,7 @@ def layer_panels(path: Path) -> list[Panel]:
 
 
 def image_panels(path: Path) -> list[Panel]:
-    """Scene, image and their difference, PSFs over field and depth, and the error by
-    cause.
+    """Scene and image with its error, their difference, PSFs over field and depth.
 
     Args:
         path: of the file.
@@ -329,22 +328,15 @@ def image_panels(path: Path) -> list[Panel]:
     ]
     psf = arrays["psf"] / arrays["psf"].max()
     pitch_um = float(attributes["pitch_um"])
-    errors = [
-        (report.in_words(k.removeprefix("error_")), v)
-        for k, v in sorted(attributes.items())
-        if k.startswith("error_")
-    ]
-    note = f"Relative L2 error of a texture, {float(attributes['error']):.2g} together; outside: light beyond the windows."
+    difference = arrays["image"] - arrays["scene"]
+    note = f"Relative L2 error of a texture: {float(attributes['error']):.2g}."
     unit = "light, as of the scene"
     return [
-        ImagePanel("Scene and image", pairs, [frames, choice], pitch_um, unit),
         ImagePanel(
-            "Image less scene",
-            arrays["image"] - arrays["scene"],
-            [frames],
-            pitch_um,
-            unit,
-            signed=True,
+            "Scene and image", pairs, [frames, choice], pitch_um, unit, caption=note
+        ),
+        ImagePanel(
+            "Image less scene", difference, [frames], pitch_um, unit, signed=True
         ),
         ImagePanel(
             "Points of the field",
@@ -354,7 +346,6 @@ def image_panels(path: Path) -> list[Panel]:
             "of the highest peak",
             optics=True,
         ),
-        TablePanel("Error of the image", ("cause", "error"), errors, note),
     ]
 
 

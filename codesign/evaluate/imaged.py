@@ -34,7 +34,7 @@ class ImagedFrames:
     depth_um: (depth,). y_deg, x_deg: field angles of the PSFs' rows and columns, the
     outermost at the edge of the margin.
     pitch_um: pitch of the samples.
-    error: relative L2 error of the image. parts: its contributions by cause.
+    error: relative L2 error of the image.
     light: wavelengths that the pillar model does not cover, in words, or empty.
     problem: why the error exceeds :data:`TOLERANCE`, or empty.
     """
@@ -47,7 +47,6 @@ class ImagedFrames:
     x_deg: Array
     pitch_um: float
     error: float
-    parts: dict[str, float]
     light: str = ""
     problem: str = ""
 
@@ -160,7 +159,6 @@ def image_first_frames(
         np.degrees(np.arctan(x_um / lens.reduced_um)),
         camera.pitch_um,
         optics.error,
-        {name: float(value) for name, value in optics.parts.items()},
         spectrum.outside_library_text(
             diode_source(lens, fwhm_nm), lens.proxy.wavelengths_um
         ),
@@ -178,9 +176,7 @@ def write_images(folder: Path, imaged: ImagedFrames, about: Provenance) -> None:
     """
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
     arrays = {name: np.asarray(getattr(imaged, name)) for name in names}
-    attributes = {"pitch_um": imaged.pitch_um, "error": imaged.error} | {
-        f"error_{cause}": error for cause, error in imaged.parts.items()
-    }
+    attributes = {"pitch_um": imaged.pitch_um, "error": imaged.error}
     store.save(
         folder / "image.h5", "image", arrays, attributes=attributes, provenance=about
     )

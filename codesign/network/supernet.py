@@ -103,16 +103,11 @@ class SlicedNorm(nn.Module):
             self._measure(x)
         if self.training and not self.measuring and parallel.process_count() > 1:
             return apply_activation(parallel.batch_norm(x, weight, bias), act)
-        batch_statistics = self.training or self.measuring
-        mean, variance = (
-            (None, None) if batch_statistics else (self.mean, self.variance)
-        )
-        if mean is not None and variance is not None:
-            mean, variance = mean[:count], variance[:count]
-        return apply_activation(
-            F.batch_norm(x, mean, variance, weight, bias, training=batch_statistics),
-            act,
-        )
+        by_batch = self.training or self.measuring
+        mean = None if by_batch else self.mean[:count]
+        variance = None if by_batch else self.variance[:count]
+        y = F.batch_norm(x, mean, variance, weight, bias, training=by_batch)
+        return apply_activation(y, act)
 
     @torch.no_grad()
     def _measure(self, x: Tensor) -> None:
