@@ -272,10 +272,12 @@ def _write_results(
         "seed": settings.inner.seed,
         "steps": settings.inner.steps,
         "rows": rows,
+        "frozen": list(settings.run.frozen),
+        "image": said,
+        "pitch_held_um": codesign_run.trainer.pitch_held_um,
+        "threads": torch.get_num_threads(),
+        "bytes_depend_on_threads": True,
     }
-    record |= {"frozen": list(settings.run.frozen), "image": said}
-    record |= {"pitch_held_um": codesign_run.trainer.pitch_held_um}
-    record |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(record, indent=1) + "\n")
     labels = {
         f"network_{i}": f"budget {row['budget_mmacs']:g} million MACs"

@@ -65,25 +65,19 @@ def run(options: Options) -> int:
     )
 
 
+def measurement_files(folder: Path) -> dict[str, Path]:
+    """Files of the measurements that a ``folder`` holds, by name."""
+    names = {"experiment": "experiment", "dim": "experiment", "optics": "optics"}
+    files = {name: folder / name / f"{file}.json" for name, file in names.items()}
+    return {name: path for name, path in files.items() if path.is_file()}
+
+
 def measurement_failures(folder: Path) -> list[str]:
-    """The checks that the measurements in ``folder`` failed, each with which it is of."""
-    files = [
-        folder / name
-        for name in (
-            "experiment/experiment.json",
-            "dim/experiment.json",
-            "optics/optics.json",
-        )
-    ]
-    results = {
-        file.parent.name: json.loads(file.read_text("utf-8"))
-        for file in files
-        if file.is_file()
-    }
+    """Checks that the measurements in ``folder`` failed, each with its measurement."""
     return [
         f"{name}: {words}"
-        for name, values in results.items()
-        for words in values.get("failures", [])
+        for name, path in measurement_files(folder).items()
+        for words in json.loads(path.read_text("utf-8")).get("failures", [])
     ]
 
 
@@ -101,20 +95,13 @@ def collect_measurements(
             version.
     """
     measured: dict[str, MeasuredNumber] = {}
-    experiment, dim, optics = (
-        folder / name / f"{file}.json"
-        for name, file in (
-            ("experiment", "experiment"),
-            ("dim", "experiment"),
-            ("optics", "optics"),
-        )
-    )
-    if experiment.is_file():
-        measured |= paper.of_experiment(experiment)
-    if experiment.is_file() and dim.is_file():
-        measured |= paper.of_dim(experiment, dim)
-    if optics.is_file():
-        measured |= paper.of_optics(optics)
+    files = measurement_files(folder)
+    if "experiment" in files:
+        measured |= paper.of_experiment(files["experiment"])
+    if {"experiment", "dim"} <= files.keys():
+        measured |= paper.of_dim(files["experiment"], files["dim"])
+    if "optics" in files:
+        measured |= paper.of_optics(files["optics"])
     rows = {role: finished.rows_of(path) for role, path in runs.items()}
     ours = rows.get("proposed", [])
     measured |= paper.of_runs(rows) | paper.of_gaze(ours)

@@ -15,6 +15,13 @@ from metalens.core.errors import StoreError, TrainingError
 
 # roles of the runs, in the order of the command line
 ROLES = ("proposed", "hyperbolic", "best_focus", "double_helix")
+# of experiment.json, and their names in the keys of claims
+QUANTITIES = {
+    "slip_mm": "slip",
+    "gaze_axial_deg": "gaze_axial",
+    "gaze_lateral_deg": "gaze_lateral",
+    "iou": "iou",
+}
 
 WORDS = (
     "visual axis of synthetic people under slippage, after a personal calibration of sphere and regressor on a fifth "
@@ -151,29 +158,18 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     numbers: dict[str, MeasuredNumber] = {}
     for run in content["runs"]:
         conditions = f"{settings['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {settings['seed']}"
-        for key, name in (
-            ("slip", "slip_mm"),
-            ("gaze_axial", "gaze_axial_deg"),
-            ("gaze_lateral", "gaze_lateral_deg"),
-            ("iou", "iou"),
-        ):
-            low, high = run.get(f"{name}_interval", (math.nan, math.nan))
+        for name, key in QUANTITIES.items():
+            interval = run.get(f"{name}_interval", (math.nan, math.nan))
             numbers[f"{key}/{run['name']}"] = MeasuredNumber(
-                run[name], low, high, conditions
+                run[name], *interval, conditions
             )
     for entry in content["ratios"]:
-        if entry["against"] != "hyperbolic":
-            continue
-        for key, name in (
-            ("slip", "slip_mm"),
-            ("gaze_axial", "gaze_axial_deg"),
-            ("gaze_lateral", "gaze_lateral_deg"),
-        ):
-            if entry["quantity"] == name:
-                low, high = entry["interval"]
-                numbers[f"{key}/ratio"] = MeasuredNumber(
-                    entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
-                )
+        if entry["against"] == "hyperbolic" and entry["quantity"] in QUANTITIES:
+            numbers[f"{QUANTITIES[entry['quantity']]}/ratio"] = MeasuredNumber(
+                entry["ratio"],
+                *entry["interval"],
+                "mid-range hyperbolic, paired subjects",
+            )
     return numbers
 
 

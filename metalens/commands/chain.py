@@ -438,7 +438,17 @@ def _retrain() -> ChainStage:
         "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
         "made. In a study of a hundred hidden lenses of 1 mm before a larger network (docs/results.md) the slippage error "
         "rose from 0.44 mm to 0.59 mm in the median, and retraining won it back.",
-        (*words, "--steps", "60", "--test-batches", "8", "-o", "retrained"),
+        (
+            *words,
+            "--steps",
+            "60",
+            "--draws",
+            "4",
+            "--test-batches",
+            "8",
+            "-o",
+            "retrained",
+        ),
         ("slip_mm", "mm of slippage error after retraining"),
         (
             (
