@@ -82,10 +82,10 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         raise TrainingError(
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {budgets}"
         )
-    entry = selected[0].get("architecture")
+    entry: dict[str, Any] = selected[0].get("architecture") or {}
     try:
         best = evolution.candidate_from_json(entry, settings.space)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError) as error:
         raise TrainingError(
             f"{folder}/result.json: its network is of another version ({error})"
         ) from None

@@ -254,7 +254,7 @@ def contact_sheet(
     rows = []
     for pictures in (light, nearness, rendered.pupil[:columns]):
         blank = torch.zeros(-len(pictures) % columns, size, size)
-        tiles = torch.cat([pictures, blank]).unflatten(0, (-1, columns))
+        tiles = torch.cat([pictures, blank]).reshape(-1, columns, size, size)
         rows.append(tiles.transpose(1, 2).reshape(-1, columns * size))
     sheet = (255 * torch.cat(rows)).numpy().astype(np.uint8)
     encoded, coded = cv2.imencode(".png", sheet)

@@ -159,16 +159,15 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     for run in content["runs"]:
         conditions = f"{settings['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {settings['seed']}"
         for name, key in QUANTITIES.items():
-            interval = run.get(f"{name}_interval", (math.nan, math.nan))
+            low, high = run.get(f"{name}_interval", (math.nan, math.nan))
             numbers[f"{key}/{run['name']}"] = MeasuredNumber(
-                run[name], *interval, conditions
+                run[name], low, high, conditions
             )
     for entry in content["ratios"]:
         if entry["against"] == "hyperbolic" and entry["quantity"] in QUANTITIES:
+            low, high = entry["interval"]
             numbers[f"{QUANTITIES[entry['quantity']]}/ratio"] = MeasuredNumber(
-                entry["ratio"],
-                *entry["interval"],
-                "mid-range hyperbolic, paired subjects",
+                entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
             )
     return numbers
 

@@ -346,7 +346,9 @@ def _training_batches(
 @torch.no_grad()
 def _features(reader: ReferenceReader, frames: LensFrames) -> Tensor:
     """(n, features) of the blur branch, 256 frames at a time."""
-    return torch.cat([reader.branch(part)[1] for part in frames.pixels.split(256)])
+    return torch.cat(
+        [reader.branch(part)[1] for part in torch.split(frames.pixels, 256)]
+    )
 
 
 @torch.no_grad()
@@ -371,7 +373,7 @@ def _evaluate(
     ratios = (error[:, 2] / spread).sort().values
     factor = float(ratios[min(math.ceil(SHARE * (len(ratios) + 1)), len(ratios)) - 1])
     error, spread = slip(test)
-    depths = [reader.branch(part)[0] for part in test.pixels.split(256)]
+    depths = [reader.branch(part)[0] for part in torch.split(test.pixels, 256)]
     truth = blur.depth_mm(test.vergence)
     window_error = (blur.depth_mm(torch.cat(depths)[:, 0]) - truth).abs()
     return ReaderResult(

@@ -427,7 +427,9 @@ def candidate_from_json(
         KeyError, TypeError: a missing or an unknown entry. ConfigError: not of this
             space.
     """
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()}
+    values: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()
+    }
     error, macs = float(values.pop("error")), float(values.pop("macs"))
     architecture = check_architecture(space, Architecture(**values))
     return EvaluatedCandidate(architecture, error, macs)
