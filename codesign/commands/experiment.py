@@ -192,7 +192,7 @@ def _beyond_training(
     """
     slips = config.slips_mm
     outside = (np.abs(slips) > source.settings.scenes.slip_mm).any(1)
-    beyond: list[list[float]] = slips[outside].tolist()
+    beyond: list[list[float]] = np.unique(slips[outside], axis=0).tolist()
     return beyond
 
 
