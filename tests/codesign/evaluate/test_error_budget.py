@@ -22,6 +22,7 @@ from metalens.cli import main
 from metalens.core.errors import LensError
 from metalens.design import Focus
 from metalens.fabrication import Spread, State, draw_lenses
+from metalens.image import with_psfs
 from metalens.library.proxy import Proxy
 from metalens.optics import Layers
 from tests.codesign import made_lens as m
@@ -133,11 +134,12 @@ def test_the_path_from_the_pupil_ends_where_the_experiment_does(run):
         "sensor noise", "image of training",
     ]  # fmt: skip
     assert math.degrees(math.hypot(*counted)) >= measured * (1 - 1e-9)
-    whole = budget.device.whole
-    same = budget.reading.changed("nothing", whole, whole, "")
-    assert (same.psf, same.gaze_rad) == (0.0, 0.0)
-    blurred = budget.device.one_psf()
-    assert budget.reading.changed("field", blurred, whole, "").gaze_rad > 0
+    whole = budget.image
+    assert error_budget.image_difference(whole, whole) == 0.0
+    assert budget.reading.turn_rad(whole, whole) == 0.0
+    rows, columns = (n // 2 for n in whole.stack.shape[:2])
+    middle = whole.stack[rows, columns].expand_as(whole.stack).contiguous()
+    assert budget.reading.turn_rad(with_psfs(whole, middle, whole.energy), whole) > 0
 
 
 def test_the_command_writes_a_table_a_page_and_a_chart(tmp_path, capsys):
