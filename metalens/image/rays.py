@@ -99,7 +99,7 @@ def rays(
     root_spread = torch.sqrt(media.area_spreading(after, p))
     # share of each node within the rim; r changes over a node by root_spread * step
     inside = ((radius - r) / (root_spread * step) + 0.5).clamp(0, 1)
-    passed = torch.sqrt(media.transmitted_power(after.order, p))
+    passed = torch.sqrt(media.passed_at(after.order, p * p))
     return Rays(
         x,
         y,

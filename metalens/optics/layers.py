@@ -190,23 +190,23 @@ class Layers:
         depth_um: float,
         wavelength_um: float,
         blur_rad: float = 0.0,
-        held: float = 1.0,
+        window_share: float = 1.0,
     ) -> float:
         """Relative L2 error of a PSF by the approximations of :meth:`shadow`.
 
         0 without a stop. Waves that meet near the middle of a blur fall off as 1 / √r.
-        Their share of the light grows as held^-½, and the error as held^-¼.
+        Their share of the light grows as window_share^-½, and the error as window_share^-¼.
 
         Args:
             tangents: (x, y) in air of the source's ray to the middle of the lens.
             depth_um: of the source, inf for collimated light.
             wavelength_um: in vacuum.
             blur_rad: radius of the PSF over its distance from the lens.
-            held: share of the PSF's light that lies in the window.
+            window_share: share of the PSF's light that lies in the window.
         """
         if self.stop is None:
             return 0.0
-        zones = self.stop.radius_um * blur_rad / wavelength_um / held**0.25
+        zones = self.stop.radius_um * blur_rad / wavelength_um / window_share**0.25
         return stop_model_error(
             self.stop,
             self._around_stop(depth_um, wavelength_um),

@@ -5,7 +5,7 @@ media share, p = n sin θ.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -159,61 +159,35 @@ def path_of_reach(media: Media, reach_um: Any) -> Any:
     return relative_path(media, ray_direction(media, reach_um))
 
 
-def transmitted_power(order: Sequence[float], p: Any) -> Any:
-    """Share of unpolarised power that passes the faces between media of indices
-    ``order``, in a single pass.
-
-    Args:
-        p: n sin θ of the ray.
-    """
-    return passed_at(order, p * p)
-
-
 def passed_at(order: Sequence[float], w: Any) -> Any:
-    """As :func:`transmitted_power`, of w = p².
+    """Share of unpolarised power that passes the faces between media, in a single pass.
 
     Args:
-        order: indices that the faces lie between.
+        order: indices of the media in the order that the light meets them.
+        w: p², where p = n sin θ.
     """
-    s_power, p_power = passed_apart(order, w)
+    s_power, p_power = fresnel_powers(order, w)
     return (s_power + p_power) / 2
 
 
-def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
-    """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel);
-    0 beyond a critical angle.
-
-    Args:
-        order: indices that the faces lie between.
-    """
-    return _fresnel(order, w, lambda cosine2: (cosine2 * (cosine2.real > 0)) ** 0.5)
-
-
-def passed_on(order: Sequence[float], w: Any) -> tuple[Any, Any]:
-    """As :func:`passed_apart` of complex w, without a cut: the analytic function that
-    sums over plane waves need.
-
-    Args:
-        order: indices that the faces lie between.
-    """
-    return _fresnel(order, w, lambda cosine2: cosine2**0.5)
-
-
-def _fresnel(
-    order: Sequence[float], w: Any, cosine: Callable[[Any], Any]
+def fresnel_powers(
+    order: Sequence[float], w: Any, *, analytic: bool = False
 ) -> tuple[Any, Any]:
     """Fresnel transmittances of s and of p power, multiplied over all faces.
 
     Args:
         order: indices of the media in the order that the light meets them.
         w: p², where p = n sin θ.
-        cosine: square root that turns cos² θ into cos θ.
+        analytic: the function of complex w that sums over plane waves need; else 0
+            beyond a critical angle.
     """
     s_power = w * 0 + 1
     p_power = w * 0 + 1
     for a, b in itertools.pairwise(order):
-        ca = cosine(1 - w / a**2)
-        cb = cosine(1 - w / b**2)
+        squares: tuple[Any, ...] = (1 - w / a**2, 1 - w / b**2)
+        if not analytic:
+            squares = tuple(square * (square.real > 0) for square in squares)
+        ca, cb = (square**0.5 for square in squares)
         s_power = s_power * (1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2)
         p_power = p_power * (1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2)
     return s_power, p_power
@@ -509,7 +483,8 @@ def plane_wave_correction(
         for n, t in layers
     )
     level = np.sqrt(
-        sum(passed_on(behind.order, w + w_change)) / sum(passed_on(behind.order, w))
+        sum(fresnel_powers(behind.order, w + w_change, analytic=True))
+        / sum(fresnel_powers(behind.order, w, analytic=True))
     )
     wave = level * np.exp(1j * k * (path + (reach_slope * u * u + g * v * v) / 2))
     return np.asarray(

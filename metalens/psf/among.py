@@ -1,4 +1,4 @@
-"""Pillars among unlike neighbours: the factor C of solved rows
+"""Pillars among non-identical neighbours: the factor C of solved rows
 (:class:`metalens.lens.NeighbourRows`) on a lens's maps.
 """
 

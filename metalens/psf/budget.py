@@ -145,7 +145,7 @@ class Budget:
         lost = (
             ""
             if math.isnan(self.outside)
-            else f"; {self.outside:.1%} of the light falls beside the window"
+            else f"; {self.outside:.1%} of the light falls outside the window"
         )
         return (
             f"error by cause: {', '.join(known)}; of the device {self.total:.1e}{lost}"

@@ -39,29 +39,36 @@ def mtf(stack: PsfStack, *, frequencies_per_um: Array) -> Array:
     return np.asarray(np.abs(np.stack(lines, axis=-2)))
 
 
-def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
+def blur_um(light: Array, step_um: float, window_share: Array | float = 1.0) -> Array:
     """(…,) radius of the uniform disc of equal spread, um, by quartiles along x and y.
 
     The middle half of a disc of radius b lies within 0.404 b of its middle along an
-    axis. The radius is at most √(area / (π held)), that of a disc of the window's mean
+    axis. The radius is at most √(area / (π window_share)), that of a disc of the window's mean
     brightness, and equal to it where less than half of the light is in the window.
 
     Args:
         light: (…, y, x) irradiance.
         step_um: step of the samples.
-        held: (…,) share of all light that falls in the window. Half of the light
+        window_share: (…,) share of all light that falls in the window. Half of the light
             outside counts on either side.
     """
-    held = np.clip(held, 1e-6, 1.0)
+    window_share = np.clip(window_share, 1e-6, 1.0)
     widths = []
     for axis in (-1, -2):
         total = np.cumsum(light.sum(axis), -1)
-        parts = [np.clip(0.5 + side / held, 0, 1)[..., None] for side in (-0.25, 0.25)]
+        parts = [
+            np.clip(0.5 + side / window_share, 0, 1)[..., None]
+            for side in (-0.25, 0.25)
+        ]
         quarters = [(total < part * total[..., -1:]).sum(-1) for part in parts]
         widths.append((quarters[1] - quarters[0] + 1) / 2 * step_um)
-    largest = step_um * np.sqrt(light.shape[-1] * light.shape[-2] / (math.pi * held))
+    largest = step_um * np.sqrt(
+        light.shape[-1] * light.shape[-2] / (math.pi * window_share)
+    )
     radius = np.hypot(*widths) / (0.404 * math.sqrt(2))
-    return np.asarray(np.where(held < 0.5, largest, np.minimum(radius, largest)))
+    return np.asarray(
+        np.where(window_share < 0.5, largest, np.minimum(radius, largest))
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from metalens.psf.intensity import (
 )
 from metalens.psf.metrics import blur_um
 from metalens.psf.record import PsfStack
-from metalens.psf.vector import PolarizationMixing, apart_maps
+from metalens.psf.vector import PolarizationMixing, jones_maps
 
 
 def psf_stack(
@@ -87,7 +87,7 @@ def psf_stack(
         integrate: means over cells where samples would alias; False for samples at the
             cell centres in any case.
         source: size and shape of a source that is no point.
-        neighbours: solved rows of unlike pillars, whose coupling multiplies the maps
+        neighbours: solved rows of non-identical pillars, whose coupling multiplies the maps
             (square lattices); None for pillars taken one by one.
         row_um: distance of neighbouring rows where it is not the pitch, else 0.
         site_um2: area of a lattice cell where it is not pitch times row, else 0.
@@ -206,7 +206,7 @@ def _polarised(
     if isinstance(neighbours, NeighbourRows):
         neighbours = among.apply_jones_coupling(*maps, neighbours, pitch_um)
     if neighbours is not None:
-        maps = apart_maps(maps, neighbours)
+        maps = jones_maps(maps, neighbours)
     return maps, PolarizationMixing(polarisation == "flux", neighbours is not None)
 
 
@@ -361,7 +361,7 @@ def _maps(
     level = to_tensor(level).to(phase)
     if phase.ndim < 2 or 0 in phase.shape[:-2] or not _broadcasts(level, phase):
         shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {tuple(level.shape)}"
-        raise PropagationError(f"{shapes}: need (…, y, x) of both, alike")
+        raise PropagationError(f"{shapes}: need the same (…, y, x) of both")
     level = level.expand(phase.shape)
     if np.ndim(wavelength_um) == 0:
         phase, level = phase.unsqueeze(-3), level.unsqueeze(-3)

@@ -35,17 +35,17 @@ class PolarizationMixing:
     """Both polarisations of the light from maps of pillars, as factors on the maps.
 
     flux: of the power through the sensor's plane, else of |E|².
-    apart: of three maps (:func:`apart_maps`), for pillars that respond differently to x
+    anisotropic: of three maps (:func:`jones_maps`), for pillars that respond differently to x
         and y; else of one map.
     """
 
     flux: bool
-    apart: bool = False
+    anisotropic: bool = False
 
     @property
     def maps(self) -> int:
         """Of every wavelength."""
-        return 3 if self.apart else 1
+        return 3 if self.anisotropic else 1
 
     def pupils(self, case: PropagationCase) -> Pupils:
         """Function from places (y, x) of the lens to signs and factors of a case.
@@ -76,7 +76,7 @@ class PolarizationMixing:
         behind = beyond_faces(transmitted_polarization(incident, first), first, order)
         x, y = behind.chunk(2)
         zero = torch.zeros_like(x)
-        pairs = [(x, zero), (zero, y), (y, x)] if self.apart else [(x, y)]
+        pairs = [(x, zero), (zero, y), (y, x)] if self.anisotropic else [(x, y)]
         both = [torch.cat(pair) for pair in pairs]
         fields = [
             of_flux(e, last) if self.flux else VectorPupil(e, (1.0,) * len(e))
@@ -84,7 +84,7 @@ class PolarizationMixing:
         ]
         factors = torch.stack([field.pupils for field in fields], 1).numpy()
         signs = np.array(fields[0].signs)
-        if self.flux and not self.apart and not has_faces(case):
+        if self.flux and not self.anisotropic and not has_faces(case):
             factors = factors[:4]
             signs = signs[:4]
         else:
@@ -105,7 +105,7 @@ class PolarizationMixing:
             powers: sum of squares of the transmission of each map.
             levels: (map, y, x) transmissions.
         """
-        weights = (0.5, 0.5, 1.0) if self.apart else (1.0,)
+        weights = (0.5, 0.5, 1.0) if self.anisotropic else (1.0,)
         total = 0.0
         for weight, power, level in zip(weights, powers, levels, strict=True):
             steep = 1.0 if self.flux or not power > 0 else self._steep(case, level)
@@ -172,7 +172,7 @@ def s_and_p(case: PropagationCase) -> Pupils:
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
         p, q, _ = rays_to(case, (y_um, x_um), 1.0).numpy()  # n sin θ
-        powers = np.stack(media.passed_apart(case.media.order, p * p + q * q))
+        powers = np.stack(media.fresnel_powers(case.media.order, p * p + q * q))
         return np.ones(2), np.sqrt(powers / powers.sum(0))[:, None]
 
     return components
@@ -202,7 +202,7 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
     )
     last_sine = sine / order[-1]
     cosine = torch.sqrt(1 - w / order[-1] ** 2)
-    s_power, p_power = media.passed_apart(order, w)
+    s_power, p_power = media.fresnel_powers(order, w)
     both = (s_power + p_power) / 2 * cosine / first[2]
     s_level = torch.sqrt(s_power / both)
     p_level = torch.sqrt(p_power / both)
@@ -214,7 +214,7 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
     return torch.stack(out)
 
 
-def apart_maps(
+def jones_maps(
     maps: tuple[Tensor, Tensor], fields: NeighbourJonesFactors
 ) -> tuple[Tensor, Tensor]:
     """(…, wavelength · 3, y, x) phase, rad, and transmission of xx, yy and xy.
