@@ -84,8 +84,8 @@ def run(options: Options) -> int:
     values = _values(content, report)
     failures = _failures(options, report, layers)
     if options.strict:
-        values["form"] = [finding.text for finding in form]
-        failures += [f"form: {finding.text}" for finding in form]
+        values["form"] = form
+        failures += [f"form: {finding}" for finding in form]
     text = _text(options.mask, content, report)
     return options.console.judged(values, text, failures)
 

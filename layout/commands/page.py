@@ -260,7 +260,7 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
     notes = " ".join(f"{note}." for note in work.notes)
     figure = Figure(die_png, "Parts on the die.", wide=True)
     text = f"Seen from the pillar side, +y up. {notes}".strip()
-    sections = [Section("Die", text, [figure, _places(work)])]
+    sections = [Section("Die", text, [figure])]
     dies = 1
     if work.dies is not None and work.record.wafer is not None:
         dies = len(work.dies.index)
@@ -294,26 +294,6 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
             KeyFigure("what fails", str(len(work.failures)), not work.failures),
         ],
     )
-
-
-def _places(work: FloorplanWork) -> Table:
-    """Table of the parts and their places."""
-    files = {part.name: str(part.file) for part in work.record.parts}
-    rows = [
-        [
-            placement.part.name,
-            files.get(placement.part.name, "own"),
-            at.x_um,
-            at.y_um,
-            f"{at.turn_deg:g}{' mirrored' * at.mirrored}",
-            at.columns * at.rows,
-        ]
-        for placement in work.placed
-        for at in placement.at
-    ]
-    head = ("part", "file", "x / µm", "y / µm", "turn / degrees", "copies")
-    text = f"The first {min(_LISTED, len(rows))} of {len(rows)} places."
-    return Table(head, rows[:_LISTED], text, digits=8)
 
 
 def _checks(work: FloorplanWork) -> Section:

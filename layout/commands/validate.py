@@ -1,10 +1,8 @@
 """Strict conformance of a mask file: what readers let pass, and a mask shop might not."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-from layout.formats import gdsii_read, oasis_read
 from layout.formats import gdsii_records as gdsii_bytes
 from layout.formats import oasis_records as oasis_bytes
 from layout.formats.files import map_bytes
@@ -24,111 +22,75 @@ _TABLES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class FormatFinding:
-    """Something that breaks the format or its good practice. byte: where, -1 where it
-    has no single place.
-    """
-
-    byte: int
-    text: str
-
-
-def validate_mask(
-    path: str | Path, content: MaskLibrary | None = None
-) -> list[FormatFinding]:
-    """All findings about a GDSII or OASIS file; an empty list is a clean file.
+def validate_mask(path: str | Path, content: MaskLibrary) -> list[str]:
+    """What breaks the format of a mask file or its good practice; empty for nothing.
 
     The first bytes of the file tell its format.
 
     Args:
         path: of the file.
-        content: what was read of it; None: it is read here.
-
-    Raises:
-        MaskFileError: an empty file.
-        OSError: it cannot be opened.
+        content: what was read of it.
     """
     data = map_bytes(path)
     is_oasis = data[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
-    try:
-        if content is None:
-            content = (
-                oasis_read.read_oasis(path) if is_oasis else gdsii_read.read_gdsii(path)
-            )
-    except MaskFileError as error:
-        return [FormatFinding(_offset(error), str(error))]
     of_format = _oasis(path, data) if is_oasis else _gdsii(content, data)
     return [*_any(content), *of_format]
 
 
-def _offset(error: MaskFileError) -> int:
-    """Byte that a message of a reader names; -1 for none."""
-    words = str(error).split("byte ", 1)[-1].split(":", 1)[0].split(" ", 1)[0]
-    return int(words) if words.isdigit() else -1
-
-
-def _any(content: MaskLibrary) -> Iterator[FormatFinding]:
+def _any(content: MaskLibrary) -> Iterator[str]:
     """What holds for both formats."""
     if len(content.tops) != 1:
-        yield FormatFinding(
-            -1,
-            f"{len(content.tops)} top cells ({', '.join(content.tops[:5])}), need one",
+        yield (
+            f"{len(content.tops)} top cells ({', '.join(content.tops[:5])}), need one"
         )
     for cell in content.cells.values():
         try:
             names.check_cell_name(cell.name)
         except ProcessError as error:
-            yield FormatFinding(-1, str(error))
+            yield str(error)
         for child in cell.placed.children:
             if child not in content.cells:
-                yield FormatFinding(
-                    -1,
-                    f"cell {cell.name!r} places {child!r}, which the file does not hold",
+                yield (
+                    f"cell {cell.name!r} places {child!r}, which the file does not hold"
                 )
         yield from _shapes(cell)
     try:
         content.topological_order()
     except MaskFileError as error:
-        yield FormatFinding(-1, str(error))
+        yield str(error)
 
 
-def _shapes(cell: MaskCell) -> Iterator[FormatFinding]:
+def _shapes(cell: MaskCell) -> Iterator[str]:
     """Polygons with a repeated vertex, and circles of radius 0, of a cell."""
     for layer, polygons in cell.polygons.items():
         for points in polygons:
             if len({(int(x), int(y)) for x, y in points}) != len(points):
-                yield FormatFinding(
-                    -1,
-                    f"cell {cell.name!r}, layer {layer}: a polygon with a vertex twice",
+                yield (
+                    f"cell {cell.name!r}, layer {layer}: a polygon with a vertex twice"
                 )
     for layer, circles in cell.circles.items():
         if any(radius == 0 for _, _, radius in circles):
-            yield FormatFinding(
-                -1, f"cell {cell.name!r}, layer {layer}: a circle of radius 0"
-            )
+            yield f"cell {cell.name!r}, layer {layer}: a circle of radius 0"
 
 
-def _gdsii(content: MaskLibrary, data: Array) -> Iterator[FormatFinding]:
+def _gdsii(content: MaskLibrary, data: Array) -> Iterator[str]:
     """What GDSII forbids: odd length, large layer numbers, long boundaries."""
     if len(data) % 2:
-        yield FormatFinding(len(data), f"{len(data)} bytes, need an even number")
+        yield f"{len(data)} bytes, need an even number"
     for cell in content.cells.values():
         for layer, polygons in cell.polygons.items():
             if max(layer) > 32767:
-                yield FormatFinding(
-                    -1,
-                    f"cell {cell.name!r}: layer {layer} is negative as a signed number",
+                yield (
+                    f"cell {cell.name!r}: layer {layer} is negative as a signed number"
                 )
             longest = max(map(len, polygons)) + 1
             if longest > gdsii_bytes.MOST_POINTS:
-                yield FormatFinding(
-                    -1,
-                    f"cell {cell.name!r}: boundary of {longest} points, at most {gdsii_bytes.MOST_POINTS}",
+                yield (
+                    f"cell {cell.name!r}: boundary of {longest} points, at most {gdsii_bytes.MOST_POINTS}"
                 )
 
 
-def _oasis(path: str | Path, data: Array) -> Iterator[FormatFinding]:
+def _oasis(path: str | Path, data: Array) -> Iterator[str]:
     """The END record: tables where it says, and a checksum."""
     end_at = len(data) - oasis_bytes.END_SIZE
     start = ByteCursor(str(path), data, at=len(oasis_bytes.MAGIC) + 1)
@@ -146,13 +108,10 @@ def _oasis(path: str | Path, data: Array) -> Iterator[FormatFinding]:
                 or int(data[offset]) not in (*kinds, oasis_bytes.CBLOCK)
             )
         ):
-            yield FormatFinding(
-                end_at,
-                f"the table of {table} is said to start at byte {offset}, where it does not",
+            yield (
+                f"the table of {table} is said to start at byte {offset}, where it does not"
             )
         if not strict:
-            yield FormatFinding(
-                end_at, f"{table} may stand anywhere; strict tables are wanted"
-            )
+            yield f"{table} may stand anywhere; strict tables are wanted"
     if int(data[-5]) != 1:
-        yield FormatFinding(len(data) - 5, "no CRC-32 of the file")
+        yield "no CRC-32 of the file"

@@ -188,13 +188,10 @@ def _numbered(child: Array) -> tuple[Array, Array]:
         used, index = np.unique(child, return_inverse=True)
         return used, index.astype(np.int32)
     occurs = np.zeros(high - low + 1, bool)
-    pieces = [
-        child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
-    ]  # numpy widens what it indexes by
-    for piece in pieces:
-        piece -= low
-        occurs[piece] = True
+    pieces = range(0, len(child), _BATCH)  # numpy widens what it indexes by
+    for n in pieces:
+        occurs[child[n : n + _BATCH] - low] = True
     lookup = np.cumsum(occurs, dtype=np.int32) - 1
-    for piece in pieces:
-        piece[:] = lookup[piece]
+    for n in pieces:
+        child[n : n + _BATCH] = lookup[child[n : n + _BATCH] - low]
     return np.flatnonzero(occurs) + low, child

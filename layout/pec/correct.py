@@ -260,7 +260,7 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
     is_close = point.widths_um < bodies.COARSE * densest.nearest_um
     close = PointExposure(point.widths_um[is_close], point.weights[is_close])
     tolerance = min(exposure.tolerance, straight_edge_error(point))
-    marks = cut_marks(plan, lattices, close, ranges.far, tolerance)
+    marks = cut_marks(plan, lattices, kinds.area_um2, close, ranges.far, tolerance)
     background = _backgrounds(lattices, table, ranges, marks)
     return WantedDoses(plan, lattices, table, ranges, background, marks)
 
@@ -535,12 +535,14 @@ def _figures(
     marks = wanted_doses.marks
     level = ladder.nearest(marks.doses(wanted_doses.background.far))
     rows = np.column_stack([marks.figure, level, marks.boxes[:, [1, 3]]])
-    follows = marks.boxes[1:, 0] == marks.boxes[:-1, 2]  # in a row, of equal dose
+    order = np.lexsort((marks.boxes[:, 0], *rows.T))
+    rows, boxes = rows[order], marks.boxes[order]
+    follows = boxes[1:, 0] == boxes[:-1, 2]  # in a row, of equal dose
     is_first = np.r_[True, ~(follows & (rows[1:] == rows[:-1]).all(1))]
     first = np.flatnonzero(is_first[: len(rows)])
     last = np.r_[first[1:], len(rows)][: len(first)] - 1
-    joined = np.hstack([marks.boxes[first, :2], marks.boxes[last, 2:]])
-    level, figure_of_box = level[first], marks.figure[first]
+    joined = np.hstack([boxes[first, :2], boxes[last, 2:]])
+    figure_of_box, level = rows[first, :2], rows[first, 2]
     layer_numbers = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
     layer_of_box = np.array([layer_numbers[f][k] for f, k in figure_of_box.tolist()])
     doses: dict[LayerNumber, float] = {}

@@ -105,11 +105,12 @@ class NodeGrid:
 
     def sample(self, field: Array, x_um: Array, y_um: Array) -> Array:
         """(n,) values of a node field at any places."""
-        out = np.zeros(len(np.atleast_1d(x_um)))
-        _sample(
-            *self.x.at(np.atleast_1d(x_um)), *self.y.at(np.atleast_1d(y_um)), field, out
-        )
-        return out
+        first_x, weight_x = self.x.at(x_um)
+        first_y, weight_y = self.y.at(y_um)
+        near = np.arange(4)
+        rows = first_y[:, None, None] + near[:, None]
+        nodes = field[rows, first_x[:, None, None] + near]
+        return np.einsum("nij,ni,nj->n", nodes, weight_y, weight_x)
 
 
 @compile_loop
@@ -128,28 +129,6 @@ def _deposit(
                 out[y_node[n] + i, x_node[n] + j] += (
                     mass[n] * y_weight[n, i] * x_weight[n, j]
                 )
-
-
-@compile_loop
-def _sample(
-    x_node: Array,
-    x_weight: Array,
-    y_node: Array,
-    y_weight: Array,
-    field: Array,
-    out: Array,
-) -> None:
-    """Fill (n,) values of a node field, by cubic interpolation over 4 x 4 nodes."""
-    for n in range(out.shape[0]):
-        total = 0.0
-        for i in range(4):
-            for j in range(4):
-                total += (
-                    field[y_node[n] + i, x_node[n] + j]
-                    * y_weight[n, i]
-                    * x_weight[n, j]
-                )
-        out[n] = total
 
 
 @compile_loop
