@@ -16,7 +16,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 
-MOST_PIECES = 500_000
+MOST_CELLS = 500_000
 # of the tolerance, which backscatter may change along a piece: the rounding of doses
 # takes three quarters of it both ways
 _CHANGE = 0.4
@@ -63,9 +63,9 @@ class ExposedMarks:
 
 
 def mean_by_piece(values: Array, piece: Array, count: int) -> Array:
-    """(count,) mean of the values (n,) of each piece, whose numbers are ``piece``."""
+    """(count,) mean of the values (n,) of each piece; 0 for a piece without values."""
     total = np.bincount(piece, values, minlength=count)
-    return np.asarray(total / np.bincount(piece, minlength=count))
+    return np.asarray(total / np.maximum(np.bincount(piece, minlength=count), 1))
 
 
 def cut_marks(
@@ -81,7 +81,6 @@ def cut_marks(
     Rectangles of a figure are divided into cells of an eighth of the narrowest range.
     A cell is halved along its edge, down to a 64th, while the backscatter of the die at
     dose 1 changes there by more than two fifths of the tolerance.
-    Neighbours in a row that bound no edge are one piece.
 
     Args:
         plan: with marks and labels of horizontal and vertical edges.
@@ -104,29 +103,16 @@ def cut_marks(
         if figure.name in EXPOSED
     ]
     figures = sorted({figure for figure, _ in drawn})
-    rectangles = [rectilinear.split_rectilinear(polygon) for _, polygon in drawn]
-    boxes = np.concatenate([np.empty((0, 4), np.int64), *rectangles]) // plan.grid
-    index = np.array([figures.index(figure) for figure, _ in drawn], np.int64)
-    figure_of_box = np.repeat(index, [len(each) for each in rectangles])
+    figure_of_polygon = np.array([figures.index(figure) for figure, _ in drawn], int)
     corners_um = [polygon * plan.unit_nm * nm for _, polygon in drawn]
-    marks = ExposedPolygons(corners_um, np.ones(len(drawn)), index)
-
-    size = boxes[:, 2:] - boxes[:, :2]
-    counts = np.maximum(np.ceil(8 * size * step_um / narrowest_um), 1).astype(np.int64)
-    cells = counts.prod(1)
-    if cells.sum() > MOST_PIECES:
-        raise ProcessError(
-            f"marks and labels need {cells.sum():,} cells of one dose each, at most "
-            f"{MOST_PIECES:,}, for a backscatter range of {narrowest_um:.3g} um; draw "
-            "smaller marks (die.mark_um), or set exposure.correct = false"
-        )
-    start = np.cumsum(cells) - cells
-    box = np.repeat(np.arange(len(boxes)), cells)
-    place = np.arange(len(box)) - start[box]
-    cell = np.stack([place % counts[box, 0], place // counts[box, 0]], -1)
-    low, high = (
-        boxes[box, :2] + size[box] * edge // counts[box] for edge in (cell, cell + 1)
-    )
+    marks = ExposedPolygons(corners_um, np.ones(len(drawn)), figure_of_polygon)
+    split = [rectilinear.split_rectilinear(polygon) for _, polygon in drawn]
+    boxes = np.concatenate([np.empty((0, 4), np.int64), *split]) // plan.grid
+    figure_of_box = np.repeat(figure_of_polygon, [len(each) for each in split])
+    lattice_boxes = [lattice.box_um for lattice in lattices]
+    around = np.array([*lattice_boxes, *(boxes * step_um)])
+    die_box = (*around[:, :2].min(0).tolist(), *around[:, 2:].max(0).tolist())
+    grid = NodeGrid.over(die_box, narrowest_um)
 
     widest_um = float(close.widths_um.max(initial=0.0))
     samples = sample_edges(marks, widest_um, min(1.0, narrowest_um / 64))
@@ -138,80 +124,120 @@ def cut_marks(
         at = inside[of_figure, None]
         holds = ((boxes[members, :2] <= at) & (at < boxes[members, 2:])).all(2)
         box_of_sample[of_figure] = members[holds.argmax(1)]
-    steps = np.floor(inside).astype(np.int64) - boxes[box_of_sample, :2]
-    column, row = ((counts[box_of_sample] * (steps + 1) - 1) // size[box_of_sample]).T
-    cell_of_sample = start[box_of_sample] + row * counts[box_of_sample, 0] + column
-
-    lattice_boxes = [lattice.box_um for lattice in lattices]
-    around = np.array([*lattice_boxes, *(boxes * step_um)])
-    die_box = (*around[:, :2].min(0).tolist(), *around[:, 2:].max(0).tolist())
-    grid = NodeGrid.over(die_box, narrowest_um)
-    middles, areas = (low + high) / 2 * step_um, (high - low).prod(1) * step_um**2
+    cells, box, cell_of_sample = _divide(
+        boxes, narrowest_um / 8 / step_um, inside, box_of_sample
+    )
+    middles, areas = _middles(cells, step_um)
     mass = grid.deposit(*middles.T, areas)[None]
     for lattice in lattices:
         grid.gather(lattice, area_um2[None], mass)
     background = grid.sample(grid.convolution(far)(mass[0]), *samples.at_um.T)
+    cells, parent, cell_of_sample = _halve(
+        cells, cell_of_sample, inside, background, _CHANGE * tolerance * THRESHOLD
+    )
 
-    bounds = np.bincount(cell_of_sample, minlength=len(box)) > 0
-    after_edge = np.r_[True, bounds][: len(box)] | (cell[:, 0] == 0)
-    inner = np.flatnonzero(~bounds)
-    run = np.cumsum(~bounds & after_edge)[inner] - 1
-    first, last = (
-        inner[np.searchsorted(run, np.unique(run), side=side) - (side == "right")]
-        for side in ("left", "right")
-    )
-    edge_low, edge_high, edge_box = low[bounds], high[bounds], box[bounds]
-    cell_of_sample = (np.cumsum(bounds) - 1)[cell_of_sample]
-    allowed = _CHANGE * tolerance * THRESHOLD
-    values = np.column_stack([background, samples.at_um])
-    for _ in range(8):
-        least = np.full((len(edge_low), 3), np.inf)
-        most = -least
-        np.minimum.at(least, cell_of_sample, values)
-        np.maximum.at(most, cell_of_sample, values)
-        change, along_x, along_y = (most - least).T
-        axis = (along_y > along_x).astype(np.int64)  # of the edge in the cell
-        each = np.arange(len(axis))
-        middle = (edge_low + edge_high)[each, axis] // 2
-        is_cut = (change > allowed) & (middle > edge_low[each, axis])
-        if not is_cut.any():
-            break
-        cut, kept = each[is_cut], each[~is_cut]
-        is_upper = inside[np.arange(len(inside)), axis[cell_of_sample]]
-        is_upper = is_upper >= middle[cell_of_sample]
-        new_number = np.empty(len(each), np.int64)
-        new_number[np.r_[kept, cut]] = each
-        new_cell = new_number[cell_of_sample]
-        cell_of_sample = new_cell + len(cut) * (is_cut[cell_of_sample] & is_upper)
-        upper_low, lower_high = edge_low[cut], edge_high[cut]
-        upper_low[np.arange(len(cut)), axis[cut]] = middle[cut]
-        lower_high[np.arange(len(cut)), axis[cut]] = middle[cut]
-        edge_low = np.concatenate([edge_low[kept], edge_low[cut], upper_low])
-        edge_high = np.concatenate([edge_high[kept], lower_high, edge_high[cut]])
-        edge_box = np.concatenate([edge_box[kept], edge_box[cut], edge_box[cut]])
-
-    pieces = np.concatenate(
-        [np.hstack([edge_low, edge_high]), np.hstack([low[first], high[last]])]
-    )
-    piece_of_run = len(edge_low) + np.arange(len(first))
-    no_edge = np.r_[
-        np.setdiff1d(np.arange(len(edge_low)), cell_of_sample), piece_of_run
-    ]
-    centres = (pieces[:, :2] + pieces[:, 2:]) / 2 * step_um
-    points = np.concatenate([samples.at_um, centres[no_edge]])
-    piece = np.r_[cell_of_sample, no_edge]
-    own = mean_by_piece(
-        exposure_at_edges(points, marks, close.terms), piece, len(pieces)
-    )
-    own[no_edge] /= 2  # as an edge through their middle would have
-    edge_areas = (edge_high - edge_low).prod(1) * step_um**2
-    spots = (
-        np.concatenate([centres[: len(edge_low)], middles[inner]]),
-        np.concatenate([edge_areas, areas[inner]]),
-        np.r_[np.arange(len(edge_low)), len(edge_low) + run],
-    )
-    figure = figure_of_box[np.r_[edge_box, box[first]]]
-    figure_numbers = np.array(figures, np.int64).reshape(-1, 2)[figure]
+    middles, areas = _middles(cells, step_um)
+    count = len(cells)
+    own = np.full(count, close.weights.sum() / 2)  # as an edge through its middle has
+    bounding = np.unique(cell_of_sample)
+    exposure = exposure_at_edges(samples.at_um, marks, close.terms)
+    own[bounding] = mean_by_piece(exposure, cell_of_sample, count)[bounding]
+    inner = np.setdiff1d(np.arange(count), bounding)
     return ExposedMarks(
-        grid, pieces * plan.grid, figure_numbers, own, points, piece, spots
+        grid,
+        cells * plan.grid,
+        np.array(figures, int).reshape(-1, 2)[figure_of_box[box[parent]]],
+        own,
+        np.concatenate([samples.at_um, middles[inner]]),
+        np.r_[cell_of_sample, inner],
+        (middles, areas, np.arange(count)),
     )
+
+
+def _middles(cells: Array, step_um: float) -> tuple[Array, Array]:
+    """(n, 2) middles of cells, um, and (n,) their areas, um^2."""
+    low, high = cells[:, :2], cells[:, 2:]
+    return (low + high) / 2 * step_um, (high - low).prod(1) * step_um**2
+
+
+def _divide(
+    boxes: Array, side: float, inside: Array, box_of_sample: Array
+) -> tuple[Array, Array, Array]:
+    """Divide boxes into equal cells, each to at most a length along both axes.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top, grid steps.
+        side: longest side of a cell.
+        inside: (m, 2) points in the boxes.
+        box_of_sample: (m,) box of each point.
+
+    Returns:
+        (cells, 4) cells, (cells,) the box of each, and (m,) the cell of each point.
+
+    Raises:
+        ProcessError: more than 500 000 cells.
+    """
+    size = boxes[:, 2:] - boxes[:, :2]
+    counts = np.maximum(np.ceil(size / side), 1).astype(np.int64)
+    cells = counts.prod(1)
+    if cells.sum() > MOST_CELLS:
+        raise ProcessError(
+            f"marks and labels need {cells.sum():,} cells of one dose each, at most "
+            f"{MOST_CELLS:,}, for so short a backscatter range; draw smaller marks "
+            "(die.mark_um), or set exposure.correct = false"
+        )
+    start = np.cumsum(cells) - cells
+    box = np.repeat(np.arange(len(boxes)), cells)
+    place = np.arange(len(box)) - start[box]
+    cell = np.stack([place % counts[box, 0], place // counts[box, 0]], -1)
+    low, high = (
+        boxes[box, :2] + size[box] * edge // counts[box] for edge in (cell, cell + 1)
+    )
+    steps = np.floor(inside).astype(np.int64) - boxes[box_of_sample, :2]
+    column, row = ((counts[box_of_sample] * (steps + 1) - 1) // size[box_of_sample]).T
+    cell_of_sample = start[box_of_sample] + row * counts[box_of_sample, 0] + column
+    return np.hstack([low, high]), box, cell_of_sample
+
+
+def _halve(
+    cells: Array, cell_of_sample: Array, inside: Array, values: Array, allowed: float
+) -> tuple[Array, Array, Array]:
+    """Halve cells, along the edge that they bound, while values on it differ too much.
+
+    Args:
+        cells: (n, 4) left, bottom, right, top, grid steps.
+        cell_of_sample: (m,) cell of each point.
+        inside: (m, 2) points in the cells.
+        values: (m,) value at each point.
+        allowed: difference of values in a cell.
+
+    Returns:
+        (k, 4) cells, (k,) the first cell that each was cut from, and (m,) the cell of
+        each point.
+    """
+    parent = np.arange(len(cells))
+    table = np.column_stack([values, inside])
+    while True:
+        least = np.full((len(cells), 3), np.inf)
+        most = -least
+        np.minimum.at(least, cell_of_sample, table)
+        np.maximum.at(most, cell_of_sample, table)
+        change, along_x, along_y = (most - least).T
+        axis = (along_y > along_x).astype(np.int64)
+        rows = np.arange(len(cells))
+        middle = (cells[rows, axis] + cells[rows, axis + 2]) // 2
+        cut = np.flatnonzero((change > allowed) & (middle > cells[rows, axis]))
+        if not len(cut):
+            return cells, parent, cell_of_sample
+        upper = cells[cut]
+        upper[np.arange(len(cut)), axis[cut]] = middle[cut]
+        cells[cut, axis[cut] + 2] = middle[cut]
+        number_of_upper = rows.copy()
+        number_of_upper[cut] = len(cells) + np.arange(len(cut))
+        at = inside[np.arange(len(inside)), axis[cell_of_sample]]
+        is_upper = at >= middle[cell_of_sample]
+        cell_of_sample = np.where(
+            is_upper, number_of_upper[cell_of_sample], cell_of_sample
+        )
+        cells = np.concatenate([cells, upper])
+        parent = np.r_[parent, parent[cut]]
