@@ -47,7 +47,7 @@ class ExposedMarks:
     def deposited(self, dose: Array) -> Array:
         """(y, x) masses of doses (pieces,)."""
         points, area, piece = self.spots
-        return self.grid.deposit(*points.T, area * dose[piece])
+        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
 
     def doses(self, field: Array) -> Array:
         """(pieces,) doses that give the edges their exposure on a background.
@@ -128,7 +128,7 @@ def cut_marks(
         boxes, narrowest_um / 8 / step_um, inside, box_of_sample
     )
     middles, areas = _middles(cells, step_um)
-    mass = grid.deposit(*middles.T, areas)[None]
+    mass = grid.deposit(middles[:, 0], middles[:, 1], areas)[None]
     for lattice in lattices:
         grid.gather(lattice, area_um2[None], mass)
     background = grid.sample(grid.convolution(far)(mass[0]), *samples.at_um.T)

@@ -110,7 +110,7 @@ class NodeGrid:
         near = np.arange(4)
         rows = first_y[:, None, None] + near[:, None]
         nodes = field[rows, first_x[:, None, None] + near]
-        return np.einsum("nij,ni,nj->n", nodes, weight_y, weight_x)
+        return np.asarray(np.einsum("nij,ni,nj->n", nodes, weight_y, weight_x))
 
 
 @compile_loop

@@ -400,7 +400,7 @@ def _some_pillars(scene: WrittenMask, samples: int) -> tuple[Array, Array]:
     body = scene.bodies[0]
     occupied = scene.dose > 0
     total = int(body.counts(len(occupied) - 1)[occupied].sum())
-    wanted = np.unique(np.linspace(0, total - 1, samples).astype(int)) if total else []
+    wanted = np.unique(np.linspace(0, max(total - 1, 0), samples).astype(int))
     chosen = [np.empty((0, 2), np.int64)]
     passed = 0
     for first, block in body.blocks():
