@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Layer, index
+from metalens.cell import Cell, index
 from metalens.core.arrays import Array
+from metalens.rcwa.permittivity import PillarSection, pillar_section
 from metalens.rcwa.sidewall import staircase_layers
 
 
@@ -95,38 +96,31 @@ def solve_textbook_rcwa(
         kz = np.where(kz == 0, 1e-9, kz)
         return kz, matrices(index_of**2 * identity)[1] / np.concatenate([kz, kz])
 
-    def toeplitz(layer: Layer) -> Array:
+    gx, gy = (
+        2 * np.pi / period * (order[:, None] - order)
+        for period, order in ((px, m), (py, n))
+    )
+    sites = 1 + np.exp(1j * (gx * px + gy * py) / 2) if cell.lattice.centred else 1
+
+    def toeplitz(section: PillarSection) -> Array:
         """Toeplitz matrix of the permittivity of a section (Laurent's rule)."""
-        gx = 2 * np.pi / px * (m[:, None] - m)
-        gy = 2 * np.pi / py * (n[:, None] - n)
-        inside = index(layer.material or cell.pillar, wavelength_um) ** 2
-        around = index(layer.between or cell.fill, wavelength_um) ** 2
-        if cell.shape.hole:
-            inside, around = around, inside
-        sites = 1 + np.exp(1j * (gx * px + gy * py) / 2) if cell.lattice.centred else 1
+        eps = section.outside * identity + 0j
+        outer = (*section.inside[1:], section.outside)
+        for outline, inside, around in zip(
+            section.outlines, section.inside, outer, strict=True
+        ):
+            eps += (inside - around) * sites * outline.fourier(gx, gy) / (px * py)
+        return eps
 
-        def pattern(grow_um: float) -> Array:
-            """Toeplitz matrix of the indicator function of the grown outline."""
-            outline = cell.outline(size_um, grow_um=grow_um)
-            return np.asarray(sites * outline.fourier(gx, gy) / (px * py))
-
-        eps = around * identity + (inside - around) * pattern(layer.grow_um)
-        if layer.coat is not None:
-            film = index(layer.coat, wavelength_um) ** 2
-            side = -2 if cell.shape.hole else 2
-            coated = pattern(layer.grow_um + side * layer.coat_um)
-            eps = eps + (film - (inside if side < 0 else around)) * (
-                side / 2 * (coated - pattern(layer.grow_um))
-            )
-        return np.asarray(eps)
-
-    def film_eps(material: object) -> Array:
-        return index(material, wavelength_um) ** 2 * identity  # type: ignore[arg-type]
-
-    slabs = [(modes(film_eps(f.material)), f.thickness_um) for f in cell.under]
-    for layer in staircase_layers(cell, steps):
-        slabs.append((modes(toeplitz(layer)), layer.height_um))
-    slabs += [(modes(film_eps(f.material)), f.thickness_um) for f in cell.over]
+    under, over = (
+        [(index(f.material, wavelength_um) ** 2 * identity, f.thickness_um) for f in s]
+        for s in (cell.under, cell.over)
+    )
+    patterned = [
+        (toeplitz(pillar_section(cell, layer, size_um, wavelength_um)), layer.height_um)
+        for layer in staircase_layers(cell, steps)
+    ]
+    slabs = [(modes(eps), height) for eps, height in (*under, *patterned, *over)]
 
     (kz_s, V_s), (kz_c, V_c) = (
         half_space(index(side, wavelength_um)) for side in (cell.substrate, cell.cover)
