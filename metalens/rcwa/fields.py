@@ -17,7 +17,6 @@ from metalens.rcwa.basis import (
     ReducedOrders,
     half_space,
     lattice_frame,
-    normal_component,
     plane_waves,
     reduced_orders,
     toeplitz_matrix,
@@ -33,10 +32,8 @@ from metalens.rcwa.permittivity import (
 from metalens.rcwa.sidewall import staircase_layers
 from metalens.rcwa.smatrix import (
     FourierModes,
-    TangentialFields,
     film_modes,
     match_layers,
-    outgoing_amplitudes,
     solve_eigenmodes,
 )
 from metalens.rcwa.solver import (
@@ -116,9 +113,10 @@ class _Slab:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Stack:
-    """Slabs between the half-spaces, and where they meet.
+    """Substrate, slabs and cover, and where they meet.
 
-    slabs: foot first. ends: (slabs + 1,) interfaces times k0, 0 at the pillar's foot.
+    slabs: foot first, with both half-spaces. ends: (slabs - 1,) interfaces times k0, 0
+        at the pillar's foot.
     """
 
     problem: CellProblem
@@ -129,22 +127,21 @@ class _Stack:
     def k0(self) -> float:
         return 2 * math.pi / self.problem.light.wavelength_um
 
-    def indices(self, z_um: Array) -> Array:
-        """(nz,) 0 for the substrate, then the slabs, last the cover."""
+    def places(self, z_um: Array) -> list[int]:
+        """(nz,) places among the slabs of heights over the foot."""
         on = _ON * (self.ends[-1] - self.ends[0])
-        return np.asarray(np.searchsorted(self.ends, self.k0 * z_um + on, "right"))
+        return np.searchsorted(self.ends, self.k0 * z_um + on, "right").tolist()
 
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
-        """Permittivity and normal field on the grid, for substrate, slabs and cover.
+        """Permittivity and normal field on the grid, for every slab.
 
         For each, eps (ny, nx), and N n n^T of (2) as (xx, yy, xy); None for a
         homogeneous slab.
         """
-        cell, media = self.problem.cell, self.problem.media
+        cell = self.problem.cell
         y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
         tables: list[tuple[Array, Array | None]] = []
-        half_spaces = _Slab(media.substrate, None, 0.0), _Slab(media.cover, None, 0.0)
-        for slab in (half_spaces[0], *self.slabs, half_spaces[1]):
+        for slab in self.slabs:
             if slab.section is None:
                 tables.append((np.full(x.shape, slab.index**2, complex), None))
                 continue
@@ -154,7 +151,8 @@ class _Stack:
 
 
 def _stack(problem: CellProblem, steps: int) -> _Stack:
-    """Slabs of a cell, foot first: films under the pillar, its sections, films over it.
+    """Slabs of a cell, foot first: substrate, films under the pillar, its sections,
+    films over it, cover.
 
     Args:
         problem: cell and light.
@@ -170,14 +168,17 @@ def _stack(problem: CellProblem, steps: int) -> _Stack:
         )
         for layer in staircase_layers(cell, steps)
     ]
-    under, over = (
+    below, above = (
         [_Slab(index, None, height) for index, height in films]
-        for films in (media.under, media.over)
+        for films in (
+            ((media.substrate, 0.0), *media.under),
+            (*media.over, (media.cover, 0.0)),
+        )
     )
-    slabs = [*under, *sections, *over]
-    foot = sum(slab.height for slab in under)
+    slabs = [*below, *sections, *above]
+    foot = sum(slab.height for slab in below)
     return _Stack(
-        problem, slabs, np.cumsum([0.0, *(slab.height for slab in slabs)]) - foot
+        problem, slabs, np.cumsum([slab.height for slab in slabs[:-1]]) - foot
     )
 
 
@@ -245,7 +246,7 @@ def near_fields(
     results = []
     for grid, (e, h), grid_error in zip(grids, fields, error.tolist(), strict=True):
         points = stack.points(grid)
-        eps = np.stack([points[i][0] for i in stack.indices(np.asarray(grid.z_um))])
+        eps = np.stack([points[i][0] for i in stack.places(np.asarray(grid.z_um))])
         results.append(
             NearField(
                 grid, e, h, np.sqrt(eps), grid_error, orders, grid_error <= tolerance
@@ -322,7 +323,7 @@ def _fields(
                     field[i] += sums(order_set, amplitude)
     for grid, (e, _, displacement) in zip(grids, totals, strict=True):
         points = stack.points(grid)
-        for i, slab in enumerate(stack.indices(np.asarray(grid.z_um))):
+        for i, slab in enumerate(stack.places(np.asarray(grid.z_um))):
             eps, normal = points[slab]
             if normal is not None:
                 xx, yy, xy = normal
@@ -336,8 +337,8 @@ Components = list[tuple[OrderSet, Array]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _SolvedClass:
-    """One symmetry class: its waves, the modes of every slab and 1/eps for Ez, incident
-    amplitudes (n,), matched fields.
+    """One symmetry class: its waves, and for every slab the modes, 1/eps for Ez, and
+    the amplitudes of upward modes at its foot and of downward ones at its top.
     """
 
     stack: _Stack
@@ -345,8 +346,8 @@ class _SolvedClass:
     waves: PlaneWaves
     layers: list[FourierModes]
     inverse_z: list[Array]
-    incident: Array
-    fields: TangentialFields
+    up: list[Array]
+    down: list[Array]
 
     def orders_at(self, z_um: Array) -> tuple[Components, Components, Components]:
         """Components of E, H (times the impedance of vacuum) and D (x and y), by (1).
@@ -362,19 +363,14 @@ class _SolvedClass:
         """
         waves = self.waves
         space = self.space
-        media = self.stack.problem.media
         u, w = self._tangential(z_um)
         ez = np.zeros((len(z_um), len(space.ez.m)), complex)
         d = np.zeros_like(u)
         p_waves = slice(waves.bare, waves.p_count)
         curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
-        for i, slab in enumerate(self.stack.indices(z_um)):
-            along = waves.kappa[p_waves] * w[i, p_waves]
-            if 0 < slab <= len(self.layers):
-                ez[i] = -self.inverse_z[slab - 1] @ along
-                d[i] = self.layers[slab - 1].Q @ u[i] + curl * u[i]
-            else:
-                ez[i] = -along / (media.cover if slab else media.substrate) ** 2
+        for i, place in enumerate(self.stack.places(z_um)):
+            ez[i] = -self.inverse_z[place] @ (waves.kappa[p_waves] * w[i, p_waves])
+            d[i] = self.layers[place].Q @ u[i] + curl * u[i]
         hz = (waves.kappa * u)[:, len(waves.kappa) - len(space.hz.m) :]
         e, h, d = (values @ waves.fold.T for values in (u, w, d))
         count = len(space.ex.m)
@@ -391,46 +387,20 @@ class _SolvedClass:
         foot upwards and from its top downwards. z_um: (nz,) heights over the foot.
         """
         ends = self.stack.ends
-        u, w = (np.zeros((len(z_um), len(self.incident)), complex) for _ in range(2))
-        places = self.stack.indices(z_um)
-        for i, (slab, z) in enumerate(zip(places, self.stack.k0 * z_um, strict=True)):
-            if 0 < slab <= len(self.layers):
-                modes, foot = self.layers[slab - 1], ends[slab - 1]
-                rise = np.exp(1j * modes.q * max(z - foot, 0.0))
-                fall = np.exp(1j * modes.q * (ends[slab] - z))
-                up = rise * self.fields.up[slab - 1]
-                down = fall * self.fields.down[slab - 1]
-                u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
-            elif slab:
-                u[i], w[i] = self._in_cover(max(z - ends[-1], 0.0))
-            else:
-                u[i], w[i] = self._in_substrate(z - ends[0])
+        feet, tops = [ends[0], *ends], [*ends, ends[-1]]
+        u, w = (np.zeros((len(z_um), len(self.waves.kappa)), complex) for _ in "uw")
+        for i, place in enumerate(self.stack.places(z_um)):
+            modes, z = self.layers[place], self.stack.k0 * z_um[i]
+            up, down = (
+                # waves that are not there may grow without bound
+                amplitude * np.exp(1j * modes.q * distance * (amplitude != 0))
+                for amplitude, distance in (
+                    (self.up[place], z - feet[place]),
+                    (self.down[place], tops[place] - z),
+                )
+            )
+            u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
         return u, w
-
-    def _in_cover(self, height: float) -> tuple[Array, Array]:
-        """(n,) u and w at a height (times k0) over the top of the slabs."""
-        index = self.stack.problem.media.cover
-        U, V = half_space(self.waves, index)
-        kz = normal_component(self.waves.kappa, index)
-        up = outgoing_amplitudes((U, V), self.fields.u_top, self.fields.w_top)
-        up = up * np.exp(1j * kz * height)
-        return U * up, V * up
-
-    def _in_substrate(self, height: float) -> tuple[Array, Array]:
-        """(n,) u and w at a height (times k0, negative) from the foot of the slabs."""
-        index = self.stack.problem.media.substrate
-        incident = self.incident
-        U, V = half_space(self.waves, index)
-        kz = normal_component(self.waves.kappa, index)
-        up = incident.copy()
-        incident_waves = np.flatnonzero(incident)
-        up[incident_waves] *= np.exp(1j * kz[incident_waves] * height)
-        fields = self.fields
-        reflected = outgoing_amplitudes(
-            (U, V), fields.u - U * incident, V * incident - fields.w
-        )
-        down = reflected * np.exp(-1j * kz * height)
-        return U * (up + down), V * (up - down)
 
 
 def _solve_class(
@@ -467,10 +437,15 @@ def _solve_class(
         half_space(waves, index)
         for index in (problem.media.substrate, problem.media.cover)
     )
-    heights = tuple(slab.height for slab in stack.slabs)
+    heights = tuple(slab.height for slab in stack.slabs[1:-1])
     source = 2 * substrate[0] * substrate[1] * incident
-    fields = match_layers(layers, heights, cover, substrate, source)
-    return _SolvedClass(stack, space, waves, layers, inverse_z, incident, fields)
+    fields = match_layers(layers[1:-1], heights, cover, substrate, source)
+    # the modes of the half-spaces are plane waves, in another order: W^T W = 1
+    upward = substrate[0] * incident
+    below, above = layers[0].W.T, layers[-1].W.T
+    up = [below @ upward, *fields.up, above @ fields.u_top]
+    down = [below @ (fields.u - upward), *fields.down, np.zeros_like(upward)]
+    return _SolvedClass(stack, space, waves, layers, inverse_z, up, down)
 
 
 def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
