@@ -130,7 +130,10 @@ class _Stack:
     def places(self, z_um: Array) -> list[int]:
         """(nz,) places among the slabs of heights over the foot."""
         on = _ON * (self.ends[-1] - self.ends[0])
-        return np.searchsorted(self.ends, self.k0 * z_um + on, "right").tolist()
+        places: list[int] = np.searchsorted(
+            self.ends, self.k0 * z_um + on, "right"
+        ).tolist()
+        return places
 
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
         """Permittivity and normal field on the grid, for every slab.
