@@ -94,7 +94,7 @@ def stop_crossing(
 def _share(before: Media, between: Media, away2: Any) -> Any:
     """Lateral distance from stop to pillars over that from source to pillars.
 
-    f of the module's heading, a Chebyshev interpolant.
+    A Chebyshev interpolant in the squared distance.
 
     Args:
         before: media from source to pillars.
@@ -320,8 +320,8 @@ def edge_diffraction_factor(
 ) -> Array:
     """Complex amplitude S of light diffracted by the stop's edge, mean over a width.
 
-    S is derived in :mod:`metalens.optics.aperture_stop`: Fresnel's straight edge, with
-    the curvature of the rim to first order.
+    Fresnel's straight edge at the nearest point of the rim, with the curvature of the
+    rim to first order.
 
     Args:
         at_um: (x, y) where rays cross the stop, from its centre, arrays of one shape.

@@ -92,7 +92,13 @@ def ray_to_offset(
 
 
 def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> Any:
-    """Complex amplitude of the ray of w = p² without its phase kL (see the module).
+    """Stationary-phase amplitude of the ray of w = p², without its phase kL.
+
+        -i k/(2π) √(T / spread) (1 + iC/(kL))
+
+    with T the transmitted power, spread the area on the sensor per area of p, L the
+    optical path, and C the saddle-point correction. In one medium it is
+    d/(2πr²) (1/r - ik).
 
     Args:
         behind: media from lens to sensor. wavenumber: in vacuum, rad/um.
@@ -197,11 +203,14 @@ def probe_positions() -> Array:
 def rayleigh_sommerfeld_kernel(
     case: PropagationCase, x: Any, y: Any, X: Any, Y: Any, inverse: Any
 ) -> Array:
-    """K of the module's heading, without the pillar's area, at lens (x, y) and window
-    offset (X, Y).
+    """Field at a window offset (X, Y) of a pillar of unit area at lens (x, y).
+
+    d/(2πr²) (1/r - ik) exp(ik path): the path from source to pillar less that from the
+    reference depth, plus that from pillar to offset less that to the window's centre.
 
     Args:
         case: geometry of the propagation.
+        x, y: lens positions, um. X, Y: offsets from the window's centre, um.
         inverse: 1 / depth of the source, 1/um.
     """
     level, sensor_path = ray_to_offset(case, x, y, X, Y)

@@ -61,6 +61,24 @@ STEEPEST = 0.93  # |p| of a ray, fading included, in units of the rarest index
 
 
 @dataclass(frozen=True, slots=True)
+class QuadraticFit:
+    """Quadratic path along one axis: the reach of a ray is A + D (p - p0).
+
+    p is the direction cosine n sin θ of a ray along the axis.
+
+    middle, reach_um, stretch_um: p0, A, D. most: largest |p - p0| of a ray to the
+    window. extra_um: largest residual of the reach. steepest: |p| of any ray.
+    """
+
+    middle: float
+    reach_um: float
+    stretch_um: float
+    most: float
+    extra_um: float
+    steepest: float
+
+
+@dataclass(frozen=True, slots=True)
 class WideAxis:
     """One axis of a wide window.
 
@@ -81,25 +99,9 @@ class WideAxis:
     size: int
     fine: int
     every: int
-    fit: "QuadraticFit"
+    fit: QuadraticFit
     guard: float
     sharp: float
-
-
-@dataclass(frozen=True, slots=True)
-class QuadraticFit:
-    """Quadratic path along one axis: the reach of a ray is A + D (p - p0).
-
-    middle, reach_um, stretch_um: p0, A, D. most: largest |p - p0| of a ray to the
-    window. extra_um: largest residual of the reach. steepest: |p| of any ray.
-    """
-
-    middle: float
-    reach_um: float
-    stretch_um: float
-    most: float
-    extra_um: float
-    steepest: float
 
 
 @functools.lru_cache(maxsize=256)

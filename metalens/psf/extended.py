@@ -97,8 +97,8 @@ def _sinc_slope(u: Any) -> Array:
 def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
     """(depth, 2, 2) matrices from the source, in its sizes, to the sensor, in um.
 
-    M of the module's heading times the size; rows and columns are [x, y]. It is the
-    product of ∂(place on sensor)/∂(tangents) and ∂(tangents)/∂(place of source).
+    Rows and columns are [x, y]. A matrix is the product, times the size, of
+    ∂(place on sensor)/∂(tangents) and ∂(tangents)/∂(place of source).
 
     Args:
         case: direction, depths and films.

@@ -439,10 +439,11 @@ def _windowed(
     Raises:
         PropagationError: no light in the window.
     """
-    choice = choose_method(request.cases[0], tolerance, differentiable=True)
+    shortest = min(request.cases, key=lambda case: case.wavelength_um)
+    choice = choose_method(shortest, tolerance, differentiable=True)
     is_wide = choice.method == "wide"
     checked: list[NodeLight] = []
-    total: Any = 0
+    total: Any = None
     power = 0.0
     for maps, case, weight, pupils in request.each():
         plan: Any
@@ -463,7 +464,7 @@ def _windowed(
             NodeLight(case, weight, nodes, at_um, noise, parts, mixing_at_nodes)
         )
         light = light if weight == 1 else weight * light
-        total = light if isinstance(total, int) else total + light
+        total = light if total is None else total + light
         power += weight * request.power(case, powers, maps[1])
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
         raise PropagationError(
