@@ -166,7 +166,7 @@ class RelativeResponse:
         return out
 
 
-def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
+def proxy_sensitivity(lens: Lens) -> Sensitivity:
     """Derivatives of ln t by the pillar-response errors, as polynomials of the
     diameter.
 
@@ -176,7 +176,6 @@ def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
 
     Args:
         lens: the lens, with its cell and proxy.
-        degree: of the polynomials over the diameter.
 
     Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by
         index; interference between foot and top is left out. The cell solvers are
@@ -192,15 +191,11 @@ def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     low = max(float(diameters.min()), lens.proxy.domain_um[0])
     high = min(float(diameters.max()), lens.proxy.domain_um[1])
     guide = effective_indices(
-        lens.cell,
-        lens.proxy,
-        lens.wavelength_um,
-        np.linspace(low, high, 61),
-        degree=degree,
+        lens.cell, lens.proxy, lens.wavelength_um, np.linspace(low, high, 61)
     )
     center = float(guide.diameter_um.mean())
     rows = np.stack([acts.quick(guide) for _, acts in response_errors()])
-    coefficients = polynomial.polyfit(guide.diameter_um - center, rows.T, degree).T
+    coefficients = polynomial.polyfit(guide.diameter_um - center, rows.T, _DEGREE).T
     return Sensitivity(coefficients, center, 0.5, low, high)
 
 
@@ -231,12 +226,7 @@ def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
 
 
 def effective_indices(
-    cell: Cell,
-    proxy: Proxy,
-    wavelength_um: float,
-    diameter_um: Array,
-    *,
-    degree: int = 5,
+    cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array
 ) -> Guide:
     """Effective index n_eff of pillars over the diameter, with two derivatives.
 
@@ -249,7 +239,6 @@ def effective_indices(
         proxy: phase and |T| over the diameter.
         wavelength_um: vacuum wavelength, um.
         diameter_um: (n,) rising diameters, um.
-        degree: of the polynomials over the diameter.
     """
     n_pillar, n_around = (
         index(material, wavelength_um).real for material in (cell.pillar, cell.fill)
@@ -267,7 +256,7 @@ def effective_indices(
     phase = proxy.phase_rad(diameter_um, wavelength_um)
     offset = diameter_um - diameter_um.mean()
     n_eff = np.polynomial.Polynomial.fit(
-        offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * h), degree
+        offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * h), _DEGREE
     )
     return Guide(
         k,

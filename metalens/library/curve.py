@@ -167,19 +167,16 @@ class ResponseCurve:
         return np.column_stack([poles.real, np.abs(poles.imag)])
 
 
-def starting_diameters(
-    low_um: float, high_um: float, count: int = FIRST
-) -> list[float]:
-    """(count) Chebyshev points with both ends, um: the diameters that
+def starting_diameters(low_um: float, high_um: float) -> list[float]:
+    """(FIRST,) Chebyshev points with both ends, um: the diameters that
     :func:`sample_adaptively` solves first.
 
     Args:
         low_um: least size, um.
         high_um: largest size, um.
-        count: of points.
     """
     middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
-    start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
+    start = middle - half * np.cos(np.pi * np.arange(FIRST) / (FIRST - 1))
     start[[0, -1]] = low_um, high_um
     return [float(v) for v in start]
 
@@ -190,7 +187,6 @@ def sample_adaptively(
     high_um: float,
     *,
     tolerance: float,
-    first: int = FIRST,
     most: int = 80,
     cheaper_um: Array | None = None,
 ) -> SolvedNodes:
@@ -205,14 +201,13 @@ def sample_adaptively(
         low_um: least size, um.
         high_um: largest size, um.
         tolerance: deviation at which predictions are accepted.
-        first: Chebyshev points at the start.
         most: solves at most; where they do not suffice ``converged`` is False.
         cheaper_um: (any,) diameters that cost less. One is taken where the fits
             disagree at least half as much as at the best diameter.
     """
     cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
     cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
-    x = starting_diameters(low_um, high_um, first)
+    x = starting_diameters(low_um, high_um)
     responses = [solve(v) for v in x]
     earlier_fits: list[RationalFunction] = []
     predicted = 0
