@@ -399,7 +399,7 @@ def sweep_two_sizes(
     reach = _choose_truncation(cell, settings)
     t = []
     error = []
-    held = []
+    held_out = []
     solves = 0
     for index, wavelength in enumerate(settings.wavelengths_um):
         nodes = _Nodes(
@@ -412,17 +412,17 @@ def sweep_two_sizes(
         x, y = _choose_lines(nodes, settings)
         values, bars = nodes.grid(x, y)
         table = interpolate_table((x, y), values, places, tolerance=settings.bar)
-        held_pairs = _held_out(nodes, places, table)
+        pairs = _held_out(nodes, places, table)
         # half of the held-out pairs scale the bars, the other half tests them
-        scale = max(0.5, 2 * float((held_pairs[::2, 2] / held_pairs[::2, 3]).max()))
+        scale = max(0.5, 2 * float((pairs[::2, 2] / pairs[::2, 3]).max()))
         bar = np.minimum(
             scale * table.doubt + _solver_error((x, y), bars, places, table.value), 2.0
         )
         row, column = _held_out_places(places)
-        held_pairs[:, 3] = bar[row, column]
+        pairs[:, 3] = bar[row, column]
         t.append(table.value.reshape(*table.doubt.shape, 2, 2))
         error.append(bar)
-        held.append(np.insert(held_pairs, 0, index, axis=1))
+        held_out.append(np.insert(pairs, 0, index, axis=1))
         solves += len(nodes.known)
     provenance = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
     library = AxesLibrary(
@@ -432,7 +432,7 @@ def sweep_two_sizes(
         *places,
         np.array(t),
         np.array(error),
-        np.concatenate(held),
+        np.concatenate(held_out),
         solves,
         reach,
         provenance,

@@ -436,23 +436,23 @@ def _choose_coefficients(
         more += 2
         # so many coefficients may take |T| below 0: then the last result stands
         with contextlib.suppress(DomainError):
-            longer = _longest_domain(branch, limits, more)
-            gain = len(longer[1].diameter_um) - len(domain.diameter_um)
-            if longer[0] <= 1 and gain > 0:
-                (cost, domain, proxy), terms = longer, more
+            new_cost, longer, candidate = _longest_domain(branch, limits, more)
+            gain = len(longer.diameter_um) - len(domain.diameter_um)
+            if new_cost <= 1 and gain > 0:
+                cost, domain, proxy, terms = new_cost, longer, candidate, more
     if cost <= 1 or not branch.monotonic:
         return domain, proxy, terms
     for fewer in range(terms - 1, 1, -1):
-        less_cost, candidate = _best_power(domain, limits, fewer)
-        if candidate is not None and less_cost < cost:
-            cost, proxy, terms = less_cost, candidate, fewer
+        new_cost, fit_of_fewer = _best_power(domain, limits, fewer)
+        if fit_of_fewer is not None and new_cost < cost:
+            cost, proxy, terms = new_cost, fit_of_fewer, fewer
     for reach in range(len(domain.diameter_um) - 2, LEAST_ENTRIES - 2, -1):
         shorter = domain.within(reach)
         if cost <= 1 or shorter.turns < 0.9 * domain.turns:
             break
-        less_cost, candidate = _best_power(shorter, limits, terms)
-        if candidate is not None and less_cost <= 1:
-            return shorter, candidate, min(terms, (reach + 1) // 3)
+        new_cost, shorter_fit = _best_power(shorter, limits, terms)
+        if shorter_fit is not None and new_cost <= 1:
+            return shorter, shorter_fit, min(terms, (reach + 1) // 3)
     return domain, proxy, terms
 
 
@@ -641,7 +641,7 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
     return curves
 
 
-def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
+def _lawson(basis: Array, values: Array) -> Array:
     """(..., terms) coefficients of least largest deviation, by Lawson's iteration
     (1961): weighted least squares, with weights multiplied by the deviations in each
     round.
@@ -649,12 +649,11 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     Args:
         basis: (n, terms) basis functions at the points.
         values: (..., n) that are fitted.
-        rounds: number of iterations; the best of them is returned.
     """
     weight = np.ones(values.shape)
     best = np.zeros((*values.shape[:-1], basis.shape[1]))
     least_deviation = np.full(values.shape[:-1], np.inf)
-    for _ in range(rounds):
+    for _ in range(40):  # the best of these rounds is returned
         root = np.sqrt(weight)[..., None]
         q, r = np.linalg.qr(basis * root)
         projected = np.swapaxes(q, -1, -2) @ (values[..., None] * root)
