@@ -265,7 +265,7 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
 
 def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     """Priors that the capture itself states: wavelength (as usual unless
-    wavelength_sigma_nm), pinhole, glass.
+    wavelength_sigma_nm), pinhole, glass, and pitch of the sensor's pixels.
 
     Args:
         lens: the design.
@@ -281,8 +281,9 @@ def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
         if name in capture.about
     ]
     if "pixel_sigma_um" in capture.about:
-        width_um = capture.fill * capture.pixel_um
-        percent = 100 * _number(capture, "pixel_sigma_um") / width_um
+        # of one colour of a mosaic, ``pixel_um`` is a multiple of the sensor's pitch
+        pitch_um = capture.fill * capture.pixel_um
+        percent = 100 * _number(capture, "pixel_sigma_um") / pitch_um
         priors.append(KnownValue("pixel_percent", 0.0, percent))
     return priors
 

@@ -21,9 +21,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
     Kinds,
-    Perturbation,
     Sensitivity,
-    Solved,
     inapplicable_names,
     own_rates,
     pair_sensitivities,
@@ -32,7 +30,7 @@ from metalens.fabrication import (
 )
 from metalens.lens import Lens
 
-_NODES, _MOST = 25, 14
+_NODES, _MOST, _TOLERANCE = 25, 14, 0.02
 _SOURCES = (
     "metalens.cell",
     "metalens.modal",
@@ -45,9 +43,7 @@ _SOURCES = (
 _KEPT = 64  # lenses whose slopes are kept on disk
 
 
-def log_response_slopes(
-    lens: Lens, *, tolerance: float = 0.02, names: Container[str] = ()
-) -> Sensitivity:
+def log_response_slopes(lens: Lens, *, names: Container[str] = ()) -> Sensitivity:
     """d ln t by the pillar-response errors over the diameters of a lens, or a table of t.
 
     The causes are those of :mod:`metalens.fabrication.perturbations`.
@@ -55,12 +51,11 @@ def log_response_slopes(
     Upright round pillars whose proxy is that of the cell: a table of t by the modal
     method (:class:`metalens.fabrication.Solved`) at every diameter that a bias can
     reach, five heights and seven indices within the bounds of the fit. Its error is
-    3e-3 there, and up to 0.03 between them where a resonance moves by. The slopes are
-    polynomials of the least degree below 15 that meets ``tolerance`` at held-out
-    diameters.
+    3e-3 there, and up to 0.03 between them where a resonance moves by.
 
-    Other round pillars: derivatives by RCWA at a fixed truncation
-    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` includes
+    Other round pillars, and causes in ``names`` that a table lacks: derivatives by RCWA
+    at a fixed truncation (:func:`metalens.fabrication.own_rates`), as polynomials of
+    the least degree below 15 that meets 2 % at held-out diameters; ``error`` includes
     the truncation. Cells that no solver takes: effective-index slopes of
     :func:`metalens.fabrication.proxy_sensitivity`; pillars that are not round: those
     of their own shape. Pillars of two sizes: slopes of up to 24 pairs of sizes, for
@@ -70,7 +65,6 @@ def log_response_slopes(
 
     Args:
         lens: its cell, its diameters and its light.
-        tolerance: of the slopes, relative.
         names: names of causes to include although a table lacks them (the sidewall);
             their slopes are zero otherwise.
 
@@ -83,10 +77,14 @@ def log_response_slopes(
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
     if lens.pairs is not None:
         return _of_pairs(lens)
-    extra = [row.name for row in _unknown() if row.name in names]
-    description = _about(lens, tolerance, extra)
+    extra = [
+        row.name
+        for row, acts in response_errors()
+        if row.name in names and not acts.exact
+    ]
+    description = _about(lens, extra)
     try:
-        return _cached(description, lambda: _solve(lens, tolerance, names))
+        return _cached(description, lambda: _solve(lens, extra))
     except (CellError, MaterialError):
         if not lens.cell.round:
             raise
@@ -97,7 +95,7 @@ def _of_pairs(lens: Lens) -> Sensitivity:
     """Of pillars of two sizes, for the light of the lens."""
     kinds = Kinds.of(lens.diameters)
     sizes = repr(kinds.width_um.tolist()), repr(kinds.length_um.tolist())
-    description = _about(lens, 0.0, ["two sizes", lens.light, *sizes])
+    description = _about(lens, ["two sizes", lens.light, *sizes])
     return _cached(
         description, lambda: Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
     )
@@ -138,7 +136,7 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def _about(lens: Lens, tolerance: float, extra: Sequence[str]) -> str:
+def _about(lens: Lens, extra: Sequence[str]) -> str:
     """Text of everything that the slopes of a lens depend on: the key of the cache."""
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     cell = lens.cell
@@ -161,13 +159,12 @@ def _about(lens: Lens, tolerance: float, extra: Sequence[str]) -> str:
             float(d.min()),
             float(d.max()),
             proxy,
-            tolerance,
             extra,
         )
     )
 
 
-def _solve(lens: Lens, tolerance: float, names: Container[str]) -> Sensitivity:
+def _solve(lens: Lens, extra: Sequence[str]) -> Sensitivity:
     """:func:`log_response_slopes` by the solvers, without the cache.
 
     Slopes are sampled at Chebyshev nodes of the diameters and fitted by polynomials.
@@ -178,57 +175,33 @@ def _solve(lens: Lens, tolerance: float, names: Container[str]) -> Sensitivity:
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())
     low, high = (low, high) if high > low else (low - 1e-3, high + 1e-3)
+    center = (low + high) / 2
+    if table is not None and not extra:
+        error = solving.TOLERANCE
+        return Sensitivity(np.zeros((1, 1)), center, error, low, high, table)
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    diameters = (low + high) / 2 + (high - low) / 2 * unit
-    truncation = 0.0
-    if table is None:
-        rates = own_rates(lens, diameters)
-        rows, truncation = rates.rates, rates.error
-    else:
-        rows = _table_slopes(lens, table, diameters, names)
-    degree, error = _degree(unit, rows, tolerance)
+    rates = own_rates(lens, center + (high - low) / 2 * unit)
+    rows = rates.rates
+    if table is not None:
+        asked = [row.name in extra for row, _ in response_errors()]
+        rows = rows * np.array(asked)[:, None]
+    degree, error = _degree(unit, rows)
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
-    error += truncation
-    return Sensitivity(
-        np.array(padded) * scale, (low + high) / 2, error, low, high, table
-    )
-
-
-def _table_slopes(
-    lens: Lens, table: Solved, diameter_um: Array, names: Container[str]
-) -> Array:
-    """(pillar-response errors, n) d ln t at the design, from the table.
-
-    By RCWA where the table lacks a cause in ``names``; zero for the others.
-    """
-    series = table.series(diameter_um)
-    rows = np.zeros((len(series), len(diameter_um)), complex)
-    unknown = [row.name for row in _unknown() if row.name in names]
-    rates = own_rates(lens, diameter_um).rates if unknown else rows
-    for n, (row, acts) in enumerate(response_errors()):
-        if acts.exact:
-            rows[n] = series[n, 1] / series[n, 0]
-        elif row.name in unknown:
-            rows[n] = rates[n]
-    return rows
-
-
-def _unknown() -> list[Perturbation]:
-    """Answering causes that a table of the modal method lacks."""
-    return [row for row, acts in response_errors() if not acts.exact]
+    error += rates.error
+    return Sensitivity(np.array(padded) * scale, center, error, low, high, table)
 
 
 def _upright(cell: Cell) -> bool:
     return cell.round and not (cell.under or cell.over or cell.sidewall_rad)
 
 
-def _degree(unit: Array, rows: Array, tolerance: float) -> tuple[int, float]:
+def _degree(unit: Array, rows: Array) -> tuple[int, float]:
     """(degree, error) of the polynomial fit of ``rows`` (causes, n) over ``unit`` (n,).
 
-    The least degree whose error at held-out nodes, every third, is below the
-    tolerance; else that of the least error. Errors are relative to the largest
+    The least degree whose error at held-out nodes, every third, is below
+    ``_TOLERANCE``; else that of the least error. Errors are relative to the largest
     deviation from the mean.
     """
     held_out = np.arange(len(unit)) % 3 == 1
@@ -243,7 +216,7 @@ def _degree(unit: Array, rows: Array, tolerance: float) -> tuple[int, float]:
         predictions = [chebyshev.chebval(unit[held_out], fit) for fit in fits]
         difference = np.abs(np.array(predictions) - rows[:, held_out]).max(1)
         errors.append(float((difference / size).max()))
-        if errors[-1] <= tolerance:
+        if errors[-1] <= _TOLERANCE:
             break
     best = int(np.argmin(errors))
     return best + 1, errors[best]
