@@ -14,19 +14,11 @@ from numpy.polynomial import legendre
 from scipy import ndimage
 
 from characterize.inference.multistart import SearchTask
-from characterize.model import (
-    LIGHT,
-    PARAMETERS,
-    PLACE,
-    ForwardModel,
-    background_planes,
-    type_b_sigma,
-)
+from characterize.model import LIGHT, PARAMETERS, PLACE, background_planes, type_b_sigma
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import CDError, ResponseError, names_of_kind
 from metalens.lens import Lens
-from metalens.optics import Stop
 
 # amounts by which the causes are probed
 _STOP_UM = 3.0
@@ -224,28 +216,21 @@ def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
     stop = task.model.lens.layers.stop
     if stop is None:
         return
+    model = copy.copy(task.model)
     for along in (0, 1):
         centre = np.add(stop.centre_um, _STOP_UM * np.eye(2)[along])
-        centre_um = float(centre[0]), float(centre[1])
-        displaced = dataclasses.replace(stop, centre_um=centre_um)
-        moved = model_behind_stop(task.model, displaced).images(x)[0]
+        moved = dataclasses.replace(
+            stop, centre_um=(float(centre[0]), float(centre[1]))
+        )
+        layers = dataclasses.replace(task.model.lens.layers, stop=moved)
+        model.lens = dataclasses.replace(task.model.lens, layers=layers)
+        depth_um = model.setting.depth_um
+        model.groups = [g.shaded(model.lens, depth_um) for g in task.model.groups]
         yield ImageChange(
             f"an aperture stop off along {'xy'[along]}",
-            (moved - image)[None],
+            (model.images(x)[0] - image)[None],
             _size(task, "stop_um") / _STOP_UM,
         )
-
-
-def model_behind_stop(model: ForwardModel, stop: Stop) -> ForwardModel:
-    """The model of the same lens behind another stop."""
-    part = copy.copy(model)
-    part.lens = dataclasses.replace(
-        model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop)
-    )
-    part.groups = [
-        group.shaded(part.lens, model.setting.depth_um) for group in model.groups
-    ]
-    return part
 
 
 def _exactly(task: SearchTask, name: str) -> bool:

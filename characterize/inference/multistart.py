@@ -161,7 +161,7 @@ def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     plain = starting_points(task)
     first = _short(task.rough(), few, [*plain, *_leaning(plain[0])])
     task = hold_windows(task, first[0].value)
-    best = _long(task, first[0].value)
+    best = refine_fit(task, first[0].value)
     floor = first[0].merit + _PROMISING
     promising = [trial.value for trial in first[1:] if trial.merit < floor]
     others = follow_starts(task, best, promising[: 2 * _MOST])
@@ -231,7 +231,7 @@ def follow_starts(
             if trial.merit < best.merit + MODES_WITHIN + _WORTH and all(
                 _sigma_distance(trial.value, e) > 2.0 for e in [best, *ends]
             ):
-                ends.append(_long(task, trial.value, trial.slopes))
+                ends.append(refine_fit(task, trial.value, trial.slopes))
     return ends
 
 
@@ -271,16 +271,6 @@ def mirrored_starts(task: SearchTask, best: FitSolution) -> list[Array]:
     return out
 
 
-def refine_fit(task: SearchTask, value: Array) -> FitSolution:
-    """A fit to the end from values of the fitted parameters.
-
-    Args:
-        task: model, frames, priors and arrangement of the search.
-        value: (p,) where the fit begins.
-    """
-    return _long(task, value)
-
-
 def hold_windows(task: SearchTask, value: Array) -> SearchTask:
     """The task with its windows fixed at the fitted decentre.
 
@@ -309,8 +299,8 @@ def place_windows(
     moved = hold_windows(task, ends[0].value)
     if moved is task:
         return task, ends
-    best = _long(moved, ends[0].value, ends[0].slopes)
-    others = (_long(moved, end.value, end.slopes) for end in ends[1:])
+    best = refine_fit(moved, ends[0].value, ends[0].slopes)
+    others = (refine_fit(moved, end.value, end.slopes) for end in ends[1:])
     return moved, distinct_modes([best, *others])
 
 
@@ -324,7 +314,7 @@ def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
     """
     start = with_values(begin, _opened(task, begin))
     try:
-        best = _long(task, start[[PLACE[name] for name in task.names]])
+        best = refine_fit(task, start[[PLACE[name] for name in task.names]])
         return add_mirrored_starts(task, [best])
     except FitError:
         return []
@@ -393,10 +383,17 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
     return sorted(threads.run_each(fit_from, begins), key=lambda t: t.merit)
 
 
-def _long(task: SearchTask, value: Array, slopes: Array | None = None) -> FitSolution:
-    """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
-    settings = SolverSettings(iterations=80)
-    return task.posed().fit(value, settings, slopes)
+def refine_fit(
+    task: SearchTask, value: Array, slopes: Array | None = None
+) -> FitSolution:
+    """A fit to the end.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        value: (p,) where the fit begins.
+        slopes: (p, n, y, x) Jacobian of a place close by.
+    """
+    return task.posed().fit(value, SolverSettings(iterations=80), slopes)
 
 
 def _opened(task: SearchTask, x: Array) -> dict[str, float]:

@@ -212,8 +212,9 @@ def _profile_side(
         )
         root = math.sqrt(max(stop.merit - mode.merit, 0.0))
         at = int(np.searchsorted(places, distance))
-        for values, new in ((places, distance), (roots, root), (stops, stop)):
-            values.insert(at, new)
+        places.insert(at, distance)
+        roots.insert(at, root)
+        stops.insert(at, stop)
         if abs(root - goal) < _CLOSE * goal or (distance >= bound and root < goal):
             break
         if max(roots) >= goal:
