@@ -30,7 +30,7 @@ _MIXED = 0.1  # share of the tolerance for the functions of p in the terms
 # the same where terms are left out too: it adds an eighth to their error
 _MIXED_FEW = 0.5
 _OFF_LENS = 0.1  # weight of directions off the lens in the low-rank terms
-_KEPT = 12  # sets of coupling terms: for the windows and distances of several fits
+_KEPT = 24  # sets of coupling terms: for the windows and distances of several fits
 _TURN = np.float32(2 * np.pi)
 
 
@@ -589,9 +589,9 @@ class CompressedLens:
                 self._near_um,
             )
             terms = self._coupling(kernel, axes_um)
+            if len(self._terms) >= _KEPT:  # a new dictionary: other threads may ask
+                self._terms = {}
             self._terms[key] = terms
-            while len(self._terms) > _KEPT:
-                self._terms.pop(next(iter(self._terms)), None)
         return terms
 
     def operators(
