@@ -45,7 +45,8 @@ class ImageChange:
     frees: parameters that describe the cause. stated: whether one of these is stated
     without an error.
     roughly: the pattern of the change is not known well enough for the frames to bound
-    it. of_mask: the cause belongs to the lens itself.
+    it. of_mask: the cause belongs to the lens itself. positive: its amount cannot be
+    below 0.
     """
 
     cause: str
@@ -55,6 +56,7 @@ class ImageChange:
     stated: bool = False
     roughly: bool = False
     of_mask: bool = False
+    positive: bool = False
 
 
 def systematic_changes(
@@ -83,6 +85,7 @@ def systematic_changes(
             (_size(task, "sidewall_deg") / _WALL_DEG) ** 2,
             roughly=True,
             of_mask=True,
+            positive=True,
         )
     light = image - background_planes(x, rough.setting)
     yield ImageChange("vibration or blur along one direction", _along_one(light))
@@ -152,6 +155,7 @@ def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]
                 ("glass_um", name) if base else (name,),
                 _exactly(task, name),
                 of_mask=name in _OF_MASK,
+                positive=before[PLACE[name]] <= row.low,
             )
 
 

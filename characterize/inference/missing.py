@@ -178,10 +178,12 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
             frees=effect.frees,
             stated=effect.stated,
         )
+        if effect.positive and fit.residual_changes(change)[1][0] <= 0:
+            test = ScoreTest(effect.cause, 0.0, 0, 1.0)
         if np.any(effect.sigma):
             assumed = np.reshape(effect.sigma, (-1, 1)) * change
             unstated.append(dataclasses.replace(effect, images=assumed))
-            if effect.frees and not effect.stated:
+            if test.frees and not test.stated:
                 test = dataclasses.replace(test, odds=fit.odds(assumed))
         tests.append(test)
     tests.append(_ghost(task, x, mode.image, root, fit))
