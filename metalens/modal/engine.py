@@ -11,11 +11,10 @@ from metalens.core.threads import one_blas_thread
 from metalens.modal.case import ModalCase
 from metalens.modal.layer import (
     LayerMedium,
-    electric_modes,
     few_modes,
     is_lossless,
+    layer_modes,
     layer_pencil,
-    magnetic_modes,
 )
 from metalens.modal.match import (
     HalfSpace,
@@ -129,7 +128,7 @@ def scatter_layer(
         modes = few_modes(pencil, case.height, weak=loss)
         if modes is not None:
             return few_scattering(pencil, modes, case.height, foot, top), magnetic
-    layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
+    layer = layer_modes(b, medium, magnetic=magnetic)
     return scattering_matrix(layer, case.height, foot, top), False
 
 

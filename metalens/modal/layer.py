@@ -50,64 +50,46 @@ def axial_wavenumber(square: np.ndarray) -> np.ndarray:
     return np.where(flip, -q, q)
 
 
-def electric_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
-    """Layer modes for u = E_t by a dense eigensolver.
+def layer_modes(
+    basis: HomogeneousBasis, medium: LayerMedium, *, magnetic: bool
+) -> LayerModes:
+    """All layer modes, stiffness w = -q^2 growth w, by a dense eigensolver.
+
+    Electric form, u = E_t: growth = diag(1, (1 - scalar_eps^-1 tm / k0^2)^-1), stiffness
+    = curl - k0^2 mass_eps. Magnetic form, u = H_t: growth = (mass_(1/eps)^-1 - diag(0,
+    tm / k0^2))^-1, stiffness = curl_(1/eps) - k0^2. TM fields are scaled by k0 /
+    sqrt(tm).
 
     Args:
         basis: homogeneous modes. medium: wavenumber and permittivities.
+        magnetic: the form.
     """
     disc, around = medium.permittivities()
-    n, te_count, k0 = basis.size, len(basis.te), medium.k0
-    scale = k0 / np.sqrt(basis.tm)
-    scaling = np.concatenate([np.ones(te_count), scale])
-    stiffness = -(k0**2) * (disc - around) * basis.disc_mass
-    diagonal = np.arange(n)
-    stiffness[diagonal, diagonal] -= k0**2 * around
-    stiffness[diagonal[:te_count], diagonal[:te_count]] += basis.te
-    level = 1 / np.concatenate([np.sqrt(basis.te + k0**2), np.full(n - te_count, k0)])
-    inverse = np.linalg.inv(level[:, None] * stiffness * level)
-    longitudinal = (disc - around) * basis.disc_scalar + around * np.eye(n - te_count)
-    tm_growth = np.linalg.solve(
-        np.eye(n - te_count) - longitudinal * scale**2, longitudinal
-    )
-    tm_growth = (tm_growth + tm_growth.T) / 2
-    level = level * scaling
-    inverse_pencil = level[:, None] * inverse * level
-    inverse_pencil[:, te_count:] = -inverse_pencil[:, te_count:] @ tm_growth
-    value, vectors = np.linalg.eig(inverse_pencil)
-    partner = vectors.copy()
-    partner[te_count:] = -tm_growth @ vectors[te_count:]
-    return LayerModes(
-        axial_wavenumber(-1 / value),
-        vectors / scaling[:, None],
-        partner * scaling[:, None],
-    )
-
-
-def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
-    """Layer modes for u = H_t by a dense eigensolver.
-
-    Args:
-        basis: homogeneous modes. medium: wavenumber and permittivities.
-    """
-    disc, around = (1 / e for e in medium.permittivities())
-    n, te_count, k0 = basis.size, len(basis.te), medium.k0
-    scale = k0 / np.sqrt(basis.tm)
-    scaling = np.concatenate([np.ones(te_count), scale])
-    weighted = (disc - around) * basis.disc_mass + around * np.eye(n)
-    inverse = scaling[:, None] * np.linalg.inv(weighted) * scaling
-    tm_places = np.arange(te_count, n)
-    inverse[tm_places, tm_places] -= 1
-    growth = np.linalg.inv(inverse)
+    n, a, k2 = basis.size, len(basis.te), medium.k0**2
+    scale = medium.k0 / np.sqrt(basis.tm)
+    scaling = np.concatenate([np.ones(a), scale])
+    tm = np.arange(a, n)
+    if magnetic:
+        disc, around = 1 / disc, 1 / around
+        inverse = np.linalg.inv((disc - around) * basis.disc_mass + around * np.eye(n))
+        inverse = scaling[:, None] * inverse * scaling
+        inverse[tm, tm] -= 1
+        growth = np.linalg.inv(inverse)
+        stiffness = np.diag(np.concatenate([around * basis.te - k2, -basis.tm]))
+        stiffness[:a, :a] += (disc - around) * basis.disc_curl
+    else:
+        scalar = (disc - around) * basis.disc_scalar + around * np.eye(n - a)
+        growth = np.eye(n, dtype=scalar.dtype)
+        growth[a:, a:] = -np.linalg.solve(np.eye(n - a) - scalar * scale**2, scalar)
+        mass = (disc - around) * basis.disc_mass + around * np.eye(n)
+        stiffness = -k2 * mass / scaling[:, None] / scaling
+        stiffness[:a, :a] += np.diag(basis.te)
     growth = (growth + growth.T) / 2
-    stiffness = (disc - around) * basis.disc_curl + np.diag(around * basis.te - k0**2)
-    level = 1 / np.sqrt(basis.te + k0**2)
-    inverse_pencil = np.empty_like(growth)
-    inverse_pencil[:te_count] = level[:, None] * np.linalg.solve(
-        level[:, None] * stiffness * level, level[:, None] * growth[:te_count]
+    level = 1 / np.sqrt(np.concatenate([basis.te + k2, basis.tm]))
+    balanced = level[:, None] * stiffness * level
+    value, vectors = np.linalg.eig(
+        level[:, None] * np.linalg.solve(balanced, level[:, None] * growth)
     )
-    inverse_pencil[te_count:] = -((scale / k0) ** 2)[:, None] * growth[te_count:]
-    value, vectors = np.linalg.eig(inverse_pencil)
     return LayerModes(
         axial_wavenumber(-1 / value),
         vectors / scaling[:, None],
