@@ -90,7 +90,7 @@ def test_a_measured_curve_gets_the_wavelengths_of_the_diode_it_samples():
     np.testing.assert_array_equal(got.wavelengths_um, want.wavelengths_um)
     np.testing.assert_array_equal(got.weights, want.weights)
     assert len(want.weights) > 1
-    cut = waves(replace(curve, beside=1e-3), 5e-3)
+    cut = waves(replace(curve, outside=1e-3), 5e-3)
     assert cut.error == pytest.approx(want.error + 1e-3)
     with pytest.raises(SceneError, match="wavelengths leave"):
-        waves(replace(curve, beside=6e-3), 5e-3)
+        waves(replace(curve, outside=6e-3), 5e-3)
