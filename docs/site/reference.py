@@ -303,7 +303,7 @@ def fit_page() -> str:
     for row in parameters.PARAMETERS:
         bounds = "–" if row.high == float("inf") else f"{row.low:g} to {row.high:g}"
         prior = "none" if row.unstated == float("inf") else f"{row.unstated:g}"
-        fitted = "yes" if row.free else "where needed" if row.extra else "on request"
+        fitted = "yes" if row.free else "on request"
         meaning = row.meaning.replace("|", "\\|")
         lines.append(f"| `{row.name}` | {meaning} | {prior} | {bounds} | {fitted} |")
     return "\n".join([*lines, ""])
