@@ -33,7 +33,7 @@ def psf_pictures(
     plain = stack.numpy()
     pictures = {"montage": plot_montage(plain), "mtf": plot_mtf(plain, limit=limit)}
     if scan is not None:
-        pictures["zscan"] = along_z(scan)
+        pictures["zscan"] = plot_focus_scan(scan)
     if len(plain.depths_um) > 1:
         pictures["xz"] = plot_slices(plain)
     return pictures
@@ -192,7 +192,7 @@ def _encircled(stack: PsfStack, light: Array, radius_um: Array) -> Array:
     return np.asarray(np.interp(radius_um, distance[order], shares))
 
 
-def along_z(scan: "FocusScan") -> bytes:
+def plot_focus_scan(scan: "FocusScan") -> bytes:
     """Irradiance along x against the shift of the plane, and its peak and FWHM."""
     figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     axes[0].pcolormesh(
