@@ -32,28 +32,25 @@ def fill_response(
         DomainError: a diameter, the wavelength or the angle lies outside the proxy's
             domain.
     """
+    d = np.asarray(lens.diameters.diameter_um)
     if lens.pairs is not None:
-        turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
-        phase[:] = (turns - np.rint(turns)) * 2 * np.pi
+        phase[:] = _wrap(lens.phase_rad(at[0], at[1]))
         level[:] = lens.transmission(at[0], at[1])
         return
-    turned = (
-        None
-        if lens.diameters.angle_rad is None
-        else np.asarray(lens.geometric_rad(slice(None)))
-    )
-    fill_response_of(
-        lens.proxy, np.asarray(lens.diameters.diameter_um), at, phase, level, turned
-    )
+    fill_response_of(lens.proxy, d, at, phase, level)
+    if lens.diameters.angle_rad is not None:
+        turned = _wrap(phase + lens.geometric_rad(slice(None)))
+        phase[:] = np.where(d > 0, turned, 0)
+
+
+def _wrap(phase_rad: Array) -> Array:
+    """Phase within ±π, rad."""
+    turns = phase_rad / (2 * np.pi)
+    return np.asarray((turns - np.rint(turns)) * 2 * np.pi)
 
 
 def fill_response_of(
-    proxy: Proxy,
-    d: Array,
-    at: tuple[float, float],
-    phase: Array,
-    level: Array,
-    turned: Array | None = None,
+    proxy: Proxy, d: Array, at: tuple[float, float], phase: Array, level: Array
 ) -> None:
     """As :func:`fill_response`, for a map of diameters and a proxy.
 
@@ -63,13 +60,9 @@ def fill_response_of(
         at: wavelength in um, angle of incidence in rad.
         phase: (y, x) array that is filled, rad.
         level: (y, x) array that is filled.
-        turned: (y, x) geometric phase that is added, rad; None for none.
     """
     loop, numbers = _fill, response_polynomials(proxy, d, at)
-    turn = np.zeros((len(d), 0)) if turned is None else turned
-    run_split(
-        len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b])
-    )
+    run_split(len(d), lambda a, b: loop(d[a:b], numbers, phase[a:b], level[a:b]))
 
 
 def response_polynomials(
@@ -128,12 +121,11 @@ def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True)
-def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
+def _fill(d, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
     """Fill some rows of :func:`fill_response`, in parts of 512 pillars.
 
     Args:
         d: (rows, x) diameters, um.
-        turned: (rows, x) phase that is added, rad; (rows, 0) for none.
         numbers: as for :func:`evaluate_row`.
         out_phase: (rows, x) that is filled, rad within ±π.
         out_level: (rows, x) that is filled.
@@ -144,9 +136,6 @@ def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-
             row = d[i, start : start + PART]
             n = row.size
             evaluate_row(row, numbers, x[:n], phase[:n], level[:n])
-            if turned.shape[1] > 0:
-                for j in range(n):
-                    phase[j] += turned[i, start + j]
             for j in range(n):
                 t = phase[j] / (2 * np.pi)
                 out_phase[i, start + j] = (
