@@ -51,7 +51,7 @@ def _records():
     from characterize.bench.protocol import BenchProtocol
     from characterize.pupil.model import PupilSpec
     from codesign.commands.evaluate_optics import OpticsSettings as Optics
-    from layout.arrange.record import Floorplan
+    from layout.arrange.record import DieFloorplan
     from layout.process.process import Process
     from metalens.library.study import CellStudy
 
@@ -65,7 +65,7 @@ def _records():
         "PROTOCOL.toml": BenchProtocol,
         "PUPIL.toml": PupilSpec,
         "CHAIN.toml": ChainFiles,
-        "ARRANGEMENT.toml": Floorplan,
+        "ARRANGEMENT.toml": DieFloorplan,
         "OPTICS.toml": Optics,
     }
 

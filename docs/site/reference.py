@@ -31,7 +31,7 @@ SETTINGS = {
     "STUDY.toml": ("metalens.library.study", "CellStudy", "study"),
     "DESIGN.toml": ("metalens.commands.design", "DesignSettings", "design"),
     "PSF.toml": ("metalens.commands.psf", "PsfSettings", "psf"),
-    "ARRANGEMENT.toml": ("layout.arrange.record", "Floorplan", "layout"),
+    "ARRANGEMENT.toml": ("layout.arrange.record", "DieFloorplan", "layout"),
     "PROCESS.toml": ("layout.process.process", "Process", "layout"),
     "TRUTH.toml": ("characterize.bench.bench", "HiddenLens", "capture --truth"),
     "PROTOCOL.toml": (

@@ -177,7 +177,7 @@ class WaferSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Floorplan:
+class DieFloorplan:
     """Lenses and cells on a die, the die alone or on a wafer.
 
     name: of the top cell; ``NAME_DIE`` is the die on a wafer.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import joined, parts, separation, wafer
-from layout.arrange.record import CellPart, Floorplan, Placement, WaferSettings
+from layout.arrange.record import CellPart, DieFloorplan, Placement, WaferSettings
 from layout.commands import make, page
 from layout.commands.job import FloorplanWork, Options, StageTimes
 from layout.drc.klayout import write_lyp
@@ -40,7 +40,7 @@ def run(options: Options) -> int:
     Args:
         options: of the command.
     """
-    record = config.load(options.lens, Floorplan)
+    record = config.load(options.lens, DieFloorplan)
     named = [part.file for part in record.parts]
     process = (
         processes.Process()

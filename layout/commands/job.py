@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from layout.arrange import joined, wafer
-from layout.arrange.record import Floorplan
+from layout.arrange.record import DieFloorplan
 from layout.drc.report import DrcReport, Violation
 from layout.formats import compare, handover
 from layout.formats.dxf import DxfWindow
@@ -225,7 +225,7 @@ class FloorplanWork:
     """
 
     options: Options
-    record: Floorplan
+    record: DieFloorplan
     process: processes.Process
     folder: Path
     stages: StageTimes

@@ -15,7 +15,7 @@ from layout.pec import bodies, psf
 from layout.pec.bodies import ExposureTable, ScatterRanges
 from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.marks import ExposedMarks, cut_marks
-from layout.pec.nodes import Background, RadialConvolution, gaussian_convolution
+from layout.pec.nodes import RadialConvolution, ScatterBackground, gaussian_convolution
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.process.process import ExposureSettings, LayerNumber, LayerTable
 from layout.shapes import rectilinear
@@ -142,7 +142,7 @@ class WantedDoses:
     lattices: Sequence[PillarArray]
     table: ExposureTable
     ranges: ScatterRanges
-    background: Background
+    background: ScatterBackground
     marks: ExposedMarks
 
     def of_pillars(self, number: int, first: int, block: Array) -> Array:
@@ -290,7 +290,7 @@ def _backgrounds(
     table: ExposureTable,
     ranges: ScatterRanges,
     marks: ExposedMarks,
-) -> Background:
+) -> ScatterBackground:
     """Background exposure at the doses sought, by alternating relaxation.
 
     The far field comes from all shapes, through the nodes; the middle field from
@@ -317,7 +317,7 @@ def _backgrounds(
     for _ in range(12 if middles else 0):
         middle_fields = []
         carried = np.zeros(grid.shape)
-        far = Background(grid, field, ())
+        far = ScatterBackground(grid, field, ())
         for lattice, middle in zip(lattices, middles, strict=True):
             classes = lattice.whole()
             far_field = far.at_sites(lattice, 0, 0, lattice.rows)
@@ -333,7 +333,7 @@ def _backgrounds(
         field = _relaxed(far_convolution, mass, THRESHOLD * goal - carried, marks=marks)
         if np.abs(field - previous).max() < 1e-7:
             break
-    return Background(grid, field, middle_fields)
+    return ScatterBackground(grid, field, middle_fields)
 
 
 def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:

@@ -12,9 +12,9 @@ from layout.pec.psf import PointExposure, disc_exposure, rim_of_own_disc, slope_
 from layout.process.jit import compile_loop
 from layout.shapes.moments import (
     Contours,
-    perimeter,
     points_along_edges,
     polygon_moments,
+    total_perimeter,
 )
 from metalens.core.arrays import Array
 
@@ -239,7 +239,7 @@ def _level(
         low, high = (middle, high) if area_above(middle) > area_um2 else (low, middle)
     level = (low + high) / 2
     difference = 0.15 * level  # a few pixels wide, so that their places do not matter
-    return level, perimeter(contours) / max(
+    return level, total_perimeter(contours) / max(
         (area_above(level - difference) - area_above(level + difference))
         / (2 * difference),
         1e-12,

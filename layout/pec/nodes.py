@@ -164,7 +164,7 @@ def _gather(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Background:
+class ScatterBackground:
     """Exposure of a die by all that scatters far.
 
     grid: nodes.

@@ -40,7 +40,7 @@ def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
     return area, first, second
 
 
-def perimeter(contours: Contours) -> float:
+def total_perimeter(contours: Contours) -> float:
     """Length of all edges.
 
     Args:

@@ -236,7 +236,7 @@ class _Field:
     """
 
     ranges: bodies.ScatterRanges
-    background: nodes.Background
+    background: nodes.ScatterBackground
     own: Array
     slope: Array
     close: Sequence[tuple[float, float]]
@@ -280,7 +280,7 @@ class _Field:
                 near.append(middle(sites).astype(np.float32))
         is_close = point.widths_um < bodies.COARSE * densest.nearest_um
         close = PointExposure(point.widths_um[is_close], point.weights[is_close])
-        background = nodes.Background(grid, grid.convolution(far)(mass[0]), near)
+        background = nodes.ScatterBackground(grid, grid.convolution(far)(mass[0]), near)
         points = np.column_stack([x, y])
         return cls(ranges, background, own, slope, close.terms, (points, masses))
 

@@ -45,8 +45,8 @@ def test_a_right_triangle_has_a_third_and_a_sixth():
 
 
 def test_the_perimeter_is_that_of_all_contours():
-    assert moments.perimeter([OUTER]) == pytest.approx(2 * (30 + 18), rel=1e-15)
-    assert moments.perimeter(
+    assert moments.total_perimeter([OUTER]) == pytest.approx(2 * (30 + 18), rel=1e-15)
+    assert moments.total_perimeter(
         [OUTER, HOLE, np.array([[0, 0], [3, 0], [0, 4]])]
     ) == pytest.approx(96 + 24 + 12, rel=1e-15)
 

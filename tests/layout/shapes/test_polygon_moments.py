@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.shapes.moments import perimeter, points_along_edges, polygon_moments
+from layout.shapes.moments import points_along_edges, polygon_moments, total_perimeter
 
 OUTER = np.array([[1.0, 2.0], [6.0, 2.0], [6.0, 5.0], [1.0, 5.0]])
 HOLE = np.array([[2.0, 3.0], [2.0, 4.5], [4.0, 4.5], [4.0, 3.0]])  # clockwise
@@ -22,7 +22,7 @@ def test_moments_are_those_of_the_rectangle_less_those_of_the_hole():
 
 
 def test_places_divide_the_edges_evenly():
-    assert perimeter([OUTER, HOLE]) == pytest.approx(16 + 7)
+    assert total_perimeter([OUTER, HOLE]) == pytest.approx(16 + 7)
     places = points_along_edges([OUTER, HOLE], 46)  # a step of 0.5 along 23
     assert places[[0, 9, 10, 31, 32, 45]] == pytest.approx(
         np.array([[1.25, 2], [5.75, 2], [6, 2.25], [1, 2.25], [2, 3.25], [2.25, 3]])
