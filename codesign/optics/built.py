@@ -356,7 +356,6 @@ class MadeLens:
         of TABLE_STEP_UM.
 
         Args:
-            state: perturbations by the process.
             block: pillars along a cell; None for that of the window.
             factor: (y, x) complex, multiplies every pillar.
         """

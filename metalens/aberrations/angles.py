@@ -142,7 +142,6 @@ def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -
 
     Args:
         angles_deg: field angles, within 85 degrees.
-        depth_um: of the sources, above 0.
         frequencies: per mm, above 0.
 
     Raises:
@@ -185,9 +184,6 @@ def _aberrations_at(
     """Columns of :class:`OverField` at one field angle.
 
     Args:
-        lens: the lens.
-        angle_deg: along x.
-        depth_um: of the source.
         rays: chief rays of angle 0 and of this angle.
         per_um: (m,) frequencies of the MTF.
     """
@@ -244,9 +240,6 @@ def _brightness(
     element's image |det M|; of an arbitrary unit.
 
     Args:
-        lens: the lens.
-        angle_deg: field angle along x.
-        depth_um: of the plane; at infinity elements are those of the tangents.
         chief: chief ray of the angle.
     """
     tangents = np.array([math.tan(math.radians(angle_deg)), 0.0])
@@ -309,9 +302,7 @@ def _sharpest(
     angle; then a bounded minimisation. nan where the best plane ends the scan.
 
     Args:
-        lens: the lens.
         light: plane waves of the field angle.
-        angle_rad: field angle along x, rad.
         close_um: (2,) foci of close rays from the sensor, um; nan where not known.
     """
     sensor = lens.sensor_distance_um

@@ -143,10 +143,8 @@ def _incident_direction(lens: Lens, x: Array, source: Array, depth_um: float) ->
     """(2,) n sin θ of the light of a source at a place of the pillars.
 
     Args:
-        lens: the lens.
         x: (2,) place on the pillars, um.
         source: (2,) place of the source in um; its tangents for collimated light.
-        depth_um: source depth from the lens, um; inf for collimated light.
     """
     if math.isinf(depth_um):
         return np.asarray(source / math.sqrt(1 + float(source @ source)))
@@ -216,7 +214,6 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
     is least at z = -sum(S C) / sum(C²) behind the sensor. inf for parallel rays.
 
     Args:
-        after: media behind the pillars.
         p: (2,) n sin θ of the chief ray.
         q: (2, 2) ∂p / ∂ place on the pillars, per um.
     """
@@ -243,7 +240,6 @@ def _wave_front(
     and the fit's covariance give the errors.
 
     Args:
-        lens: the lens.
         at: (2,) place on the pillars, um.
         angle_rad: (x, y) field angle, rad.
 
@@ -311,9 +307,7 @@ def _patch(
     """Pillars within a radius of a place: coordinates, phases, and a mask.
 
     Args:
-        lens: the lens.
         at: (2,) place, um.
-        radius: um.
         tilt_rad: angle of incidence for the library.
 
     Returns:

@@ -153,11 +153,6 @@ def _field_at_pillars(
     """The complex field behind the pillars, as a function of row numbers to (rows, x).
 
     |t| exp(i (phase + k path from the source)) times the shadow of the stop.
-
-    Args:
-        lens: the lens.
-        angle_rad: field angles along x and y, rad.
-        depth_um: source depth from the lens, um.
     """
     d = lens.diameters
     wave = lens.wavelength_um
@@ -194,10 +189,6 @@ def _directions(
     They are slopes of the phase, phase steps between neighbours averaged over short
     pieces of 48 rows. Pieces that are dark or whose pillars have no common slope are
     left out.
-
-    Args:
-        lens: the lens.
-        light_rows: light of some rows, see :func:`_field_at_pillars`.
     """
     d = lens.diameters
     hop = 2 if d.lattice.centred else 1
@@ -226,7 +217,6 @@ def _row_transforms(
     """(y, orders) transforms along x of the light behind the pillars, and sum |light|².
 
     Args:
-        light_rows: light of some rows, see :func:`_field_at_pillars`.
         ny: rows of the map.
         count: length of the transforms, padded with zeros.
         orders: indices of the frequencies that are returned.

@@ -191,10 +191,8 @@ def _cosine4(
     θ is the angle at the middle of the stop, or of the lens without a stop.
 
     Args:
-        optics: layers and lens-sensor distance.
         at_um: (…, [x, y]) field points on the sensor, um.
         depths_um: (depths,) source depths, um.
-        wavelength_um: in vacuum, um.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = at_um.numpy() / after.reduced_um
@@ -210,11 +208,6 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
 
     One eighth of the nodes is computed. The others follow by mirror images in x, in y
     and in the diagonal.
-
-    Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        plan: field nodes, depths and wavelengths.
-        device: where they are computed.
     """
     count = len(plan.x_um)
     half = (count + 1) // 2
@@ -269,10 +262,6 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     PSFs of ``HELD_OUT`` random samples and four depths are computed directly and
     compared. Errors relative to the light of a place are scaled by
     :func:`image_dimming`, as an image can be dimmer than the whole frame.
-
-    Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        prepared: imager whose error is estimated.
 
     Returns:
         dict: error by name; see ``parts`` of :class:`Imager`.
@@ -374,12 +363,9 @@ def _shadow_error(
     Each error counts by the light of its place over that of the brightest place.
 
     Args:
-        optics: layers with the stop, and lens-sensor distance.
-        wavelength_um: in vacuum, um.
         places: (n, [x, y]) field points in um, and (depths,) in um.
         judged: PSFs (n, depths, h, w), the share of the light on the aperture that each
             contains, and that share of the brightest place of each depth.
-        step_um: of the PSFs' samples.
     """
     at, depths_um = places
     psfs, contained, brightest = (part.cpu().numpy() for part in judged)

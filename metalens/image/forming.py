@@ -287,10 +287,6 @@ def _assembled(
     """Imager with kernels and weights for light and, fewer of them, for coverage.
 
     Args:
-        grid: where the scene is sampled.
-        plan: nodes over the field and depths.
-        field: PSFs and illumination at the nodes.
-        basis: kernels as mixtures of the nodes' PSFs.
         parts: error by cause.
     """
     few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)

@@ -226,9 +226,6 @@ def _of_pillars(
     The window is centred on the field point.
 
     Args:
-        optics: layers and lens-sensor distance.
-        wave: pillars of the lens.
-        wavelength_um: vacuum wavelength, um.
         at: (x, y) field point in um, and (depths,) in um.
         sampled: step of a sample in um, number of samples, points per sample.
     """

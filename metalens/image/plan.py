@@ -276,11 +276,7 @@ def _unfolded(
     The period grows by 2^(1/4) at a time, to four widths of the window at most.
 
     Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        waves: wavelengths with their weights.
-        window: with the first period.
         at: field points (n, [x, y]) in um and depths in um, at which it is judged.
-        tolerance: relative error.
     """
     while folding_error(JudgedPsfs(optics, waves, window, at)) > tolerance:
         if window.period >= 4:
@@ -382,7 +378,6 @@ def _node_count(
 
     Args:
         psfs_at: function from places 0 … 1 of the line to PSFs (places, depths, h, w).
-        tolerance: relative L2 error.
         cure: words for what to narrow, in the error's text.
     """
     count = 5

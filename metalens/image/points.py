@@ -232,12 +232,8 @@ def _point_psfs(
     over each sample. The window's rays are traced to where the light lands.
 
     Args:
-        optics: wave of the lens, layers and lens-sensor distance.
         place: (x, y) field point on the sensor, um.
-        grid: nodes of the pupil and size of the padded transform.
         depths_um: (depths,) source depths from the lens, um.
-        wavelength_um: vacuum wavelength, um.
-        finest_um: shortest wavelength of the spectrum, um.
         shift_um: (x, y) from the landing place to where the rays are traced, um.
     """
     finest_media = optics.layers.after(optics.distance_um, finest_um)
@@ -330,7 +326,6 @@ def _shown(
 
     Args:
         fluxes: (depths, size, size) |U|², then the flux along x and y if any.
-        to_samples: transform to the samples along x and along y.
         moves: shift and divergence of each flux (:func:`_move`).
     """
     plain, change = _moved(fluxes[0], to_samples, moves[0])
@@ -385,7 +380,6 @@ def _on_samples(
 
     Args:
         power: (…, size, size) light on the points of the padded transform.
-        to_samples: transform to the samples along x and along y.
     """
     along_x, along_y = to_samples
     height, width = len(along_y.place_um), len(along_x.place_um)
@@ -406,7 +400,6 @@ def _move(slope: Tensor, to_samples: tuple[WindowSamples, ...]) -> Tensor:
 
     Args:
         slope: (2, 2, 2) symmetric matrices slope_j, 1/um.
-        to_samples: transform to the samples along x and along y; δ is their place.
     """
     delta = _around(to_samples)
     gradient = torch.einsum("jab,byx->jayx", slope.to(delta), delta)
@@ -421,7 +414,6 @@ def _moved(
 
     Args:
         power: (depths, size, size) |U|², or a component of the flux.
-        to_samples: transform to the samples along x and along y.
         move: shift s along x and y, and its divergence (:func:`_move`).
     """
     plain, by_x, by_y = _on_samples(power, to_samples)
@@ -496,10 +488,8 @@ def _to_samples(
     1e-6 keeps the shape of a PSF that has next to no light.
 
     Args:
-        grid: nodes of the pupil and size of the padded transform.
         view_um: from the field point to where the light lands, um.
         shift_um: from there to where the rays are traced, um.
-        device: of the matrices.
     """
     window = grid.window
     harmonic = np.arange(grid.harmonics + 1)

@@ -216,7 +216,6 @@ def _turning(after: Media, p: Tensor) -> Tensor:
     """(…, 2, 2) H = ∂p/∂X: change of a ray's direction p by its place X, 1/um.
 
     Args:
-        after: media behind the pillars.
         p: (…, [x, y]) directions.
     """
     size = torch.hypot(p[..., 0], p[..., 1]).clamp_min(1e-9)
@@ -301,11 +300,7 @@ def _paths_by_depth(
     Chebyshev interpolant of the squared reach, which is clamped at the rim of the lens.
 
     Args:
-        layers: films before the lens.
         tangents: (x, y) slopes of the ray to the lens' middle.
-        bundle: rays of the nodes, with their places on the lens.
-        depths_um: source depths, inf for a plane wave.
-        wavelength_um: in vacuum; None where no film lies before the lens.
     """
     x, y = bundle.x_um, bundle.y_um
     slope = math.hypot(*tangents)

@@ -135,8 +135,6 @@ def _whole_lens(
     """Footprint of a lens without a stop: the whole aperture, and cos⁴ of the angle.
 
     Args:
-        radius_um: of the lens.
-        grid: samples of the frame.
         reduced_um: lens-sensor distance, Σ t/n.
         middle_um: (x, y) field point in the middle.
     """
@@ -155,9 +153,6 @@ def _behind_stop(
     directions, and interpolated to the samples of the frame.
 
     Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        grid: samples of the frame.
-        depth_um: of the sources.
         middle_um: (x, y) field point in the middle.
     """
     layers = optics.layers

@@ -249,10 +249,6 @@ class PillarWave:
         """(y, x) complex t, carrier in rad, and 1 where a pillar stands, float32.
 
         The first is differentiable where the diameters are.
-
-        Args:
-            wavelength_um: vacuum wavelength, um.
-            tilt: angle of incidence, rad.
         """
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
@@ -279,10 +275,6 @@ class PillarWave:
         """(2, cells y, cells x) real and imaginary mean of t exp(-i carrier) per cell.
 
         An empty cell has the mean of the 3 x 3 cells around it.
-
-        Args:
-            wavelength_um: vacuum wavelength, um.
-            tilt: angle of incidence, rad.
         """
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
@@ -308,8 +300,6 @@ class PillarWave:
         neighbours.
 
         Args:
-            wavelength_um: vacuum wavelength, um.
-            tilt: angle of incidence, rad.
             spare: (y, x) rows and columns that are added to fill the last cells.
         """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
