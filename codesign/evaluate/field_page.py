@@ -16,9 +16,8 @@ from metalens.core.report import Table, figure_png, make_figure
 from metalens.lens import Lens
 
 CAPTIONS = {
-    "field": "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays (lines) and of "
-    "the whole aperture (points), tangential (line drawn through, circles) and sagittal (dashed, squares); relative "
-    "illumination and, dotted, vignetting.",
+    "field": "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays, "
+    "tangential (drawn through) and sagittal (dashed); relative illumination and, dotted, vignetting.",
     "mtf": "Modulation transfer over the field angle, of all light through the lens, a frequency each: tangential "
     "drawn through, sagittal dashed.",
 }
@@ -101,16 +100,13 @@ def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
     """
     head = (
         "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
-        "sharpest line T / µm", "S / µm", "vignetting / %", "illumination",
+        "vignetting / %", "illumination",
     )  # fmt: skip
     rows, mtf_rows = [], []
     for name, aberrations in field_aberrations.items():
         for k, angle in enumerate(aberrations.angles_deg):
             label = name if k == 0 else ""
-            focus = [
-                _format_value(value, 1)
-                for value in (*aberrations.close_um[k], *aberrations.sharpest_um[k])
-            ]
+            focus = [_format_value(value, 1) for value in aberrations.close_um[k]]
             distortion, vignetting = (
                 _format_value(100 * value[k], 2)
                 for value in (aberrations.distortion, aberrations.vignetting)
@@ -176,17 +172,9 @@ def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:
             .plot(angle, 100 * aberrations.distortion[order], ".-", label=name)[0]
             .get_color()
         )
-        for axis, style, mark in ((0, "-", "o"), (1, "--", "s")):
+        for axis, style in ((0, "-"), (1, "--")):
             panels[1].plot(
                 angle, aberrations.close_um[order, axis], style, color=colour
-            )
-            panels[1].plot(
-                angle,
-                aberrations.sharpest_um[order, axis],
-                mark,
-                color=colour,
-                markersize=3,
-                fillstyle="none",
             )
         panels[2].plot(angle, aberrations.illumination[order], ".-", color=colour)
         panels[2].plot(angle, aberrations.vignetting[order], ":", color=colour)

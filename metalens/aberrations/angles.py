@@ -6,15 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from metalens.aberrations.chief import ChiefRay, chief_ray, middle_um, source_at
-from metalens.aberrations.waves import (
-    FieldPlaneWaves,
-    line_mtf,
-    plane_waves_of_source,
-    sharpness_per_um,
-)
+from metalens.aberrations.waves import line_mtf, plane_waves_of_source
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.lens import Lens, reach
@@ -22,10 +16,6 @@ from metalens.optics import media
 from metalens.psf import passed_um2
 
 SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are given
-BEYOND = 4.0  # depths of focus scanned on either side of the foci of close rays
-STEPS = 2.0  # of the scan in a depth of focus, wavelength index / NA²
-MOST_STEPS = 400  # of the scan
-CONVERGED = 1e-3  # of a depth of focus: tolerance of the sharpest plane
 PATCHES = 512  # along an axis, over the light of a stop in the pillars' plane
 
 
@@ -44,8 +34,6 @@ class OverField:
     close_um: (n, 2) tangential and sagittal focus of rays close to the chief ray,
         behind the sensor (+) or before it.
     close_error_um: (n, 2) one sigma of these.
-    sharpest_um: (n, 2) the same of the whole aperture: where the line image along x
-        (tangential) and along y (sagittal) is sharpest, largest ∫ L² / (∫ L)².
     vignetting: (n,) share of the light through the stop's hole that misses the pillars;
         0 without a stop.
     illumination: (n,) irradiance in the image of an evenly bright (Lambertian) plane,
@@ -64,7 +52,6 @@ class OverField:
     distortion: Array
     close_um: Array
     close_error_um: Array
-    sharpest_um: Array
     vignetting: Array
     illumination: Array
     frequencies_per_mm: Array
@@ -108,9 +95,8 @@ def over_field(
             critical angle.
         DomainError: an angle outside the lens's library.
 
-    Accuracy: MTF 1e-3 (waves beyond those in the directions of the rays); the sharpest
-        line to a thousandth of a depth of focus, wavelength / NA²; vignetting 1e-4;
-        rays as in :func:`metalens.aberrations.chief_ray`.
+    Accuracy: MTF 1e-3 (waves beyond those in the directions of the rays); vignetting
+        1e-4; rays as in :func:`metalens.aberrations.chief_ray`.
     """
     depth = lens.source_distance_um if depth_um is None else float(depth_um)
     per_mm = np.array(
@@ -128,8 +114,6 @@ def over_field(
         chief = origin if angle == 0 else _chief_or_note(lens, angle, depth, failures)
         rows.append(_aberrations_at(lens, angle, depth, (origin, chief), per_mm / 1e3))
         rows[-1]["illumination"] = rows[-1]["illumination"] / base
-        if np.isnan(rows[-1]["sharpest_um"]).any():
-            failures.append(f"no sharpest line about the sensor at {angle:g} degrees")
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return OverField(
         np.array(angles_deg, float), depth, lens.sensor_distance_um, frequencies_per_mm=per_mm,
@@ -197,13 +181,11 @@ def _aberrations_at(
         close = chief.focus_um - lens.sensor_distance_um
         brightness = _brightness(lens, angle_deg, depth_um, chief)
         illumination = light.passed_um2 * brightness
-    sharpest = _sharpest(lens, light, angle[0], close)
     return {
         "chief_um": unknown if chief is None else chief.meets_um,
         "distortion": _distortion(*rays),
         "close_um": close,
         "close_error_um": unknown if chief is None else chief.focus_error_um,
-        "sharpest_um": sharpest - lens.sensor_distance_um,
         "illumination": illumination,
         "vignetting": vignetted_share(lens, angle, depth_um),
         "mtf": np.stack([line_mtf(light, at_sensor, axis, per_um) for axis in (0, 1)]),
@@ -291,70 +273,3 @@ def vignetted_share(
         tangents, depth_um, wave, sites, math.sqrt(d.site_um2)
     ) * (np.asarray(d.diameter_um) > 0)
     return max(0.0, 1 - float(share.sum()) * d.site_um2 / hole_um2)
-
-
-def _sharpest(
-    lens: Lens, light: FieldPlaneWaves, angle_rad: float, close_um: Array
-) -> Array:
-    """(2,) distance in um behind the pillars of the sharpest line image along x and y.
-
-    A scan around the foci of close rays, the sensor, and the sensor times cos³ of the
-    angle; then a bounded minimisation. nan where the best plane ends the scan.
-
-    Args:
-        light: plane waves of the field angle.
-        close_um: (2,) foci of close rays from the sensor, um; nan where not known.
-    """
-    sensor = lens.sensor_distance_um
-    media_after = lens.layers.after(sensor, lens.wavelength_um)
-    aperture = max(min(light.aperture), 1e-6)
-    depth_of_focus = lens.wavelength_um * media_after.index[0] / aperture**2
-    close = sensor + close_um[np.abs(close_um) < sensor]
-    candidates = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
-    films = sum(media_after.thickness_um[1:])
-    low = max(
-        min(candidates) - BEYOND * depth_of_focus, films + 0.05 * (sensor - films)
-    )
-    high = max(candidates) + BEYOND * depth_of_focus
-    count = min(max(math.ceil((high - low) / depth_of_focus * STEPS), 8), MOST_STEPS)
-    places, step = np.linspace(low, high, count, retstep=True)
-    field = light.at(float(places[0]))
-    step_factor = light.at(float(step), np.ones_like(field))
-    sharpness = np.empty((count, 2))
-    for at_plane in sharpness:
-        at_plane[:] = [sharpness_per_um(light, field, axis) for axis in (0, 1)]
-        field = field * step_factor
-    return np.array(
-        [
-            _refine_maximum(light, places, sharpness[:, axis], axis, depth_of_focus)
-            for axis in (0, 1)
-        ]
-    )
-
-
-def _refine_maximum(
-    light: FieldPlaneWaves,
-    places: Array,
-    sharp: Array,
-    axis: int,
-    depth_of_focus: float,
-) -> float:
-    """Distance in um of largest sharpness, refined between the neighbours of the best
-    scan.
-
-    Args:
-        light: plane waves of the field angle.
-        places: (n,) scanned distances behind the pillars, um.
-        sharp: (n,) sharpness there, per um.
-        axis: 0 or 1, line image along x or y.
-        depth_of_focus: um; the result is exact to a thousandth of it.
-    """
-    best = int(np.argmax(sharp))
-    if best in (0, len(places) - 1):
-        return math.nan
-    ends = float(places[best - 1]), float(places[best + 1])
-    minimum = minimize_scalar(
-        lambda z: -sharpness_per_um(light, light.at(float(z)), axis),
-        bounds=ends, method="bounded", options={"xatol": CONVERGED * depth_of_focus},
-    )  # fmt: skip
-    return float(minimum.x)

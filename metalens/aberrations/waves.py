@@ -1,5 +1,5 @@
-"""The plane waves of the light behind a lens, and line images and transfer functions at
-any distance from them.
+"""The plane waves of the light behind a lens, and transfer functions at any distance
+from them.
 """
 
 import math
@@ -40,7 +40,6 @@ class FieldPlaneWaves:
     light: power behind the pillars that passes the faces, on the scale of Σ
         |amplitude|².
     passed_um2: the same power for unit irradiance on the lens.
-    aperture: half the width (x, y) of the directions of the rim's rays, the NA on axis.
     wavelength_um: vacuum wavelength.
     after: media behind the pillars, at the lens's own sensor.
     """
@@ -51,7 +50,6 @@ class FieldPlaneWaves:
     spacing: tuple[float, float]
     light: float
     passed_um2: float
-    aperture: tuple[float, float]
     wavelength_um: float
     after: Media
 
@@ -60,33 +58,23 @@ class FieldPlaneWaves:
         """Share of the light that these waves are."""
         return float((np.abs(self.amplitude) ** 2).sum()) / self.light
 
-    def at(self, distance_um: float, like: Array | None = None) -> Array:
+    def at(self, distance_um: float) -> Array:
         """Plane-wave amplitudes (y, x) at a distance behind the pillars.
 
         amplitude exp(i k sum_layers t sqrt(n² - p_x² - p_y²)), films as they are and
         the gap before them changed.
 
         Args:
-            distance_um: from the pillars; with ``like`` a further distance in the
-                cover.
-            like: (y, x) amplitudes that are propagated in place of those at the
-                pillars.
+            distance_um: from the pillars.
         """
-        cover = self.after.index[0]
-        films = list(
-            zip(self.after.index[1:], self.after.thickness_um[1:], strict=True)
-        )
+        cover, *films = zip(self.after.index, self.after.thickness_um, strict=True)
+        pairs = [(cover[0], distance_um - sum(t for _, t in films)), *films]
         p_square = self.p_x**2 + self.p_y[:, None] ** 2
-        if like is None:
-            amplitude = self.amplitude
-            pairs = [(cover, distance_um - sum(t for _, t in films)), *films]
-        else:
-            amplitude = like
-            pairs = [(cover, distance_um)]
         path = sum(
             t * np.sqrt(np.maximum(n * n - p_square, 0.0)) for n, t in pairs if t
         )
-        return np.asarray(amplitude * np.exp(2j * np.pi / self.wavelength_um * path))
+        turns = path / self.wavelength_um
+        return np.asarray(self.amplitude * np.exp(2j * np.pi * turns))
 
 
 def plane_waves_of_source(
@@ -141,9 +129,8 @@ def plane_waves_of_source(
     faces = float(media.passed_at(after.order, middle_square))
     light = nx * ny * power * faces
     passed_um2 = d.site_um2 * power * faces
-    aperture = float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2
     return FieldPlaneWaves(
-        amplitude, p_x, p_y, (dx, dy), light, passed_um2, aperture, wave, after
+        amplitude, p_x, p_y, (dx, dy), light, passed_um2, wave, after
     )
 
 
@@ -231,54 +218,27 @@ def _row_transforms(
     return out, power
 
 
-def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
-    """Line image along x (0) or y (1) of waves on a plane, and its sample step in um.
-
-    The sum is 1 where all light is in it. It repeats beyond its ends.
-
-    Args:
-        waves: plane waves behind the lens.
-        field: (y, x) amplitudes on the plane (:meth:`FieldPlaneWaves.at`).
-        axis: 0: image over x, summed over y; 1: over y.
-    """
-    along = field if axis == 0 else field.T
-    count = scipy.fft.next_fast_len(2 * along.shape[1])
-    line = (np.abs(scipy.fft.ifft(along, count, axis=1)) ** 2).sum(0) * (
-        count / waves.light
-    )
-    return np.asarray(line), waves.wavelength_um / (count * waves.spacing[axis])
-
-
-def sharpness_per_um(waves: FieldPlaneWaves, field: Array, axis: int) -> float:
-    """Sharpness ∫ L² / (∫ L)² of the line image L along an axis; 1 / b for a bar of
-    width b.
-
-    Args:
-        waves: plane waves behind the lens.
-        field: (y, x) amplitudes on the plane.
-        axis: 0: along x; 1: along y.
-    """
-    line, step = line_image(waves, field, axis)
-    return float((line**2).sum() / line.sum() ** 2 / step)
-
-
 def line_mtf(
     waves: FieldPlaneWaves, field: Array, axis: int, frequencies_per_um: Array
 ) -> Array:
     """(frequencies,) modulation transfer along an axis, of all light through the lens.
 
-    |sum L exp(-2 pi i f x)| of the line image L. Just above frequency 0 it is
-    :attr:`FieldPlaneWaves.held`.
+    |sum L exp(-2 pi i f x)| of the line image L, the light over x (0) or y (1) summed
+    over the other. Just above frequency 0 it is :attr:`FieldPlaneWaves.held`.
 
     Args:
         waves: plane waves behind the lens.
-        field: (y, x) amplitudes on the plane.
+        field: (y, x) amplitudes on the plane (:meth:`FieldPlaneWaves.at`).
         axis: 0: along x; 1: along y.
         frequencies_per_um: spatial frequencies, cycles per um.
     """
-    line, step = line_image(waves, field, axis)
+    along = field if axis == 0 else field.T
+    count = scipy.fft.next_fast_len(2 * along.shape[1])
+    line = (np.abs(scipy.fft.ifft(along, count, axis=1)) ** 2).sum(0)
     shifted = np.roll(line, len(line) // 2 - int(np.argmax(line)))
-    x = (np.arange(len(line)) - len(line) // 2) * step
+    step_um = waves.wavelength_um / (count * waves.spacing[axis])
+    x = (np.arange(count) - count // 2) * step_um
+    turns = np.outer(frequencies_per_um, x)
     return np.asarray(
-        np.abs(np.exp(-2j * np.pi * np.outer(frequencies_per_um, x)) @ shifted)
+        np.abs(np.exp(-2j * np.pi * turns) @ shifted) * (count / waves.light)
     )

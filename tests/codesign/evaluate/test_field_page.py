@@ -23,7 +23,7 @@ def typed(**changes):
         "chief_um": np.array([[-140.256, 0.1], [math.nan] * 2]), "distortion": np.array([-0.01234, math.nan]),
         "close_um": np.array([[-12.34, -5.67], [math.nan] * 2]),
         "close_error_um": np.array([[0.4, 0.3], [math.nan] * 2]),
-        "sharpest_um": np.array([[-13.57, -6.89], [7.9, 8.8]]), "vignetting": np.array([0.0, 0.0625]),
+        "vignetting": np.array([0.0, 0.0625]),
         "illumination": np.array([0.987, math.nan]), "frequencies_per_mm": np.array([37.0, 74.0]),
         "mtf": np.array([[[0.81, 0.62], [0.83, 0.64]], [[0.41, 0.22], [0.53, 0.34]]]),
         "held": np.array([0.99, 0.98]), "left_out": ("the chief ray of (9, 0) degrees is lost",),
@@ -41,23 +41,10 @@ def test_every_number_stands_under_its_name_with_its_unit():
         "-1.23",
         "-12.3",
         "-5.7",
-        "-13.6",
-        "-6.9",
         "0.00",
         "0.987",
     ]
-    assert list(fields.rows[1]) == [
-        "",
-        "9",
-        "–",
-        "–",
-        "–",
-        "–",
-        "7.9",
-        "8.8",
-        "6.25",
-        "–",
-    ]
+    assert list(fields.rows[1]) == ["", "9", "–", "–", "–", "–", "6.25", "–"]
     assert rows[0]["vignetting / %"] == "0.00"
     assert fields.head[3:6] == ("distortion / %", "close rays T / µm", "S / µm")
     assert "21 mm" in fields.caption
