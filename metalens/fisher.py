@@ -8,6 +8,4 @@ from metalens.image.information import encircled_energy as encircled_energy
 from metalens.image.information import information as information
 from metalens.image.information import optics_loss as optics_loss
 from metalens.image.information import pixel_information as pixel_information
-from metalens.image.information import span_angle as span_angle
 from metalens.image.information import texture_information as texture_information
-from metalens.image.information import without_nuisance as without_nuisance

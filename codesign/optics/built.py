@@ -32,6 +32,7 @@ from metalens.image import (
     amplitude,
     cell_um,
     coordinates,
+    interpolate_cells,
     view_pupil,
 )
 from metalens.lens import Lens
@@ -106,7 +107,7 @@ class PillarCells:
 
     def factor(
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
-    ) -> Tensor | None:
+    ) -> Tensor:
         """Complex transmission at the rays, without the focus: cells by linear
         interpolation.
 
@@ -116,20 +117,8 @@ class PillarCells:
             x_um: x on the lens. y_um: y on the lens. wavelength_um: of the light.
             angle_rad: angle of the light to the axis.
         """
-        normalised = [
-            (v - c) / h
-            for v, c, h in zip((x_um, y_um), self.centre_um, self.half_um, strict=True)
-        ]
-        points = torch.stack(normalised, -1).to(self.cells)
-        sampled = torch.nn.functional.grid_sample(
-            self.cells[None],
-            points.reshape(1, 1, -1, 2),
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-        )
-        real, imaginary = sampled.reshape(2, *x_um.shape).unbind(0)
-        return self._with_added_phase(torch.complex(real, imaginary), x_um, y_um)
+        t = interpolate_cells(self.cells, (x_um, y_um), self.centre_um, self.half_um)
+        return self._with_added_phase(t, x_um, y_um)
 
     def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
         """(y, x) complex t of every pillar, for the error of averaging over cells.
@@ -213,23 +202,20 @@ class MadeLens:
         pupil = self._pupil(distance_um)
         tangents = self._field.tangents
         view = view_pupil(pupil, self._field, self.design.source_distance_um)
-        x_um = view.x_um.numpy()
-        y_um = view.y_um.numpy()
+        place_um = view.x_um, view.y_um
         state = process_state_of(parameters)
-        cells = self._gathered(state)
-        transmission = torch.from_numpy(self._on_nodes(cells, x_um, y_um))
-        phase = profiles.hyperbolic_phase(x_um, y_um, self.focus)
-        phase = phase + self._aberration(state, x_um, y_um)
+        plane = self.plane(state)
+        light_in = self.design.wavelength_um, self._field.angle_rad
+        transmission = plane.factor(*place_um, *light_in) * view.weight
         centre_um = tangents[0] * distance_um, tangents[1] * distance_um
         k = 2 * math.pi / pupil.wavelength_um
-        lens_phase = torch.from_numpy(phase) + k * sensor_path(
-            view.x_um, view.y_um, centre_um, distance_um
+        lens_phase = plane.carrier_rad(*place_um) + k * sensor_path(
+            *place_um, centre_um, distance_um
         )
         source_paths = [
-            source_path(view.x_um, view.y_um, tangents, 1 / z)
+            source_path(*place_um, tangents, 1 / z)
             for z in self.settings.depths_um.tolist()
         ]
-        transmission = transmission * view.weight
         light = []
         for source in source_paths:
             angle = torch.remainder(lens_phase + k * source, 2 * math.pi)
@@ -241,7 +227,7 @@ class MadeLens:
         return PixelPsfStack(
             torch.stack(light),
             self.settings.depths_um,
-            Optics(self._plane(state, cells), self.design.layers, distance_um),
+            Optics(plane, self.design.layers, distance_um),
         )
 
     def wave(self, x: Array | None = None) -> Array:
@@ -255,21 +241,19 @@ class MadeLens:
         """
         parameters = at_rest(parameter_vector() if x is None else x)
         pupil = self._pupil(self.design.sensor_distance_um)
-        nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
-        transmission = self._on_nodes(
-            self._gathered(process_state_of(parameters)), nodes_x, nodes_y
-        )
-        radius2 = nodes_x**2 + nodes_y**2
+        place_um = coordinates(pupil)
+        plane = self.plane(process_state_of(parameters))
+        transmission = plane.factor(*place_um, self.design.wavelength_um, 0.0)
+        radius2 = (place_um[0] ** 2 + place_um[1] ** 2).numpy()
         distance_um = self.design.sensor_distance_um + float(
             parameters[PLACE["distance_um"]]
         )
         defocus_um = path_difference(radius2, distance_um) - path_difference(
             radius2, self.design.sensor_distance_um
         )
-        phase = 2 * math.pi / self.design.wavelength_um * defocus_um + self._aberration(
-            process_state_of(parameters), nodes_x, nodes_y
-        )
-        return np.asarray(transmission * np.exp(1j * phase) * amplitude(pupil).numpy())
+        phase = 2 * math.pi / self.design.wavelength_um * defocus_um
+        factor = transmission * amplitude(pupil)
+        return np.asarray(factor.numpy() * np.exp(1j * phase))
 
     def redrawn(self, lens: Lens) -> "MadeLens":
         """The same settings and response for a lens of other diameters."""
@@ -282,26 +266,8 @@ class MadeLens:
             state: perturbations by the process.
             factor: (y, x) complex, multiplies every pillar.
         """
-        return self._plane(state, self._gathered(state, factor=factor), factor)
-
-    def pillars(self, state: State, *, factor: Array | None = None) -> Tensor:
-        """(y, x) complex t of every pillar in a process state, 0 where there is none.
-
-        Args:
-            state: perturbations by the process.
-            factor: (y, x) complex, multiplies every pillar.
-        """
-        single = self._gathered(state, 1, factor=factor)
-        return torch.from_numpy(single * self._carrier.conj())
-
-    def _plane(
-        self, state: State, cells: Array, factor: Array | None = None
-    ) -> PillarCells:
-        """Lens plane of (y, x) cells of a process state, with its wave front as
-        added phase.
-        """
         d = self.design.diameters
-        filled = _filled(cells)
+        filled = _filled(self._gathered(state, factor=factor))
         step_um = self._block * d.pitch_um
         half_um = filled.shape[1] * step_um / 2, filled.shape[0] * step_um / 2
         centre_um = tuple(
@@ -310,7 +276,8 @@ class MadeLens:
         )
 
         def added_rad(x_um: Tensor, y_um: Tensor) -> Tensor:
-            return torch.from_numpy(self._aberration(state, x_um.numpy(), y_um.numpy()))
+            place = (x_um / self._rim_um).numpy(), (y_um / self._rim_um).numpy()
+            return torch.from_numpy(state.phase_rad(*place))
 
         return PillarCells(
             self.focus,
@@ -323,12 +290,15 @@ class MadeLens:
             added_rad if state.has_wavefront_error() else None,
         )
 
-    def _aberration(self, state: State, nodes_x: Array, nodes_y: Array) -> Array:
-        """Phase of the wave-front error of a process state at points of the lens,
-        rad.
+    def pillars(self, state: State, *, factor: Array | None = None) -> Tensor:
+        """(y, x) complex t of every pillar in a process state, 0 where there is none.
+
+        Args:
+            state: perturbations by the process.
+            factor: (y, x) complex, multiplies every pillar.
         """
-        rim_um = self._rim_um
-        return state.phase_rad(nodes_x / rim_um, nodes_y / rim_um)
+        single = self._gathered(state, 1, factor=factor)
+        return torch.from_numpy(single * self._carrier.conj())
 
     def _pupil(self, distance_um: float) -> Pupil:
         """Pupil at a sensor distance, with nodes for the window and a margin of
@@ -390,23 +360,6 @@ class MadeLens:
             block or self._block,
         )
         return np.asarray(means)
-
-    def _on_nodes(self, cells: Array, nodes_x: Array, nodes_y: Array) -> Array:
-        """Complex cells interpolated linearly to the pupil's nodes (um), constant
-        past the rim.
-        """
-        d = self.design.diameters
-        block = self._block
-        filled = _filled(cells)
-        index = [
-            (nodes - (first + (block - 1) / 2 * d.pitch_um)) / (block * d.pitch_um)
-            for nodes, first in ((nodes_y, d.y_um[0]), (nodes_x, d.x_um[0]))
-        ]
-        real, imaginary = (
-            ndimage.map_coordinates(part, index, order=1, mode="nearest")
-            for part in (filled.real, filled.imag)
-        )
-        return np.asarray(real + 1j * imaginary)
 
 
 def _filled(cells: Array) -> Array:

@@ -40,3 +40,4 @@ from .waves import PillarWave as PillarWave
 from .waves import SmoothWave as SmoothWave
 from .waves import Wave as Wave
 from .waves import cell_um as cell_um
+from .waves import interpolate_cells as interpolate_cells

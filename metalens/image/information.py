@@ -30,23 +30,6 @@ def information(jacobians: Tensor, variance: Tensor | None = None) -> Tensor:
     return jacobians.flatten(1) @ weighted.flatten(1).mT
 
 
-def span_angle(fisher: Tensor) -> Tensor:
-    """Angle between two sensitivity fields: cos phi = F12 / sqrt(F11 F22) (Eq. 5), in
-    [0, pi].
-
-    From atan2, so that it is exact near 0 and pi; 0 where a field vanishes.
-
-    Args:
-        fisher: (..., n, n) Fisher matrix.
-    """
-    f11 = fisher[..., 0, 0]
-    f22 = fisher[..., 1, 1]
-    f12 = fisher[..., 0, 1]
-    across = torch.sqrt((f11 * f22 - f12**2).clamp_min(torch.finfo(fisher.dtype).tiny))
-    dark = (f11 <= 0) | (f22 <= 0)
-    return torch.where(dark, 0.0, torch.atan2(across, f12))
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class OpticsLoss:
     """Eq. 6 and its parts.
@@ -240,27 +223,6 @@ def texture_information(
     slope = (power[1:] - power[:-1]) / (step_um * 1e-3)
     total: Tensor = 0.5 * (slope**2 * weight).sum((-2, -1))
     return total
-
-
-def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
-    """Information on the first parameters when the others are unknown: A - B C⁻¹ Bᵀ.
-
-    The Schur complement. Nuisance directions without any information are left out
-    (pseudo-inverse of C, scaled to a unit diagonal).
-
-    Args:
-        fisher: (n, n) Fisher matrix [[A, B], [Bᵀ, C]].
-        wanted: number of the first parameters, the size of A.
-    """
-    a = fisher[:wanted, :wanted]
-    b = fisher[:wanted, wanted:]
-    c = fisher[wanted:, wanted:]
-    scale = torch.sqrt(torch.diagonal(c).clamp_min(torch.finfo(c.dtype).tiny))
-    inverse = torch.linalg.pinv(
-        c / torch.outer(scale, scale), hermitian=True, rtol=1e-12
-    )
-    complement: Tensor = a - (b / scale) @ inverse @ (b / scale).mT
-    return complement
 
 
 def cramer_rao(fisher: Tensor) -> Tensor:

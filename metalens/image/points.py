@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import PropagationError
-from metalens.image import compiled, polarised
+from metalens.image import compiled
 from metalens.image.rays import (
+    OF_ENERGY,
+    OF_FLUX,
     RayPaths,
     Rays,
     landing_offset,
+    polarisation_factors,
     rays,
     source_paths,
     through_stop,
@@ -36,7 +39,7 @@ class Window:
 
     curved: with the flux of the second order as well, three times the work.
     components: number of the strongest mixtures of both polarisations' fields
-        (:mod:`metalens.image.polarised`), each as much work as a scalar; 0 for one
+        (:func:`metalens.image.rays.polarisation_factors`), each as much work as a scalar; 0 for one
         scalar.
     flux: whether those give the flux through the sensor's plane, which a pixel counts,
         or |Ex|² + |Ey|² + |Ez|².
@@ -68,7 +71,7 @@ class Window:
     @property
     def whole(self) -> int:
         """Components that leave nothing out."""
-        return polarised.OF_FLUX if self.flux else polarised.OF_ENERGY
+        return OF_FLUX if self.flux else OF_ENERGY
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -261,14 +264,18 @@ def _point_psfs(
         light = light * factor.to(torch.complex64)
     total: float | Tensor = pupil.given * grid.size**2 * (1 - grid.dimmed)
     if optics.layers.stop is not None:
-        shade, taken = stop_amplitudes(
-            optics, tangents, bundle, depths_um, wavelength_um
+        depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
+        sides = float(tangents[0]), float(tangents[1])
+        light = light * through_stop(
+            optics.layers, sides, bundle, depths, wavelength_um
         )
-        light = light * shade
-        total = total * taken
+        # light on the stop over that on the whole lens, of sources on the axis
+        footprints = [optics.layers.footprint_um(d, wavelength_um) for d in depths]
+        taken = (torch.tensor(footprints, device=light.device) / radius) ** 2
+        total = total * taken[:, None, None]
     mixed = None
     if grid.window.components:
-        fields = polarised.polarisation_factors(
+        fields = polarisation_factors(
             bundle, tangents, after.order, flux=grid.window.flux
         )
         mixed = dominant_components(fields, pupil.weight, grid.window.components)
@@ -283,56 +290,12 @@ def _point_psfs(
     images = []
     for part in torch.split(light, at_once):
         fluxes = _fluxes(part, mixed, second_order, grid.size)
-        images.append(_shown(fluxes, to_samples, moves))
+        moved = [
+            _moved(flux, to_samples, move)
+            for flux, move in zip(fluxes, moves, strict=True)
+        ]
+        images.append(moved[0][0] + sum(change for _, change in moved))
     return torch.cat(images) / total
-
-
-def stop_amplitudes(
-    optics: Optics,
-    tangents: Tensor,
-    found: Rays,
-    depths_um: Tensor,
-    wavelength_um: float,
-) -> tuple[Tensor, Tensor]:
-    """Amplitude transmission of the aperture stop, and the light that enters it.
-
-    Returns (depths, nodes, nodes) complex amplitude behind the stop over that without
-    it, and (depths, 1, 1) light on the stop over that on the whole lens. The second is
-    (footprint radius / lens radius)², of sources on the axis.
-
-    Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        tangents: (2,) tangents of the field angles along x and y.
-        found: rays of the nodes.
-        depths_um: source depths from the lens, um.
-        wavelength_um: vacuum wavelength, um.
-    """
-    depths = tuple(depths_um.tolist())
-    radius = optics.wave.radius_um
-    shade = through_stop(
-        optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um
-    )
-    taken = [
-        (optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2
-        for depth in depths
-    ]
-    return shade, torch.tensor(taken, device=shade.device)[:, None, None]
-
-
-def _shown(
-    fluxes: list[Tensor], to_samples: tuple[WindowSamples, ...], moves: list[Tensor]
-) -> Tensor:
-    """(depths, h, w) light of the transforms, moved to second order, on the samples.
-
-    Args:
-        fluxes: (depths, size, size) |U|², then the flux along x and y if any.
-        moves: shift and divergence of each flux (:func:`_move`).
-    """
-    plain, change = _moved(fluxes[0], to_samples, moves[0])
-    image = plain + change
-    for flux, move in zip(fluxes[1:], moves[1:], strict=True):
-        image = image + _moved(flux, to_samples, move)[1]
-    return image
 
 
 def _fluxes(
@@ -373,35 +336,17 @@ def _fluxes(
     return total
 
 
-def _on_samples(
-    power: Tensor, to_samples: tuple[WindowSamples, ...]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(…, h, w) light on the samples, and its derivatives by x and by y, per um.
-
-    Args:
-        power: (…, size, size) light on the points of the padded transform.
-    """
-    along_x, along_y = to_samples
-    height, width = len(along_y.place_um), len(along_x.place_um)
-    rows = along_y.both @ power
-    plain, by_y = rows[..., :height, :], rows[..., height:, :]
-    light = plain @ along_x.both.mT
-    return light[..., :width], light[..., width:], by_y @ along_x.both[:width].mT
-
-
-def _around(to_samples: tuple[WindowSamples, ...]) -> Tensor:
-    """([x, y], h, w) places of the samples from where the rays are traced to, um."""
-    y, x = torch.meshgrid(to_samples[1].place_um, to_samples[0].place_um, indexing="ij")
-    return torch.stack([x, y])
-
-
 def _move(slope: Tensor, to_samples: tuple[WindowSamples, ...]) -> Tensor:
     """([x, y, divergence], h, w) of the shift s(δ)_j = δᵀ slope_j δ / 2, in um.
+
+    δ is the place of a sample from where the rays are traced to.
 
     Args:
         slope: (2, 2, 2) symmetric matrices slope_j, 1/um.
     """
-    delta = _around(to_samples)
+    along_x, along_y = to_samples
+    y, x = torch.meshgrid(along_y.place_um, along_x.place_um, indexing="ij")
+    delta = torch.stack([x, y])
     gradient = torch.einsum("jab,byx->jayx", slope.to(delta), delta)
     shift = torch.einsum("jayx,ayx->jyx", gradient, delta) / 2
     return torch.cat([shift, (gradient[0, 0] + gradient[1, 1])[None]])
@@ -416,7 +361,12 @@ def _moved(
         power: (depths, size, size) |U|², or a component of the flux.
         move: shift s along x and y, and its divergence (:func:`_move`).
     """
-    plain, by_x, by_y = _on_samples(power, to_samples)
+    along_x, along_y = to_samples
+    height, width = len(along_y.place_um), len(along_x.place_um)
+    rows = along_y.both @ power
+    both = rows[..., :height, :] @ along_x.both.mT
+    plain, by_x = both[..., :width], both[..., width:]
+    by_y = rows[..., height:, :] @ along_x.both[:width].mT
     return plain, plain * move[2] + move[0] * by_x + move[1] * by_y
 
 

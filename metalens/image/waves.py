@@ -175,17 +175,8 @@ class PillarWave:
             (n - own) % 2 * pitch / 2
             for n, own in zip(self._padded, self.diameter_um.shape, strict=True)
         ]
-        place = torch.stack(
-            [(x_um - shift[1]) / half[1], (y_um - shift[0]) / half[0]], -1
-        ).to(cells)
-        factor = torch.nn.functional.grid_sample(
-            cells[None],
-            place.reshape(1, 1, -1, 2),
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-        )
-        return torch.complex(*factor.reshape(2, *x_um.shape).unbind(0))
+        centre = (shift[1], shift[0])
+        return interpolate_cells(cells, (x_um, y_um), centre, (half[1], half[0]))
 
     @property
     def pitch_um(self) -> float:
@@ -316,6 +307,31 @@ class PillarWave:
         return torch.nn.functional.avg_pool2d(
             torch.nn.functional.pad(layers, pad)[None], self._block
         )[0]
+
+
+def interpolate_cells(
+    cells: Tensor,
+    at_um: tuple[Tensor, Tensor],
+    centre_um: tuple[float, float],
+    half_um: tuple[float, float],
+) -> Tensor:
+    """Complex means of cells at places, bilinear and constant beyond the outer cells.
+
+    Args:
+        cells: (2, y, x) real and imaginary parts.
+        at_um: x and y of the places, of one shape.
+        centre_um: (x, y) middle of the cells.
+        half_um: (x, y) half of their extent.
+    """
+    place = [(a - c) / h for a, c, h in zip(at_um, centre_um, half_um, strict=True)]
+    factor = torch.nn.functional.grid_sample(
+        cells[None],
+        torch.stack(place, -1).to(cells).reshape(1, 1, -1, 2),
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return torch.complex(*factor.reshape(2, *at_um[0].shape).unbind(0))
 
 
 def _over(cells: Tensor, width: float) -> Tensor:

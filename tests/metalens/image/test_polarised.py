@@ -16,8 +16,7 @@ from scipy import special
 from metalens.core.errors import PropagationError
 from metalens.design import Focus
 from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
-from metalens.image.polarised import polarisation_factors
-from metalens.image.rays import Rays
+from metalens.image.rays import Rays, polarisation_factors
 from metalens.image.texture import texture_error
 from metalens.optics import Layers
 from metalens.psf import (
