@@ -132,62 +132,6 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
         out[:, row] = sums / (side * side)
 
 
-def weigh_sources(
-    content: Tensor, depth_um: Tensor, table: Tensor, vergence: tuple[float, float]
-) -> Tensor:
-    """(rank, *content) float32 sources times the kernels' weights at their depths.
-
-    Args:
-        content: (frames, kinds, *sheets, y, x) light and coverage; or (frames, y, x).
-        depth_um: the same with 1 kind; or (frames, y, x).
-        table: (codes, rank) weights at equal steps of 1/z.
-        vergence: (first, last) 1/z of the table, 1/um.
-    """
-    frame = content.shape[-2:]
-    frames = len(content)
-    kinds = content.numel() // max(depth_um.numel(), 1)
-    light = content.reshape(frames, kinds, -1, *frame).contiguous().numpy()
-    depth = depth_um.reshape(frames, -1, *frame).contiguous().numpy()
-    out = np.empty((table.shape[1], *light.shape), np.float32)
-    rows = np.ascontiguousarray(table.numpy().T)
-    near, far = (np.float32(end) for end in vergence)
-
-    run_split(frames, lambda a, b: _weigh(light, depth, rows, near, far, a, b, out))
-    return torch.from_numpy(out).reshape(-1, *content.shape)
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _weigh(light, depth, table, near, far, start, stop, out):  # type: ignore[no-untyped-def]
-    """Write light times the weight at the nearest depth of the table into ``out``.
-
-    Args:
-        light: (frames, kinds, sheets, y, x).
-        depth: (frames, sheets, y, x), um.
-        table: (rank, codes) weights at equal steps of 1/z.
-        near, far: 1/z of the first and last code.
-        start, stop: frames that are written.
-        out: (rank, frames, kinds, sheets, y, x).
-    """
-    _, kinds, sheets, height, width = light.shape
-    top = np.float32(table.shape[1] - 1)
-    unit = top / max(near - far, np.float32(1e-30))
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    code = np.empty(width, np.uint32)
-    for n in range(start, stop):
-        for sheet in range(sheets):
-            for y in range(height):
-                for x in range(width):
-                    place = (near - one / max(depth[n, sheet, y, x], one)) * unit
-                    code[x] = np.uint32(min(max(place + half, zero), top))
-                for k in range(table.shape[0]):
-                    row = table[k]
-                    for kind in range(kinds):
-                        source = light[n, kind, sheet, y]
-                        weighted = out[k, n, kind, sheet, y]
-                        for x in range(width):
-                            weighted[x] = row[code[x]] * source[x]
-
-
 def is_compilable(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory,
     without derivatives.

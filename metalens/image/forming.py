@@ -333,7 +333,8 @@ def _filled(value: Tensor, known: Tensor) -> Tensor:
     if max(size) == 1:
         return torch.where(known, value, 0.0)
     pool = functools.partial(
-        torch.nn.functional.adaptive_avg_pool2d, output_size=[-(-n // 2) for n in size]
+        torch.nn.functional.adaptive_avg_pool2d,
+        output_size=(-(-size[0] // 2), -(-size[1] // 2)),
     )
     count = pool(known.to(value))
     mean = pool(torch.where(known, value, 0.0)) / torch.where(count > 0, count, 1.0)

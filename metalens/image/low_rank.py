@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
-from metalens.image import compiled
 from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
 from metalens.image.texture import scene_spectrum, texture_spectrum
 
@@ -185,9 +184,6 @@ class LowRankPsfs:
                 have the weights of the outermost.
         """
         if self.uniform:
-            parts = content, depth_um, self.table
-            if all(compiled.is_compilable(part) for part in parts):
-                return compiled.weigh_sources(*parts, self.vergence)
             rows = self.interpolate(depth_um).reshape(-1, *depth_um.shape)
             return rows * content
         fixed = not (content.requires_grad and torch.is_grad_enabled())
@@ -364,7 +360,8 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
     def adjoint(error: Tensor) -> Tensor:
         spectrum = torch.fft.rfft2(error * scale, s=shape) * transfer.conj()
         whole = torch.fft.irfft2(spectrum, s=shape)[:, :rows, :columns]
-        return (sources * whole).sum(0)
+        back: Tensor = (sources * whole).sum(0)
+        return back
 
     factor = torch.ones_like(target)
     residual = target * scale - image(factor)
