@@ -12,7 +12,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.lens import Lens, reach
 from metalens.optics import media
-from metalens.psf import View, from_lens, metrics, passed_um2
+from metalens.psf import View, from_lens, mtf, passed_um2
 
 SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are given
 EXACT = 1e-3  # of the MTF: last change with a window twice as wide
@@ -222,7 +222,7 @@ def _transfer(
                 raise
             break
         held = float(stack.energy_um2[0, 0]) / passed_um2
-        transfer = held * metrics.mtf(stack, frequencies_per_um=per_um)[0, 0]
+        transfer = held * mtf(stack, frequencies_per_um=per_um)[0, 0]
         if np.abs(transfer - last).max() < EXACT:
             break
         last, window_um = transfer, 2 * window_um

@@ -19,6 +19,7 @@ from .metrics import diffraction_limit as diffraction_limit
 from .metrics import encircled_power as encircled_power
 from .metrics import find_peak as find_peak
 from .metrics import fwhm as fwhm
+from .metrics import mtf as mtf
 from .of_lens import View as View
 from .of_lens import all_maps as all_maps
 from .of_lens import from_lens as from_lens
