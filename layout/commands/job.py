@@ -1,4 +1,4 @@
-"""What ``metalens layout`` was asked for, and what it has made so far."""
+"""Options and results so far of ``metalens layout``."""
 
 import contextlib
 import time
@@ -90,7 +90,7 @@ class Options(DistributedOptions):
 
 @dataclass(eq=False, slots=True)
 class StageTimes:
-    """Seconds of each stage; ``say`` is told when one begins."""
+    """Seconds of each stage; ``say`` announces each as it begins."""
 
     say: Callable[[str], None]
     seconds: dict[str, float] = field(default_factory=dict)
@@ -106,7 +106,7 @@ class StageTimes:
 
 @dataclass(eq=False, slots=True)
 class LayoutJob:
-    """What a run of the command has made so far.
+    """Results so far of a run of the command.
 
     stages: what the time went to. written: {file name: bytes}. compared: {file name:
     outcome of reading it back}.

@@ -213,7 +213,7 @@ def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
     return (
         f" The point exposure is the table {exposure.csv.name}, as "
         f"{len(point.weights)} Gaussians: the energy within any radius differs by up "
-        f"to {100 * point.fit_error:.2g} % of the whole from that of the table, besides."
+        f"to {100 * point.fit_error:.2g} % of the whole from that of the table."
     )
 
 
@@ -314,7 +314,7 @@ def _checks(work: FloorplanWork) -> Section:
             [violation.text, violation.value / 1e3, violation.limit / 1e3]
             for violation in work.near[:_LISTED]
         ]
-        head = ("what", "apart / µm", "needed / µm")
+        head = ("what", "distance / µm", "needed / µm")
         items.append(Table(head, near, "Parts that stand too near each other."))
     text = [*work.failures, *work.warnings]
     if not work.failures:
