@@ -13,6 +13,7 @@ from torch import Tensor
 from metalens.core.errors import SceneError
 from metalens.image.compiled import has_no_gradient
 from metalens.image.low_rank import (
+    EVEN,
     KernelBasis,
     LowRankPsfs,
     PsfField,
@@ -111,6 +112,8 @@ class Imager:
         # away from borders, derivatives are those of the light alone
         border = (hidden > FAINT) & (hidden < 1 - FAINT)
         hidden = torch.where(border, hidden, hidden.detach())
+        # full and no coverage are so, in spite of errors of kernels and between nodes
+        hidden = (1 + 4 * EVEN) * hidden - 2 * EVEN
         covered, behind = hidden.clamp(0, 1).unbind(1)
         # of two sheets at one depth, the light is the sum of both
         covered = torch.stack([covered, 1 - behind], 1)
