@@ -515,7 +515,7 @@ def _unpack(row: Any) -> Any:
 
 
 @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
-def frames(
+def render_strips(
     first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array,
     w: Array, light: Array, cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip
@@ -576,5 +576,5 @@ def render_rows(
     arrays = (parameters, scale, bank, u, w, light, cover, depth, pupil)
     threads.run_split(
         len(parameters) * -(-len(w) // ROWS),
-        lambda first, end: frames(first, end, *arrays),
+        lambda first, end: render_strips(first, end, *arrays),
     )

@@ -421,7 +421,7 @@ class Trainer:
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
         workers = renderer_threads(self.light.device)
-        for batch in prefetch(self._batch, range(self.step, end), workers=workers):
+        for batch in compute_ahead(self._batch, range(self.step, end), workers=workers):
             yield self._advance(batch)
 
     def state(self) -> dict[str, object]:
@@ -727,7 +727,7 @@ class Trainer:
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
 
 
-def prefetch(
+def compute_ahead(
     work: Callable[[int], Made], steps: range, *, workers: int
 ) -> Iterator[Made]:
     """Results of ``work`` for every step in order, computed ahead by ``workers``

@@ -13,7 +13,7 @@ import torch
 from characterize import next_mask
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
 from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
-from codesign.train.trainer import prefetch
+from codesign.train.trainer import compute_ahead
 
 ROOT = Path(__file__).parents[3]
 
@@ -61,7 +61,7 @@ def test_a_lens_is_trained_behind_a_network_and_a_loss_of_ones_own():
 def test_frames_rendered_ahead_are_those_of_their_steps(workers):
     scenes = EyeScenes(SceneConfig(pixels=32, margin=0), 36.0, 2000.0, seed=2)
     steps = range(3, 8)
-    made = list(prefetch(lambda n: scenes.batch(n, 2), steps, workers=workers))
+    made = list(compute_ahead(lambda n: scenes.batch(n, 2), steps, workers=workers))
     assert len(made) == len(steps)
     for step, batch in zip(steps, made, strict=True):
         assert torch.equal(batch.slip_mm, scenes.batch(step, 2).slip_mm)
