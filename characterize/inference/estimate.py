@@ -50,11 +50,16 @@ from characterize.model import (
 )
 from metalens.core import threads
 from metalens.core.arrays import Array
-from metalens.core.errors import FitRefused
+from metalens.core.errors import FitError, FitRefused
 from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 LIKENESS = 0.45
+# fitted too where the usual parameters do not explain the frames
+EXTRA = (
+    "bias_a_nm", "bias_o_nm", "bandwidth_nm", "tilt_x_deg", "tilt_y_deg", "pinhole_um",
+    "pixel_percent",
+)  # fmt: skip
 # fits with rounded counts: at most so many, until none moves by more sigma
 _ROUNDS, _STAYS = 5, 0.1
 # a solution, its score tests, and stated values that it contradicts
@@ -148,7 +153,7 @@ def _fit(
     unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
     fast = quick_enough(task.model, task.data, unbiased)
     task = dataclasses.replace(task, model=fast)
-    task, ends = multistart.search_modes(task)
+    task, ends = _ends(task, frames.gain, cautions)
     task, ends = multistart.place_windows(task, ends)
     task, ends = _unrounded(task, ends, frames.gain)
     task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
@@ -178,6 +183,30 @@ def _refuse(
         leaning = (finding.words for finding in missing.score_test_text(score_tests))
         reasons = dict.fromkeys([*problems, *leaning])  # each once
         raise FitRefused("fit refused: " + "; ".join(reasons))
+
+
+def _ends(
+    task: SearchTask, gain: SensorNoise, cautions: list[str]
+) -> tuple[SearchTask, list[FitSolution]]:
+    """Modes of the usual parameters, or with ``EXTRA`` where these do not fit.
+
+    The extra parameters stay only where chi-square falls by 3 % or more.
+    """
+    task, ends = multistart.search_modes(task)
+    if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
+        return task, ends
+    extended = dataclasses.replace(task, free=(*task.free, *EXTRA))
+    begin = task.all_of(ends[0].value)
+    try:
+        wider = multistart.search_modes(extended, begins=[begin])
+    except FitError:
+        return task, ends
+    if wider[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
+        return task, ends
+    cautions.append(
+        f"the usual parameters did not explain the frames: {', '.join(EXTRA)} fitted too"
+    )
+    return wider
 
 
 def _unrounded(

@@ -146,11 +146,13 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     )
 
 
-def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
+def search_modes(
+    task: SearchTask, *, begins: Sequence[Array] = ()
+) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
     1. Short fits on a few frames, from the nominal lens, other global biases and
-       astigmatic wave fronts.
+       astigmatic wave fronts, or from ``begins``.
     2. The best of these to the end.
     3. Other promising ones, and mirrored starts, to the end.
 
@@ -159,7 +161,8 @@ def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """
     few = few_frames(task.model.setting)
     plain = starting_points(task)
-    first = _short(task.rough(), few, [*plain, *_leaning(plain[0])])
+    starts = list(begins) or [*plain, *_leaning(plain[0])]
+    first = _short(task.rough(), few, starts)
     task = hold_windows(task, first[0].value)
     best = refine_fit(task, first[0].value)
     floor = first[0].merit + _PROMISING
