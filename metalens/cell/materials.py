@@ -153,15 +153,16 @@ def index(material: record.Material | Material, wavelength_um: float) -> complex
         return complex(material.n, material.k)
     if isinstance(material, Blend):
         return _bruggeman(material, wavelength_um)
-    found = find_material(material) if isinstance(material, str) else material
-    low, high = found.range_um
+    constants = find_material(material) if isinstance(material, str) else material
+    low, high = constants.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(
-            f"{found.name} at {wavelength_um} um: its source holds from {low:.6g} to {high:.6g} um ({found.source}); "
-            f"choose a wavelength inside, another material{_table_hint(found.name, wavelength_um)}, or plain n and k"
+            f"{constants.name} at {wavelength_um} um: its source holds from {low:.6g} to "
+            f"{high:.6g} um ({constants.source}); choose a wavelength inside, another "
+            f"material{_table_hint(constants.name, wavelength_um)}, or plain n and k"
         )
-    k = found.k.at(wavelength_um) if found.k else 0.0
-    return complex(found.n.at(wavelength_um), max(0.0, k))
+    k = constants.k.at(wavelength_um) if constants.k else 0.0
+    return complex(constants.n.at(wavelength_um), max(0.0, k))
 
 
 def find_material(name: str) -> Material:

@@ -190,7 +190,7 @@ class Cell:
         )
 
     @property
-    def alike(self) -> bool:
+    def is_isotropic(self) -> bool:
         """Whether light along x and along y meets the same cell at normal incidence: a
         turn of less than half does.
         """

@@ -309,7 +309,7 @@ def _notes(pillars: PillarLibrary, failures: list[str]) -> list[str]:
     if (
         pillars.turned is None
         and pillars.polarization == ("x",)
-        and not pillars.cell.alike
+        and not pillars.cell.is_isotropic
     ):
         notes.append(
             "all of it for light along x: these pillars respond to light along y otherwise"

@@ -384,7 +384,7 @@ class Lens:
         """Polarisation that the proxy describes, in words, where pillars of one size
         respond differently to x and y; else empty.
         """
-        if self.hand or self.pairs is not None or self.cell.alike:
+        if self.hand or self.pairs is not None or self.cell.is_isotropic:
             return ""
         angled = self.proxy.max_angle_rad > 0
         return (

@@ -127,7 +127,7 @@ class _SweepRun:
         equally to both use x for s as well.
         """
         if not angle_deg and polarization in ("s", "p"):
-            along_y = polarization == "s" and not self.cell.alike
+            along_y = polarization == "s" and not self.cell.is_isotropic
             polarization = "y" if along_y else "x"
         return Incidence(wavelength_um, math.radians(angle_deg), polarization)
 

@@ -103,7 +103,8 @@ LOW = 32.0  # times the contrast: levels above are not diagonalised
 SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
 ROUNDS = 6  # of enlarging the trial space, at most
 STEPS = 80  # of the fixed point, at most
-SETTLED = 0.03  # change of the slow rows, over that of the last full step, until a next
+# change of the slow rows, over that of the last full step, at which the next follows
+RESUMED = 0.03
 SLOW = 8  # the rows of the lowest eighth of the levels go on alone
 # accuracy of a root in single precision, whose errors matter ten times less, and in
 # double
@@ -316,7 +317,7 @@ def matrix_root(
         e = correction.astype(kind)
         change = last = first = math.inf
         for step in range(STEPS):
-            whole = step == 0 or change < max(aim, SETTLED * last)
+            whole = step == 0 or change < max(aim, RESUMED * last)
             rows = slice(None if whole else slow)
             product = signed_square(e, mirror) if whole else e[:slow] @ e
             moved = offset[rows] - weight[rows] * product

@@ -589,7 +589,7 @@ def _is_square(problem: CellProblem) -> bool:
         and len(problem.classes[0]) == 4
         and problem.light.normal
         and problem.cell.lattice.kind == "square"
-        and problem.cell.alike
+        and problem.cell.is_isotropic
     )
 
 

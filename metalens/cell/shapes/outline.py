@@ -15,7 +15,7 @@ _EQUAL = 1e-9  # of the area: Fourier factors that differ less are the same
 _INSET = 1e-4  # of an edge, from its end
 _PROBES = np.array(
     [[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]]
-)  # over the radius, no two alike
+)  # over the radius, none equal
 _DIRECTIONS = np.stack(
     [np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1
 )
@@ -209,32 +209,19 @@ class Outline:
         return np.asarray(depth > 0)
 
     def keeps(self, flip_x: int, flip_y: int) -> bool:
-        """Whether (x, y) -> (flip_x x, flip_y y), flips +-1, leaves it as it is (judged
-        by its Fourier factors).
-        """
-        gx, gy = (_PROBES / self.radius_um).T
-        difference = np.abs(
-            self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)
-        ).max()
-        return bool(difference <= _EQUAL * self.area_um2)
+        """Whether (x, y) -> (flip_x x, flip_y y), flips +-1, leaves it as it is."""
+        return self._is_invariant(np.diag([flip_x, flip_y]))
 
     def repeats(self, turn_rad: float) -> bool:
-        """Whether a turn in the plane leaves it as it is (judged by its Fourier
-        factors).
-        """
-        gx, gy = (_PROBES / self.radius_um).T
+        """Whether a turn in the plane leaves it as it is."""
         c, s = math.cos(turn_rad), math.sin(turn_rad)
-        difference = np.abs(
-            self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)
-        ).max()
-        return bool(difference <= _EQUAL * self.area_um2)
+        return self._is_invariant(np.array([[c, -s], [s, c]]))
 
-    @property
-    def narrowest_um(self) -> float:
-        """Least width across, between parallel lines (of the outermost part, its
-        hollows filled).
-        """
-        return _least_width(self.parts[0].vertices(64))
+    def _is_invariant(self, matrix: Array) -> bool:
+        """Whether an orthogonal ``matrix`` leaves the Fourier factors as they are."""
+        g = (_PROBES / self.radius_um).T
+        difference = np.abs(self.fourier(*g) - self.fourier(*(matrix @ g))).max()
+        return bool(difference <= _EQUAL * self.area_um2)
 
     @property
     def spans_um(self) -> tuple[float, float]:
@@ -264,7 +251,10 @@ class Outline:
             for c, is_hollow in zip(parts[1:], hollow[1:], strict=True)
             if not is_hollow
         ]
-        solid, space = self.narrowest_um, min(holes, default=math.inf)
+        solid, space = (
+            _least_width(self.parts[0].vertices(64)),
+            min(holes, default=math.inf),
+        )
         for tip in (
             start[i] + _INSET * (end - start)[i],
             end[i] - _INSET * (end - start)[i],

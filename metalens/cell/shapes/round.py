@@ -33,7 +33,7 @@ class Circle:
 class Ellipse:
     """Its size is the axis along x before the turn; ratio: of the other axis to it.
 
-    angle_rad: in the plane, from +x towards +y. grow_um moves both axes alike (not
+    angle_rad: in the plane, from +x towards +y. grow_um moves both axes (not
     quite a parallel curve: the error
     is of second order in grow / axis).
     hole: an opening in a film. kind: of the shape.

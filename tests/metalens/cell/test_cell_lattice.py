@@ -85,15 +85,15 @@ def test_the_least_order_is_the_shortest_reciprocal_vector(lattice):
 
 def test_shapes_alike_along_x_and_y_follow_their_lattice():
     hexagonal = Lattice("hexagonal")
-    assert Cell(0.5, shape=Square()).alike
-    assert not Cell(0.5, shape=Rectangle(1.3)).alike
-    assert not Cell(0.5, shape=RegularPolygon(5)).alike
-    assert Cell(0.5, shape=RegularPolygon(6), lattice=hexagonal).alike
+    assert Cell(0.5, shape=Square()).is_isotropic
+    assert not Cell(0.5, shape=Rectangle(1.3)).is_isotropic
+    assert not Cell(0.5, shape=RegularPolygon(5)).is_isotropic
+    assert Cell(0.5, shape=RegularPolygon(6), lattice=hexagonal).is_isotropic
     assert Cell(
         0.5, shape=RegularPolygon(3, 0.2), lattice=hexagonal
-    ).alike  # by thirds of a turn
-    assert not Cell(0.5, shape=RegularPolygon(4), lattice=hexagonal).alike
-    assert not Cell(0.5, lattice=Lattice("rectangular", 1.2)).alike
+    ).is_isotropic  # by thirds of a turn
+    assert not Cell(0.5, shape=RegularPolygon(4), lattice=hexagonal).is_isotropic
+    assert not Cell(0.5, lattice=Lattice("rectangular", 1.2)).is_isotropic
 
 
 def test_sections_that_grow_in_closed_form():
