@@ -315,7 +315,7 @@ def _wave(lens: Lens, response: Sensitivity, x: Array) -> Array:
         radius2, distance + float(x[PLACE["distance_um"]])
     ) - path_difference(radius2, distance)
     wave = made.as_built_transmission(lens, response, x)
-    return wave * np.exp(2j * np.pi / lens.wavelength_um * defocus_um)
+    return np.asarray(wave * np.exp(2j * np.pi / lens.wavelength_um * defocus_um))
 
 
 def loss_reason(before: PredictedLens, after: PredictedLens) -> str:
