@@ -3,6 +3,7 @@ the lens.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -104,11 +105,14 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout:
     while True:
         parts = min(parts, most_parts)
         rows = window_tiles(case, parts)[1]
-        corners = {
-            _mirrored(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
-        }
+        tiles = [tile for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])]
+        # the tile below the lens is seen under the largest angle
+        tiles.append(
+            min(itertools.chain(*rows), key=lambda t: math.hypot(*t.centre_um))
+        )
+        judged = {_mirrored(tile) for tile in tiles}
         try:
-            sizes = _largest_counts([node_counts(tile, tolerance) for tile in corners])
+            sizes = _largest_counts([node_counts(tile, tolerance) for tile in judged])
         except PropagationError:
             if parts == most_parts:
                 raise

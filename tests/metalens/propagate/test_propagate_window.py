@@ -201,6 +201,24 @@ def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
     check(*lens((64, 64), distance=20.0), tolerance=1e-4, **geometry)
 
 
+@pytest.mark.parametrize(
+    ("window_um", "offset_um"), [(900.0, (0.0, 0.0)), (500.0, (200.0, -50.0))]
+)
+def test_a_window_that_is_wide_for_its_distance(window_um, offset_um):
+    """The middle of the window is seen under a larger angle than its corners."""
+    phase, level = lens((38, 41), kind="random")
+    _, error = compare(
+        phase,
+        level,
+        tolerance=1e-3,
+        sensor_distance_um=300.0,
+        window_um=window_um,
+        samples=45,
+        offset_um=offset_um,
+    )
+    assert error < 1e-3
+
+
 @pytest.mark.slow
 def test_a_window_too_large_for_the_windowed_method_goes_by_transforms():
     geometry = dict(pitch_um=3.0, sensor_distance_um=3000.0, window_um=800.0, samples=6)
