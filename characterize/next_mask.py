@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import AsBuilt
-from characterize.model import PLACE, made, parameter_vector, process_state_of
+from characterize.model import PLACE, as_built, parameter_vector, process_state_of
 from metalens import lens as lenses
 from metalens.core import store
 from metalens.core.arrays import Array
@@ -314,7 +314,7 @@ def _wave(lens: Lens, response: Sensitivity, x: Array) -> Array:
     defocus_um = path_difference(
         radius2, distance + float(x[PLACE["distance_um"]])
     ) - path_difference(radius2, distance)
-    wave = made.as_built_transmission(lens, response, x)
+    wave = as_built.as_built_transmission(lens, response, x)
     return np.asarray(wave * np.exp(2j * np.pi / lens.wavelength_um * defocus_um))
 
 

@@ -274,6 +274,6 @@ def test_fields_and_roles_of_docstrings_are_set_as_lists_and_links():
     )  # a bare name is no place of the reference
     assert ":func:" not in maker.docstring.value
     stack = griffe.load(
-        "metalens.psf.of_lens", search_paths=[str(ROOT)], extensions=extensions
+        "metalens.psf.lens_psfs", search_paths=[str(ROOT)], extensions=extensions
     )["View"]
     assert "[`metalens.psf.psf_stack`][metalens.psf.psf_stack]" in stack.docstring.value

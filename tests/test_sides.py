@@ -14,7 +14,12 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from characterize import next_mask
-from characterize.model import made, parameter_vector, pillar_slopes, process_state_of
+from characterize.model import (
+    as_built,
+    parameter_vector,
+    pillar_slopes,
+    process_state_of,
+)
 from codesign.evaluate.error_budget import BudgetInputs, ErrorBudget, scatter_rad
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
@@ -109,7 +114,7 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
         lens, **{name: 1e-3 * change.get(row, 0.0) for name, row in amounts.items()}
     )
     got = seen(
-        lens, made.as_built_transmission(lens, response, parameter_vector(change))
+        lens, as_built.as_built_transmission(lens, response, parameter_vector(change))
     )
     before = seen(lens, anew(lens))
     want = seen(lens, truth)
@@ -120,12 +125,12 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
 def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_order(
     lens, response
 ):
-    still = made.as_built_transmission(
+    still = as_built.as_built_transmission(
         lens, response, parameter_vector({"turn_deg": 1.5})
     )
     assert (
         np.abs(
-            still - made.as_built_transmission(lens, response, parameter_vector())
+            still - as_built.as_built_transmission(lens, response, parameter_vector())
         ).max()
         < 1e-9
     )
@@ -196,7 +201,7 @@ def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response
     known = parameter_vector({"bias_nm": 8.0, "bias_x_nm": -5.0, "width_nm": 3.0})
     ready = MadeLens(lens, OpticsConfig(), response=response)
     side = ready._block
-    t = made.as_built_transmission(lens, response, known) * ready._carrier
+    t = as_built.as_built_transmission(lens, response, known) * ready._carrier
     rows, columns = (n // side * side for n in t.shape)
     built = (lens.diameters.diameter_um > 0)[:rows, :columns]
     blocks = rows // side, side, columns // side, side

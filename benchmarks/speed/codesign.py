@@ -14,13 +14,13 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks import Row, fastest
 from benchmarks.peers import mobilenet_v3
 from codesign.batches import pool
-from codesign.batches.flat import depth_um, flatten_layers, sensor_irradiance
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import EyeScenes, SceneConfig
+from codesign.batches.surface_frames import depth_um, flatten_layers, sensor_irradiance
 from codesign.network import architecture, blur, cost
 from codesign.network.architecture import Architecture, SearchSpace
 from codesign.network.supernet import Supernet
-from codesign.optics import formed
+from codesign.optics import image_formation
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from codesign.train import make_model
@@ -392,7 +392,9 @@ def _data(made: pool.FramePool, of: OpticsConfig) -> float:
     scenes = PoolScenes(made, 16, 0.2, 0)
     pitch = torch.tensor(9.0, dtype=torch.float64)
     noise = torch.Generator()
-    lens = formed.make_imager(of, torch.zeros(35, dtype=torch.float64), 160, margin=16)
+    lens = image_formation.make_imager(
+        of, torch.zeros(35, dtype=torch.float64), 160, margin=16
+    )
 
     @torch.no_grad()
     def work() -> None:
@@ -414,7 +416,7 @@ def _anew(of: OpticsConfig) -> float:
         torch.full((35,), 0.01 * n, dtype=torch.float64) for n in range(1, 9)
     )  # none is formed twice
     seconds = fastest(
-        lambda: formed.make_imager(of, next(places), 160, margin=16), repeats=2
+        lambda: image_formation.make_imager(of, next(places), 160, margin=16), repeats=2
     )
     return seconds / (InnerConfig().refresh * BATCH)
 

@@ -13,7 +13,7 @@ from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
 from metalens.image import Frames, Grid, Optics, PillarWave, SmoothWave, Window, imager
-from metalens.image.left_out import JudgedPsfs, polarisation_error, transform_error
+from metalens.image.model_error import JudgedPsfs, polarisation_error, transform_error
 from metalens.image.plan import sum_over_spectrum
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy

@@ -285,7 +285,7 @@ def _command_rows(target: Path) -> list[Row]:
 
 def _certificate_rows(target: Path) -> list[Row]:
     """8.7 million pillars with corrected doses, written, read back and exposed again."""
-    from layout.formats import handover
+    from layout.formats import job_files
     from layout.process.process import ExposureSettings, Process
     from layout.verify.exposure import verify_exposure
 
@@ -293,9 +293,9 @@ def _certificate_rows(target: Path) -> list[Row]:
     bare = layout.plan(_lens(1.0, 0.3).diameters, process, furnished=False)
     plan = layout.correct(bare, process.exposure)
     layout.write_gdsii(plan, target / "c.gds")
-    handover.write_dose_table(plan, process, target / "c.csv")
+    job_files.write_dose_table(plan, process, target / "c.csv")
     content = layout.read_gdsii(target / "c.gds")
-    table = handover.read_dose_table(target / "c.csv")
+    table = job_files.read_dose_table(target / "c.csv")
     found = verify_exposure(content, plan, table, process)
     seconds, peak = measured(
         lambda: verify_exposure(content, plan, table, process), repeats=1

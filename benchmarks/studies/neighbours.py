@@ -6,7 +6,7 @@ nm, and one of NA 0.4: the 62
 pillars along a diameter, repeated across, are one cell of RCWA (a cylinder lens), for
 light along the cut and across
 it. The predicted light is that of the maps that ``psf_stack`` takes
-(:mod:`metalens.psf.among`), pillar by pillar. No
+(:mod:`metalens.psf.neighbour_coupling`), pillar by pillar. No
 times to quote: rows and cut are solved at the same two orders per pillar, where
 truncation all but cancels.
 """
@@ -28,7 +28,7 @@ from metalens.core import config
 from metalens.core.arrays import Array
 from metalens.design.neighbours import drawn_diameter_range, estimate_neighbour_coupling
 from metalens.lens import Lens, NeighbourRows
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 from metalens.rcwa import solve_row
 
 FILE = Path(__file__).parents[2] / "examples" / "cells" / "tio2_532.toml"
@@ -204,7 +204,7 @@ def factor(lens: Lens, found: NeighbourRows, place: int) -> Array:
     the cut.
     """
     phase = torch.as_tensor(np.tile(_phase(lens), (9, 1)))
-    made = among.apply_jones_coupling(
+    made = neighbour_coupling.apply_jones_coupling(
         phase, torch.ones_like(phase), found, lens.cell.pitch_um
     )
     return np.asarray((made.xx if place == 0 else made.yy)[4].numpy())

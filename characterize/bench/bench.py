@@ -15,10 +15,10 @@ from characterize.model import (
     FilmStack,
     KnownValue,
     SpectralLine,
+    as_built,
     extra_path,
     incidence_rad,
     light_maps,
-    made,
     parameter_vector,
 )
 from metalens import psf
@@ -204,7 +204,7 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
         for incidence, index in _frame_groups(lens, truth, colour, depth, angles):
-            transmission = made.as_built_transmission(
+            transmission = as_built.as_built_transmission(
                 lens,
                 response,
                 colour,

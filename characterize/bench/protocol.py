@@ -14,8 +14,8 @@ from characterize.inference import (
     SearchTask,
     UnmodelledShifts,
     invert_information,
-    missing,
     uncertainty,
+    unmodelled_effects,
 )
 from characterize.model import (
     NAMES,
@@ -237,7 +237,7 @@ def _unstated_shifts(
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
-    return missing.expected_score_tests(
+    return unmodelled_effects.expected_score_tests(
         SearchTask(model, data, x, known, None, free, sizes)
     )
 

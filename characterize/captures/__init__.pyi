@@ -1,9 +1,9 @@
 from . import capture as capture
+from .calibration import ElectronFrames as ElectronFrames
+from .calibration import SensorNoise as SensorNoise
+from .calibration import merge_brackets as merge_brackets
+from .calibration import to_electrons as to_electrons
 from .capture import Capture as Capture
-from .electrons import ElectronFrames as ElectronFrames
-from .electrons import SensorNoise as SensorNoise
-from .electrons import merge_brackets as merge_brackets
-from .electrons import to_electrons as to_electrons
 from .frames import MIRRORED as MIRRORED
 from .frames import TURNS as TURNS
 from .frames import FrameSpectra as FrameSpectra

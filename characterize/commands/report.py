@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.inference import AsBuilt, invert_information, knowable
+from characterize.inference import AsBuilt, identifiability, invert_information
 from characterize.model import PARAMETERS, PLACE
 from characterize.pupil import PupilFit
 from metalens.core import report, store
@@ -196,13 +196,15 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
         axis.plot(
             grid,
-            knowable.profile_density(_widened_profile(result, name, curve), grid),
+            identifiability.profile_density(
+                _widened_profile(result, name, curve), grid
+            ),
             color="#1f6feb",
             linewidth=1.2,
         )
         axis.plot(
             grid,
-            knowable.profile_density(curve, grid),
+            identifiability.profile_density(curve, grid),
             color="#1f6feb",
             linewidth=0.6,
             linestyle=(0, (3, 2)),

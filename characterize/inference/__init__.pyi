@@ -1,8 +1,8 @@
 from . import asbuilt as asbuilt
-from . import knowable as knowable
+from . import identifiability as identifiability
 from . import leastsquares as leastsquares
-from . import missing as missing
 from . import uncertainty as uncertainty
+from . import unmodelled_effects as unmodelled_effects
 from .asbuilt import AsBuilt as AsBuilt
 from .estimate import FitOptions as FitOptions
 from .estimate import fit as fit
@@ -11,5 +11,5 @@ from .leastsquares import FitSolution as FitSolution
 from .leastsquares import GaussianPrior as GaussianPrior
 from .leastsquares import SolverSettings as SolverSettings
 from .leastsquares import invert_information as invert_information
-from .missing import UnmodelledShifts as UnmodelledShifts
 from .multistart import SearchTask as SearchTask
+from .unmodelled_effects import UnmodelledShifts as UnmodelledShifts

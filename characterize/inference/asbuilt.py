@@ -11,7 +11,7 @@ from characterize.inference.leastsquares import gaussian_draws
 from characterize.model import (
     PLACE,
     FrameSetting,
-    made,
+    as_built,
     parameter_vector,
     required_oversampling,
     true_depth,
@@ -201,7 +201,7 @@ class AsBuilt:
         """The lens with as-built diameters and distance; ``value`` as one row of
         :meth:`samples`.
         """
-        return made.built_lens(self.design, self.parameters(value))
+        return as_built.built_lens(self.design, self.parameters(value))
 
     @property
     def diameters(self) -> DiameterMap:
@@ -212,7 +212,7 @@ class AsBuilt:
         """(y, x) complex transmission of every as-built pillar at normal incidence,
         wave-front errors included.
         """
-        return made.as_built_transmission(
+        return as_built.as_built_transmission(
             self.design, self.response, self.parameters(value)
         )
 
@@ -264,7 +264,7 @@ class AsBuilt:
             for name in ("decentre_x_um", "decentre_y_um")
         )
         more: dict[str, Any] = {"offset_um": (dx, dy), "tolerance": tolerance}
-        return made.psf_stack(self.design, self.response, x, view, **more)
+        return as_built.psf_stack(self.design, self.response, x, view, **more)
 
     def psf_posterior(self, view: "psfs.View", *, draws: int = 8) -> float:
         """Relative L2 error of :meth:`psf_stack` from the uncertainty of the lens.

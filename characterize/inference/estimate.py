@@ -10,21 +10,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.captures import Capture, SensorNoise, to_electrons
-from characterize.inference import knowable, missing, multistart, uncertainty, verdict
-from characterize.inference.arrange import (
+from characterize.inference import (
+    identifiability,
+    multistart,
+    uncertainty,
+    unmodelled_effects,
+    verdict,
+)
+from characterize.inference.asbuilt import AsBuilt, WithinModel
+from characterize.inference.frame_alignment import (
     FrameArrangement,
     arrangement_text,
     find_arrangement,
     rearrange_frames,
 )
-from characterize.inference.asbuilt import AsBuilt, WithinModel
 from characterize.inference.leastsquares import FitSolution, gaussian_draws
-from characterize.inference.missing import (
-    ResidualFinding,
-    ScoreTest,
-    ScoreTests,
-    UnmodelledShifts,
-)
 from characterize.inference.multistart import SearchTask, with_values
 from characterize.inference.prepare import (
     check_depths,
@@ -38,6 +38,12 @@ from characterize.inference.prepare import (
     stated_priors,
 )
 from characterize.inference.uncertainty import FitPosterior
+from characterize.inference.unmodelled_effects import (
+    ResidualFinding,
+    ScoreTest,
+    ScoreTests,
+    UnmodelledShifts,
+)
 from characterize.model import (
     NAMES,
     PLACE,
@@ -162,7 +168,11 @@ def _fit(
     posterior = uncertainty.explore_posterior(task, ends, frames.gain)
     doubts = looked[2] if looked else []
     if looked is None or posterior.best is not looked[0]:
-        looked = posterior.best, missing.run_score_tests(task, posterior.best), doubts
+        looked = (
+            posterior.best,
+            unmodelled_effects.run_score_tests(task, posterior.best),
+            doubts,
+        )
     cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
     result = _result(capture, task, posterior, cautions, frames.gain, looked)
     _refuse(result.problems, options, score_tests)
@@ -180,7 +190,9 @@ def _refuse(
 ) -> None:
     """Raise FitRefused with the problems and the causes the residuals lean to."""
     if problems and not options.insist:
-        leaning = (finding.words for finding in missing.score_test_text(score_tests))
+        leaning = (
+            finding.words for finding in unmodelled_effects.score_test_text(score_tests)
+        )
         reasons = dict.fromkeys([*problems, *leaning])  # each once
         raise FitRefused("fit refused: " + "; ".join(reasons))
 
@@ -236,7 +248,7 @@ def _unrounded(
 def _with_likely_causes(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
 ) -> tuple[SearchTask, list[FitSolution], Looked | None]:
-    """The task with the parameters of likely causes (:func:`missing.to_fit`) freed.
+    """The task with the parameters of likely causes (:func:`unmodelled_effects.to_fit`) freed.
 
     At most four, one after the other, each the largest fall of the misfit.
 
@@ -246,7 +258,7 @@ def _with_likely_causes(
     """
     if not gain.known:
         return task, ends, None
-    tests = missing.run_score_tests(task, ends[0])
+    tests = unmodelled_effects.run_score_tests(task, ends[0])
     doubts = list[ResidualFinding]()
     for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
@@ -266,7 +278,7 @@ def _with_likely_causes(
         )
         doubts += _contradicted(cause, falls)
         task, ends = extended, wider
-        tests = missing.run_score_tests(task, ends[0])
+        tests = unmodelled_effects.run_score_tests(task, ends[0])
     return task, ends, (ends[0], tests, doubts)
 
 
@@ -284,7 +296,7 @@ def _falls(
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
-    for cause in missing.to_fit(score_tests, stuck=stuck):
+    for cause in unmodelled_effects.to_fit(score_tests, stuck=stuck):
         fall = best.merit - multistart.merit_with(task, best, cause.frees)
         if fall > (out_of_bounds if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
@@ -394,19 +406,21 @@ def _result(
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(
-            knowable.identifiable_combinations(
+            identifiability.identifiable_combinations(
                 names, solution.information, task.prior.sigma
             )
         ),
         degeneracies=(
             *uncertainty.posterior_text(names, posterior),
-            *knowable.correlated_pairs(names, posterior.covariance, task.prior.sigma),
+            *identifiability.correlated_pairs(
+                names, posterior.covariance, task.prior.sigma
+            ),
         ),
         cautions=tuple(cautions),
         problems=(
             *_problems(task, solution, gain),
             *verdict.held_back(names, solution, task.prior),
-            *missing.decisive_findings(findings),
+            *unmodelled_effects.decisive_findings(findings),
         ),
         low=low,
         high=high,
@@ -469,7 +483,7 @@ def _findings(
     structure = verdict.correlated_residuals_text(
         np.where(data.saturated, 0.0, residual), shared
     )
-    return [*structure, *missing.score_test_text(looked.tests)]
+    return [*structure, *unmodelled_effects.score_test_text(looked.tests)]
 
 
 def _problems(task: SearchTask, solution: FitSolution, gain: SensorNoise) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from characterize.captures import relative_orientation
 from characterize.inference import leastsquares
-from characterize.inference.arrange import FrameArrangement, few_frames
+from characterize.inference.frame_alignment import FrameArrangement, few_frames
 from characterize.inference.leastsquares import (
     FitImages,
     FitProblem,

@@ -15,9 +15,9 @@ from characterize.inference.leastsquares import (
     GaussianPrior,
     SolverSettings,
 )
-from characterize.inference.missing import ResidualFinding
 from characterize.inference.multistart import WAVES_RAD, SearchTask
 from characterize.inference.uncertainty import FitPosterior
+from characterize.inference.unmodelled_effects import ResidualFinding
 from characterize.model import FitParameter, KnownValue, background_planes
 from metalens.core import threads
 from metalens.core.arrays import Array

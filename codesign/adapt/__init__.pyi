@@ -1,5 +1,5 @@
 from . import report as report
-from . import retrained as retrained
+from . import retrained_network as retrained_network
 from . import source as source
 from . import train as train
 from .source import FinishedRun as FinishedRun

@@ -14,7 +14,7 @@ from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
 from codesign.adapt.source import FinishedRun, check_lens, lens_file, load_finished_run
 from codesign.batches import TEST, FrameBatch
-from codesign.optics import MadeLens, PixelPsfStack, built
+from codesign.optics import MadeLens, PixelPsfStack, as_built_lens
 from codesign.settings import RetrainConfig
 from codesign.train import (
     InnerConfig,
@@ -175,7 +175,7 @@ def lens_psfs(
         truth: lens of a virtual bench; None of a real one.
     """
     rows = list(
-        built.posterior_parameters(
+        as_built_lens.posterior_parameters(
             result, config.draws + config.judge, seed=config.seed
         )
     )

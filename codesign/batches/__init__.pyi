@@ -2,10 +2,6 @@ from . import parallel as parallel
 from .batch import EyePose as EyePose
 from .batch import FrameBatch as FrameBatch
 from .batch import SceneSource as SceneSource
-from .flat import SingleSurfaceFrames as SingleSurfaceFrames
-from .flat import depth_um as depth_um
-from .flat import frame_samples as frame_samples
-from .flat import sensor_irradiance as sensor_irradiance
 from .pool import FramePool as FramePool
 from .pool import PoolScenes as PoolScenes
 from .pool import render_pool as render_pool
@@ -20,3 +16,7 @@ from .scenes import as_batch as as_batch
 from .scenes import augmented_frames as augmented_frames
 from .scenes import draw_depth_scales as draw_depth_scales
 from .scenes import widen_motion as widen_motion
+from .surface_frames import SingleSurfaceFrames as SingleSurfaceFrames
+from .surface_frames import depth_um as depth_um
+from .surface_frames import frame_samples as frame_samples
+from .surface_frames import sensor_irradiance as sensor_irradiance

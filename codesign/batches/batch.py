@@ -6,7 +6,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from codesign.batches.flat import SingleSurfaceFrames
+from codesign.batches.surface_frames import SingleSurfaceFrames
 from metalens.image import Frames
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from codesign.batches.batch import FrameBatch
-from codesign.batches.flat import SingleSurfaceFrames
+from codesign.batches.surface_frames import SingleSurfaceFrames
 from metalens.core.errors import TrainingError
 from metalens.image import Frames
 

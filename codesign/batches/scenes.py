@@ -60,7 +60,7 @@ class SceneConfig:
         the lids. 1 is the population as
         published, bare; from there to 2 and more come spectacles with reflections,
         make-up, uneven light, shadows
-        and movement (:mod:`codesign.eye.worn`): for faces and lamps that nobody
+        and movement (:mod:`codesign.eye.appearance`): for faces and lamps that nobody
         modelled.
     pool: frames that training draws from again and again, at another scale each time; 0
     renders every frame anew.
@@ -208,7 +208,7 @@ def augmented_frames(
     variety: float,
     seed: tuple[int, ...],
 ) -> RenderedFrames:
-    """Rendered frames with random augmentations of :mod:`codesign.eye.worn`.
+    """Rendered frames with random augmentations of :mod:`codesign.eye.appearance`.
 
     Without any up to variety 1.
 

@@ -14,7 +14,7 @@ from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
 from codesign.network import Subnet
-from codesign.optics import formed
+from codesign.optics import image_formation
 from codesign.optics import stack as trained
 from codesign.settings import Part
 from codesign.train import (
@@ -75,7 +75,7 @@ def run(options: Options) -> int:
     note = f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
     return options.console.judged(
         values,
-        f"{_table(rows)}\n{formed.describe_image_text(image)}\n{note}",
+        f"{_table(rows)}\n{image_formation.describe_image_text(image)}\n{note}",
         [image["above"]],
     )
 
@@ -159,12 +159,12 @@ def _of_pitch(codesign_run: CodesignRun, limit_um: float) -> str:
 
 def _image_record(codesign_run: CodesignRun) -> dict[str, Any]:
     """Image model of a run and its error:
-    :func:`codesign.optics.formed.describe_image`.
+    :func:`codesign.optics.image_formation.describe_image`.
     """
     settings = codesign_run.settings
     side = settings.scenes.pixels + 2 * settings.scenes.margin
     coefficients = codesign_run.trainer.model.coefficients_rad.detach()
-    return formed.describe_image(
+    return image_formation.describe_image(
         settings.optics, coefficients, side, margin=settings.scenes.margin
     )
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import FinishedRun, retrained
+from codesign.adapt import FinishedRun, retrained_network
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import AXIAL, LATERAL, RunResult, plots, run_experiment
 from codesign.gaze import PopulationPrior, people_file
-from codesign.optics import formed
+from codesign.optics import image_formation
 from codesign.settings import ExperimentConfig
 from codesign.train import bootstrap_interval, bootstrap_ratio
 from metalens.core import config as settings
@@ -47,7 +47,7 @@ def run(options: Options) -> int:
         )
     folder = options.output
     config = options.settings
-    sources = [retrained.load_retrained(path) for path in options.runs]
+    sources = [retrained_network.load_retrained(path) for path in options.runs]
     with options.claim_folder(folder) as draft:
         results: list[RunResult] = []
         steps = run_experiment(sources, config, names=names)
@@ -56,7 +56,7 @@ def run(options: Options) -> int:
         ):
             results = latest
         lenses = {
-            name: retrained.lens_of(path)
+            name: retrained_network.lens_of(path)
             for name, path in zip(names, options.runs, strict=True)
         }
         values = experiment_summary(results, config) | {
@@ -107,7 +107,7 @@ def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, An
     """
     return {
         name: json.loads(
-            (retrained.run_of(folder) / "result.json").read_text("utf-8")
+            (retrained_network.run_of(folder) / "result.json").read_text("utf-8")
         ).get("image")
         for name, folder in zip(names, folders, strict=True)
     }
@@ -255,7 +255,7 @@ def experiment_text(values: dict[str, Any]) -> str:
         values: content of experiment.json.
     """
     images = [
-        f"{name}: {formed.describe_image_text(image)}"
+        f"{name}: {image_formation.describe_image_text(image)}"
         for name, image in values["images"].items()
         if image
     ]

@@ -13,7 +13,12 @@ from characterize.inference import asbuilt
 from codesign.adapt import FinishedRun, LensPsfs, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
-from codesign.adapt.retrained import RECIPE, RESULT, RetrainingRecipe, relative_inputs
+from codesign.adapt.retrained_network import (
+    RECIPE,
+    RESULT,
+    RetrainingRecipe,
+    relative_inputs,
+)
 from codesign.adapt.source import check_lens, load_finished_run
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options

@@ -9,7 +9,7 @@ import torch
 
 from codesign.batches import augmented_frames, widen_motion
 from codesign.commands.options.scene import Options
-from codesign.evaluate import imaged
+from codesign.evaluate import scene_image
 from codesign.eye import (
     CameraRig,
     MotionRanges,
@@ -148,7 +148,7 @@ def run(options: Options) -> int:
                 settings.seed,
             )
             images = _image_frames(settings, lens, options.fwhm_nm)
-            imaged.write_images(draft.path, images, provenance)
+            scene_image.write_images(draft.path, images, provenance)
             values |= {"image_error": images.error, "light": images.light}
             failures.append(images.problem)
             summary += f"\n{images.error:.2g} of a texture is the error of the image: {folder}/image.png{images.light}"
@@ -178,9 +178,9 @@ def _render_and_write(settings: SceneSettings, folder: Path) -> int:
 
 def _image_frames(
     settings: SceneSettings, lens: Lens, fwhm_nm: float
-) -> imaged.ImagedFrames:
+) -> scene_image.ImagedFrames:
     """First frames imaged by a lens over its field."""
-    count = min(settings.frames, imaged.FRAMES)
+    count = min(settings.frames, scene_image.FRAMES)
     states = dataset.states_at(
         torch.arange(count), settings.seed, motion=settings.motion
     )
@@ -191,7 +191,7 @@ def _image_frames(
         )
 
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
-    return imaged.image_first_frames(
+    return scene_image.image_first_frames(
         lens, camera, settings.rig, render_with, fwhm_nm=fwhm_nm
     )
 

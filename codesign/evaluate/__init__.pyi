@@ -1,11 +1,11 @@
 from . import error_budget as error_budget
 from . import field_page as field_page
 from . import gaze_experiment as gaze_experiment
-from . import imaged as imaged
 from . import optics as optics
 from . import paper as paper
 from . import plots as plots
 from . import reader as reader
+from . import scene_image as scene_image
 from .field_page import FieldSetting as FieldSetting
 from .gaze_experiment import AXIAL as AXIAL
 from .gaze_experiment import LATERAL as LATERAL

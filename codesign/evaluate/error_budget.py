@@ -14,7 +14,7 @@ from codesign.batches import EXPERIMENT
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.eye import PinholeCamera, RenderedFrames, render
 from codesign.gaze import NetworkReadings, PersonCalibrator, angle_deg
-from codesign.optics import MadeLens, OpticsConfig, formed
+from codesign.optics import MadeLens, OpticsConfig, image_formation
 from codesign.settings import ExperimentConfig
 from metalens.cell import Incidence
 from metalens.core.arrays import Array
@@ -24,7 +24,7 @@ from metalens.fabrication import Printed, State, draw_lenses
 from metalens.image import Imager, Optics, node_light, normalise_psfs, with_psfs
 from metalens.lens import Lens, NeighbourRows
 from metalens.library import PillarLibrary, engines
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 
 NONE = math.nan
 TOTAL, MEASURED = "all links", "measured, all at once"
@@ -367,7 +367,7 @@ class ErrorBudget:
             frame = scenes.pixels + 2 * margin
             self.reading = NetworkReading(given.run, given.frames)
             self.smooth_rad = trainer.model.coefficients_rad.detach()
-            self.smooth = formed.make_imager(
+            self.smooth = image_formation.make_imager(
                 self.settings, self.smooth_rad, frame, margin=margin
             )
         self.made = MadeLens(lens, self.settings)
@@ -377,7 +377,7 @@ class ErrorBudget:
         self.base = self._pillars(self.made, State.of(), self.coupling)
         plane = self.made.plane(State.of(), factor=self.coupling)
         self.optics = Optics(plane, lens.layers, lens.sensor_distance_um)
-        self.image = formed.imager_through(
+        self.image = image_formation.imager_through(
             self.settings, self.optics, frame, margin=margin
         )
 
@@ -417,7 +417,7 @@ class ErrorBudget:
         """(y, x) complex factor on every pillar by coupling to unequal neighbours."""
         alone = self.made.pillars(State.of())
         pitch = self.lens.diameters.pitch_um
-        return np.asarray(among.mean_coupling(alone, rows, pitch).numpy())
+        return np.asarray(neighbour_coupling.mean_coupling(alone, rows, pitch).numpy())
 
     def _entry(
         self, link: str, image: Imager, method: str, *, phase_rad: float = NONE,
@@ -472,7 +472,7 @@ class ErrorBudget:
             method = (
                 "pillars of the lens file; training had a smooth phase without films"
             )
-            smooth = formed.optics_of(self.settings, self.smooth_rad)
+            smooth = image_formation.optics_of(self.settings, self.smooth_rad)
             base = image_through(smooth, self.image)
             yield self._entry("pillars on a lattice", self.image, method, base=base)
         layers = self.lens.layers

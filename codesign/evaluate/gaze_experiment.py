@@ -30,7 +30,7 @@ from codesign.gaze import (
     face_angles,
     shared,
 )
-from codesign.optics import OpticsConfig, formed
+from codesign.optics import OpticsConfig, image_formation
 from codesign.settings import ExperimentConfig
 from codesign.train import Predictions, SensorFrames, assess
 from metalens.core.arrays import Array
@@ -364,7 +364,7 @@ def run_experiment(
         if predictions[i][1]:
             fine = _result(name, source, predictions[i][1], *about)
         settings = source.run.trainer.optics
-        above = formed.image_tolerance_problem(settings, images[i][0])
+        above = image_formation.image_tolerance_problem(settings, images[i][0])
         results.append(replace(result, above=above, finer=fine))
     yield config.subjects, results
 
@@ -471,7 +471,7 @@ def finer_imager(source: FinishedRun) -> Imager | None:
 def _imager_of(source: FinishedRun, settings: OpticsConfig) -> Imager:
     """Imager of the lens of a run or retraining, formed as the settings say."""
     scenes = source.settings.scenes
-    return formed.make_imager(
+    return image_formation.make_imager(
         settings,
         source.run.trainer.model.coefficients_rad,
         scenes.pixels + 2 * scenes.margin,

@@ -22,7 +22,7 @@ from codesign.batches import (
     render_pool,
     sensor_irradiance,
 )
-from codesign.evaluate.imaged import lens_imager, margin_of
+from codesign.evaluate.scene_image import lens_imager, margin_of
 from codesign.eye import PinholeCamera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch

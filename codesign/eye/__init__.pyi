@@ -4,6 +4,12 @@ from . import model as model
 from . import population as population
 from . import renderer as renderer
 from . import textures as textures
+from .appearance import CAUSES as CAUSES
+from .appearance import DrawnAugmentations as DrawnAugmentations
+from .appearance import apply_augmentations as apply_augmentations
+from .appearance import draw_augmentations as draw_augmentations
+from .appearance import drawn_of_people as drawn_of_people
+from .appearance import render_dressed as render_dressed
 from .dataset import moved_states as moved_states
 from .dataset import states_at as states_at
 from .population import POPULATION as POPULATION
@@ -18,9 +24,3 @@ from .renderer import FrameLabels as FrameLabels
 from .renderer import PinholeCamera as PinholeCamera
 from .renderer import RenderedFrames as RenderedFrames
 from .renderer import render as render
-from .worn import CAUSES as CAUSES
-from .worn import DrawnAugmentations as DrawnAugmentations
-from .worn import apply_augmentations as apply_augmentations
-from .worn import draw_augmentations as draw_augmentations
-from .worn import drawn_of_people as drawn_of_people
-from .worn import render_dressed as render_dressed

@@ -28,7 +28,7 @@ from codesign.network.cost import (
     SLIP_HIDDEN,
     lateral_strides,
 )
-from codesign.network.running import RunningNorm
+from codesign.network.frozen_norm import RunningNorm
 from codesign.network.windows import resample_image
 from metalens.core.errors import TrainingError
 
@@ -410,7 +410,7 @@ def recalibrate_batch_norm(
     """Measure the batch statistics of one architecture anew on given batches, in place.
 
     Leaves the network in evaluation mode. Running means
-    (:class:`codesign.network.running.RunningNorm`) belong to all architectures and
+    (:class:`codesign.network.frozen_norm.RunningNorm`) belong to all architectures and
     stay.
 
     Args:

@@ -28,7 +28,7 @@ from codesign.network import (
     losses,
     recalibrate_batch_norm,
 )
-from codesign.optics import OpticsConfig, PixelPsfStack, formed
+from codesign.optics import OpticsConfig, PixelPsfStack, image_formation
 from codesign.train.imaging import frame_wide, read_out
 from codesign.train.trainer import InnerConfig, Trainer
 from metalens.core.arrays import Array
@@ -45,7 +45,7 @@ class SensorFrames:
     wide: the frame's width over the image's (:func:`frame_wide`).
     vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`.
     above: why the error of their images is above ``optics.image_tolerance``
-    (:func:`codesign.optics.formed.image_tolerance_problem`); empty where it is not.
+    (:func:`codesign.optics.image_formation.image_tolerance_problem`); empty where it is not.
     """
 
     frames: Tensor
@@ -166,7 +166,7 @@ def sensor_frames(
         batch = scenes.batch(number, trainer.inner.batch)
         if shift_um:
             batch = replace(batch, frames=displace_frames(batch.frames, shift_um))
-        imager = imager or formed.make_imager(
+        imager = imager or image_formation.make_imager(
             optics,
             trainer.model.coefficients_rad,
             frame_samples(batch.frames),
@@ -180,7 +180,7 @@ def sensor_frames(
         name: torch.cat([getattr(part, name) for part in parts])
         for name in ("frames", "mask", "slip_mm", "vergence")
     }
-    above = formed.image_tolerance_problem(optics, imager) if imager else ""
+    above = image_formation.image_tolerance_problem(optics, imager) if imager else ""
     return replace(parts[0], **joined, above=above)
 
 

@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 
 from codesign.batches import parallel
-from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack, formed
+from codesign.optics import (
+    DrawnLensErrors,
+    OpticsConfig,
+    PixelPsfStack,
+    image_formation,
+)
 from codesign.optics import stack as lens
 from metalens.image import Imager, Sensor, draw_nodes
 from metalens.image import sensor as camera
@@ -28,7 +33,7 @@ class StepImaging:
     The uniform image is formed at every step in which the lens moves. The true image is
     formed every ``refresh`` steps and when the lens stops. Between these it is that of
     the last time, while the gradient is that of the present lens (see
-    :mod:`codesign.optics.formed`).
+    :mod:`codesign.optics.image_formation`).
     """
 
     def __init__(
@@ -56,7 +61,7 @@ class StepImaging:
         self.device = torch.device("cpu")
         self._ready: Imager | None = None
         self._given: dict[int, Imager] = {}
-        self._live: formed.DifferentiableImager | None = None
+        self._live: image_formation.DifferentiableImager | None = None
 
     def state(self) -> dict[str, Any]:
         """Which lens is imaged: all that the next step needs."""
@@ -87,7 +92,7 @@ class StepImaging:
         """
         self._live = None
         make = functools.partial(
-            formed.make_imager,
+            image_formation.make_imager,
             self.optics,
             frame=frame,
             margin=margin,
@@ -102,7 +107,9 @@ class StepImaging:
             return imager
         generator = seeded_generator(self.seed, step, 9)
         nodes = draw_nodes(imager.plan, self.draws, generator)
-        self._live = formed.make_differentiable_imager(self.optics, imager, nodes)
+        self._live = image_formation.make_differentiable_imager(
+            self.optics, imager, nodes
+        )
         return self._live.ready
 
     def pass_on(self, coefficients_rad: Tensor) -> None:

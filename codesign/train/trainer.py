@@ -33,8 +33,8 @@ from codesign.network import (
     Supernet,
     blur,
     cost,
+    frozen_norm,
     losses,
-    running,
 )
 from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
@@ -476,7 +476,7 @@ class Trainer:
         are averaged over the processes. A step without finite gradients changes no
         parameter.
         """
-        means = running.keep_running_means(self.model.net)
+        means = frozen_norm.keep_running_means(self.model.net)
         task, macs_of_members = self._losses(inputs, pitch_moves=rates["pitch"] > 0)
         optics_loss = inputs.optics_loss
         total = task + self.inner.optics_weight * optics_loss.to(self.light.device)
@@ -492,7 +492,7 @@ class Trainer:
             p for _, ps in self.groups.values() for p in ps
         )
         if not finite:
-            running.put_back(means)
+            frozen_norm.put_back(means)
         self._apply(rates, finite=finite)
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs / 1e6)

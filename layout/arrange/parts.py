@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.formats import handover
+from layout.formats import job_files
 from layout.formats.library import MaskCell, MaskLibrary, flatten_stacks, library_of
 from layout.mask.plan import UNDRAWN, MaskPlan, PillarArray
 from layout.process.process import LayerNumber, Process
@@ -127,7 +127,7 @@ def of_file(
     library, empty = _without_empty(library)
     layers = process.layers
     table = path.with_name("doses.csv")
-    table_doses = handover.read_dose_table(table) if table.is_file() else {}
+    table_doses = job_files.read_dose_table(table) if table.is_file() else {}
     used = sorted(library.layers - {layers.outline, layers.fields})
     doses = {layer: table_doses.get(layer, relative_dose) for layer in used}
     boxes: dict[str, list[Array]] = {}

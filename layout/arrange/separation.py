@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.arrange.joined import PER_UM, PartPlacement
+from layout.arrange.assembly import PER_UM, PartPlacement
 from layout.arrange.parts import APERTURE, DieComponent, box_around
 from layout.drc.report import Violation
 from layout.formats.library import CellReference, Orientation

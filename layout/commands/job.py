@@ -9,10 +9,10 @@ from typing import Any
 
 import tyro
 
-from layout.arrange import joined, wafer
+from layout.arrange import assembly, wafer
 from layout.arrange.record import DieFloorplan
 from layout.drc.report import DrcReport, Violation
-from layout.formats import compare, handover
+from layout.formats import compare, job_files
 from layout.formats.dxf import DxfWindow
 from layout.mask import build
 from layout.mask.fields import FieldPlan
@@ -20,8 +20,8 @@ from layout.mask.plan import MaskPlan
 from layout.pec.correct import DoseLadder
 from layout.process import process as processes
 from layout.process.process import LayerNumber
-from layout.verify.as_written import LensRows
 from layout.verify.report import ExposureReport
+from layout.verify.written_lens import LensRows
 from metalens.commands import DistributedOptions, Output
 from metalens.core.errors import ConfigError
 from metalens.lens import Lens
@@ -173,7 +173,7 @@ class LayoutJob:
     @property
     def sheet(self) -> str:
         """The job sheet."""
-        return handover.job_sheet(
+        return job_files.job_sheet(
             self.plan, self.process, self.fields, self.written, self.verdict
         )
 
@@ -235,7 +235,7 @@ class FloorplanWork:
     lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
     written: dict[str, int] = field(default_factory=dict)
     dies: wafer.WaferDies | None = None
-    placed: list[joined.PartPlacement] = field(default_factory=list)
+    placed: list[assembly.PartPlacement] = field(default_factory=list)
     near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
     splits: dict[str, FieldPlan] = field(default_factory=dict)

@@ -19,9 +19,9 @@ def run(options: Options) -> int:
         options: of the command.
     """
     if options.lens.suffix.lower() == ARRANGEMENT:
-        from layout.commands import arranged
+        from layout.commands import arrangement
 
-        return arranged.run(options)
+        return arrangement.run(options)
     with (
         options.claim_folder(options.output) as draft,
         options.shared(),

@@ -20,7 +20,7 @@ from layout.formats import (
     dxf,
     gdsii_read,
     gdsii_write,
-    handover,
+    job_files,
     oasis_read,
     oasis_write,
 )
@@ -31,9 +31,9 @@ from layout.pec import correct
 from layout.pec.correct import DoseLadder
 from layout.process import process as processes
 from layout.process.process import LayerNumber
-from layout.verify.as_written import LensRows
 from layout.verify.exposure import verify_exposure
 from layout.verify.report import ExposureReport
+from layout.verify.written_lens import LensRows
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.arrays import Array
@@ -124,7 +124,7 @@ def make_mask(
                 [drawing.made.plan], drawing.process, corrected=drawing.corrected
             )
     job = _checked(drawing, *solved)
-    handover.write_dose_table(job.plan, job.process, folder / "doses.csv")
+    job_files.write_dose_table(job.plan, job.process, folder / "doses.csv")
     _write_masks(job, folder)
     with job.stages("report"):
         _accompany(job, folder)
@@ -231,7 +231,7 @@ def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> 
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
-        table = handover.read_dose_table(path.with_name("doses.csv"))
+        table = job_files.read_dose_table(path.with_name("doses.csv"))
     if _is_verifiable(job) and job.compared[path.name].ok:
         with job.stages(f"verify exposure {path.suffix[1:]}"):
             job.verified[path.name] = _verified(job, content, table)
@@ -268,7 +268,7 @@ def _accompany(job: LayoutJob, target: Path) -> None:
     write_lyp(job.plan, target / "mask.lyp")
     write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
-    handover.write_fields(handover.field_sequence(job.fields), target / "fields.csv")
+    job_files.write_fields(job_files.field_sequence(job.fields), target / "fields.csv")
     store.write_text(target / "job.txt", job.sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))

@@ -5,7 +5,7 @@ it was checked.
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import joined, separation
+from layout.arrange import assembly, separation
 from layout.commands import pictures
 from layout.commands.job import FloorplanWork, LayoutJob
 from layout.drc.report import DrcReport, format_size
@@ -264,7 +264,7 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
     dies = 1
     if work.dies is not None and work.record.wafer is not None:
         dies = len(work.dies.index)
-        box = separation.extent_of_copies(work.placed) / joined.PER_UM
+        box = separation.extent_of_copies(work.placed) / assembly.PER_UM
         wafer_png = pictures.plot_wafer(work.record.wafer, work.dies, box)
         (work.folder / "wafer.png").write_bytes(wafer_png)
         caption = "Dies within the edge exclusion, and marks."

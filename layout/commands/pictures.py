@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.arrange import joined, separation
+from layout.arrange import assembly, separation
 from layout.arrange.record import WaferSettings
 from layout.arrange.wafer import WaferDies
 from layout.drc.report import DrcReport, Violation
@@ -138,7 +138,7 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
 
 
 def plot_floorplan(
-    placed: Sequence[joined.PartPlacement], near: Sequence[Violation]
+    placed: Sequence[assembly.PartPlacement], near: Sequence[Violation]
 ) -> bytes:
     """Boxes of the parts of a die by exposure as PNG; crosses where they are too near.
 
@@ -153,15 +153,15 @@ def plot_floorplan(
     for part in separation.standing_parts(placed):
         for colour, boxes in zip(_COLOURS, part.part.boxes.values(), strict=False):
             shapes = [rectilinear.box_corners(box) for box in part.moved(boxes)]
-            corners = [shape / joined.PER_UM for shape in shapes]
+            corners = [shape / assembly.PER_UM for shape in shapes]
             style: dict[str, Any] = {"facecolors": f"{colour}55", "edgecolors": "none"}
             axes.add_collection(PolyCollection(corners, **style))
-        x, y = part.x / joined.PER_UM, part.y / joined.PER_UM
+        x, y = part.x / assembly.PER_UM, part.y / assembly.PER_UM
         axes.annotate(part.part.name, (x, y), fontsize=7, ha="center", va="center")
     if near:
-        x, y = np.array([violation.centre for violation in near]).T / joined.PER_UM
+        x, y = np.array([violation.centre for violation in near]).T / assembly.PER_UM
         axes.plot(x, y, "x", color="red", ms=6, mew=1.5)
-    box = separation.extent_of_copies(placed) / joined.PER_UM
+    box = separation.extent_of_copies(placed) / assembly.PER_UM
     left, bottom, right, top = box.tolist()
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.set(xlabel="x / µm", ylabel="y / µm")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.formats import handover
+from layout.formats import job_files
 from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, PolygonStack, equal_shapes
 from layout.formats.reading import read_mask
@@ -45,7 +45,7 @@ def mask_panels(path: Path) -> list[Panel]:
     content = read_mask(mask, limit)
     content.refuse_beyond(limit)
     table = mask.with_name("doses.csv")
-    dose = handover.read_dose_table(table) if table.is_file() else {}
+    dose = job_files.read_dose_table(table) if table.is_file() else {}
     groups = equal_shapes(content, lambda shape: (shape.cell, shape.layer))
     outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.held import ScratchArray, hold_on_disk
+from layout.mask.class_store import ScratchArray, hold_on_disk
 from layout.mask.plan import BLOCK_SITES, MOST_CLASSES
 from layout.process import isolation
 from layout.process.process import Process

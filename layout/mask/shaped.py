@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from layout.mask.cells import DrawnClasses, with_isolation
-from layout.mask.held import hold_on_disk
+from layout.mask.class_store import hold_on_disk
 from layout.mask.plan import MOST_CLASSES, PillarClass
 from layout.process.process import Process
 from layout.shapes import polygon, region

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.plan import PillarArray
-from layout.pec.drawn import DrawnKinds
+from layout.pec.pillar_exposure import DrawnKinds
 from layout.pec.psf import PointExposure
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError

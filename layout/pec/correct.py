@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.build import check_layers
-from layout.mask.held import hold_on_disk
+from layout.mask.class_store import hold_on_disk
 from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarClass
 from layout.pec import bodies, psf
 from layout.pec.bodies import ExposureTable, ScatterRanges
-from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.marks import ExposedMarks, cut_marks
 from layout.pec.nodes import RadialConvolution, ScatterBackground, gaussian_convolution
+from layout.pec.pillar_exposure import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.process.process import ExposureSettings, LayerNumber, LayerTable
 from layout.shapes import rectilinear

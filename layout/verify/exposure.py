@@ -9,7 +9,7 @@ import numpy as np
 from layout.formats.library import NOTHING, MaskLibrary, PolygonStack, flatten_stacks
 from layout.mask.plan import MaskPlan, PillarArray
 from layout.pec import bodies, correct, nodes, polygon_edges
-from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
+from layout.pec.pillar_exposure import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.polygon_edges import ExposedPolygons
 from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
 from layout.process import isolation

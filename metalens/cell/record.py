@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from metalens.cell.lattice import Lattice
 from metalens.cell.shapes import Outline
-from metalens.cell.shapes.every import Shape
+from metalens.cell.shapes.registry import Shape
 from metalens.cell.shapes.round import Circle
 from metalens.core.errors import CellError
 

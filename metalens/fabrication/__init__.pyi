@@ -2,9 +2,6 @@ from . import perturbations as perturbations
 from .bias import STEEPEST as STEEPEST
 from .bias import Bias as Bias
 from .bias import read_csv as read_csv
-from .own import ResponseRates as ResponseRates
-from .own import own_rates as own_rates
-from .own import pair_rates as pair_rates
 from .perturbations import PERTURBATIONS as PERTURBATIONS
 from .perturbations import CDError as CDError
 from .perturbations import Drawn as Drawn
@@ -38,6 +35,9 @@ from .response import effective_indices as effective_indices
 from .response import perturbed_transmission as perturbed_transmission
 from .response import prepare_response as prepare_response
 from .response import proxy_sensitivity as proxy_sensitivity
+from .solved_rates import ResponseRates as ResponseRates
+from .solved_rates import own_rates as own_rates
+from .solved_rates import pair_rates as pair_rates
 from .two_sizes import Kinds as Kinds
 from .two_sizes import PairTable as PairTable
 from .two_sizes import pair_sensitivities as pair_sensitivities

@@ -11,8 +11,8 @@ from numpy.polynomial import polynomial
 from metalens.cell import Cell, index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.own import ResponseRates, own_rates
 from metalens.fabrication.perturbations import Guide, response_errors, with_missing
+from metalens.fabrication.solved_rates import ResponseRates, own_rates
 from metalens.lens import Lens
 from metalens.library import Proxy
 
@@ -202,7 +202,7 @@ def proxy_sensitivity(lens: Lens) -> Sensitivity:
 def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
     """Derivatives of ln t of a lens's own pillar shape, as polynomials of degree 5.
 
-    RCWA rates (:func:`metalens.fabrication.own.own_rates`) at the 9 Chebyshev sizes of
+    RCWA rates (:func:`metalens.fabrication.solved_rates.own_rates`) at the 9 Chebyshev sizes of
     the proxy's domain are fitted by least squares. ``error``: truncation of the solver
     plus the largest relative residual of the fit.
     """

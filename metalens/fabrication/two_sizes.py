@@ -9,7 +9,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.own import ResponseRates, pair_rates
+from metalens.fabrication.solved_rates import ResponseRates, pair_rates
 from metalens.lens import DiameterMap, Lens
 
 _PAIRS = 24  # pairs of sizes that are solved

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
-from metalens.image import left_out
+from metalens.image import model_error
 from metalens.image.forming import Imager, build_imager
 from metalens.image.low_rank import frame_maps, plane_images
 from metalens.image.plan import Grid, Plan, plan_nodes, sum_over_spectrum
@@ -286,17 +286,17 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     few = at[:FEW], depths[1:-1]
     # of the brightest of few places in the image
     share = float(light[:FEW].max() / (light**2).mean().sqrt()) * dimmer
-    judged = left_out.JudgedPsfs(optics, plan.waves, plan.window, few)
+    judged = model_error.JudgedPsfs(optics, plan.waves, plan.window, few)
     wave = float(plan.waves.wavelengths_um[0])
     pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
     parts = {
         "psfs": scene_error(used, (true * cosine4).to(used)) * dimmer,
         "planes": _plane_error(prepared),
         "spectrum": max(plan.waves.error, 0.0),
-        "transform": left_out.transform_error(judged) * share,
-        "folded": left_out.folding_error(judged) * share,
-        "polarisation": left_out.polarisation_error(judged) * share,
-        "pillars": left_out.gathering_error(*pillars) * dimmer,
+        "transform": model_error.transform_error(judged) * share,
+        "folded": model_error.folding_error(judged) * share,
+        "polarisation": model_error.polarisation_error(judged) * share,
+        "pillars": model_error.gathering_error(*pillars) * dimmer,
         "edge": sampling(optics, plan.window, wave).beyond / 2,
     }
     if optics.layers.stop is not None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
 from metalens.image.compiled import is_compilable
-from metalens.image.left_out import (
+from metalens.image.model_error import (
     JudgedPsfs,
     choose_polarisation,
     folding_error,
@@ -147,8 +147,8 @@ def plan_nodes(
     Field nodes are tried on a line at 0.6 of the half height, depth nodes at two field
     points. PSFs half-way between the nodes judge each number. These trials use two
     wavelengths of the spectrum. The window's period and curvature follow from the light
-    that the transform aliases and neglects (:mod:`metalens.image.left_out`), its
-    components from :func:`metalens.image.left_out.choose_polarisation`.
+    that the transform aliases and neglects (:mod:`metalens.image.model_error`), its
+    components from :func:`metalens.image.model_error.choose_polarisation`.
 
     Args:
         optics: wave of the lens, layers and lens-sensor distance.

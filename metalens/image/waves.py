@@ -18,7 +18,7 @@ from metalens.image import compiled
 from metalens.image.compiled import is_plain_value
 from metalens.lens import Lens, response
 from metalens.optics import Layers, Media, interpolant, media
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 
 # largest width over which pillars are averaged: below a zone of the lens, many pitches
 CELL_UM = 2.5
@@ -88,11 +88,11 @@ class PillarWave:
     differentiable in. cell_um: width of
     the cells, a whole number of pitches, one at least.
 
-    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`,
+    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.neighbour_coupling`,
     the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image;
     what of it lands in the window is
-    measured by :mod:`metalens.image.left_out`.
+    measured by :mod:`metalens.image.model_error`.
 
     Raises:
         SceneError: another lattice than a square one, turned pillars, those of two
@@ -205,7 +205,7 @@ class PillarWave:
         """Transmission t times the mean coupling of neighbours, if there is any."""
         if self.lens.neighbours is None:
             return t
-        return t * among.mean_coupling(
+        return t * neighbour_coupling.mean_coupling(
             t, self.lens.neighbours, self.lens.diameters.pitch_um
         )
 

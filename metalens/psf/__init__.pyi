@@ -1,5 +1,5 @@
-from . import among as among
 from . import export as export
+from . import neighbour_coupling as neighbour_coupling
 from . import plots as plots
 from . import spectrum as spectrum
 from .budget import NEIGHBOURS as NEIGHBOURS
@@ -12,6 +12,13 @@ from .directions import FarField as FarField
 from .directions import far_field as far_field
 from .extended import Extent as Extent
 from .focus import focus_metrics as focus_metrics
+from .lens_psfs import View as View
+from .lens_psfs import all_maps as all_maps
+from .lens_psfs import from_lens as from_lens
+from .lens_psfs import lens_stop_shadow as lens_stop_shadow
+from .lens_psfs import library_incidence as library_incidence
+from .lens_psfs import mean_over_polarizations as mean_over_polarizations
+from .lens_psfs import passed_um2 as passed_um2
 from .metrics import DiffractionLimit as DiffractionLimit
 from .metrics import FocusMetrics as FocusMetrics
 from .metrics import blur_um as blur_um
@@ -20,13 +27,6 @@ from .metrics import encircled_power as encircled_power
 from .metrics import find_peak as find_peak
 from .metrics import fwhm as fwhm
 from .metrics import mtf as mtf
-from .of_lens import View as View
-from .of_lens import all_maps as all_maps
-from .of_lens import from_lens as from_lens
-from .of_lens import lens_stop_shadow as lens_stop_shadow
-from .of_lens import library_incidence as library_incidence
-from .of_lens import mean_over_polarizations as mean_over_polarizations
-from .of_lens import passed_um2 as passed_um2
 from .pixels import integrate_pixels as integrate_pixels
 from .pixels import on_pixels as on_pixels
 from .pixels import pixel_count as pixel_count

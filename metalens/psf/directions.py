@@ -10,7 +10,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.lens import Lens
 from metalens.optics.paths import source_path
-from metalens.psf.of_lens import library_incidence
+from metalens.psf.lens_psfs import library_incidence
 
 MOST_SITES = 25_000_000  # 5000 x 5000: 1.5 GB
 # radius of the circle that is counted as one beam, wavelength / aperture width: 98 % of

@@ -12,6 +12,7 @@ from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.lens import Lens
 from metalens.psf.budget import sine_aperture
+from metalens.psf.lens_psfs import all_maps, lens_stop_shadow, passed_um2
 from metalens.psf.metrics import (
     SPOT_FWHM,
     FocusMetrics,
@@ -22,7 +23,6 @@ from metalens.psf.metrics import (
     half_maximum,
     mtf50,
 )
-from metalens.psf.of_lens import all_maps, lens_stop_shadow, passed_um2
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import SpectralNodes
 

@@ -13,8 +13,7 @@ from metalens.core.errors import PropagationError
 from metalens.lens import NeighbourRows
 from metalens.optics import Layers
 from metalens.propagate import PropagationCase
-from metalens.psf import among
-from metalens.psf.among import NeighbourJonesFactors
+from metalens.psf import neighbour_coupling
 from metalens.psf.budget import Polarisation
 from metalens.psf.extended import Extent
 from metalens.psf.intensity import (
@@ -25,6 +24,7 @@ from metalens.psf.intensity import (
     compute_intensity,
 )
 from metalens.psf.metrics import blur_um
+from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 from metalens.psf.record import PsfStack
 from metalens.psf.vector import PolarizationMixing, jones_maps
 
@@ -197,14 +197,16 @@ def _polarised(
                 "factors on both fields, but one scalar: give the rows, or polarisation = 'flux'"
             )
         if neighbours is not None:
-            maps = among.apply_scalar_coupling(*maps, neighbours, pitch_um)
+            maps = neighbour_coupling.apply_scalar_coupling(*maps, neighbours, pitch_um)
         return maps, None
     if polarisation not in ("flux", "vector"):
         raise PropagationError(
             f"polarisation = {polarisation!r}: need one of scalar, flux, vector"
         )
     if isinstance(neighbours, NeighbourRows):
-        neighbours = among.apply_jones_coupling(*maps, neighbours, pitch_um)
+        neighbours = neighbour_coupling.apply_jones_coupling(
+            *maps, neighbours, pitch_um
+        )
     if neighbours is not None:
         maps = jones_maps(maps, neighbours)
     return maps, PolarizationMixing(polarisation == "flux", neighbours is not None)

@@ -13,7 +13,7 @@ from torch import Tensor
 from metalens.core.arrays import Array
 from metalens.optics import media
 from metalens.propagate import PropagationCase, Pupils, ray_cosines
-from metalens.psf.among import NeighbourJonesFactors
+from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 
 # blocks of pillars along an axis, each with one cosine of its rays
 POOLED = 64

@@ -11,8 +11,8 @@ from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.lens import Lens
 from metalens.psf.budget import sine_aperture
+from metalens.psf.lens_psfs import all_maps, lens_stop_shadow
 from metalens.psf.metrics import Point, fwhm
-from metalens.psf.of_lens import all_maps, lens_stop_shadow
 from metalens.psf.spectrum import SpectralNodes
 
 PLANES = 21

@@ -12,7 +12,7 @@ from metalens import psf
 from metalens.core import report, store
 from metalens.core.arrays import Array
 from metalens.library import axes
-from metalens.view import standing
+from metalens.view import pillar_drawing
 from metalens.view.panels import (
     ClassMapPanel,
     CurvePanel,
@@ -144,7 +144,7 @@ def lens_panels(path: Path) -> list[Panel]:
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
-        return [standing.draw_pillars(lens), _section(diameter, lens)]
+        return [pillar_drawing.draw_pillars(lens), _section(diameter, lens)]
     index, sizes = classes_of(diameter)
     return [
         ClassMapPanel(

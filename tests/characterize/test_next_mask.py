@@ -7,7 +7,7 @@ import pytest
 
 from characterize import next_mask
 from characterize.model.parameters import parameter_vector, process_state_of
-from codesign.optics import built
+from codesign.optics import as_built_lens
 from layout.process import process as processes
 from metalens import lens
 from metalens.core.errors import ConfigError
@@ -110,7 +110,7 @@ def test_a_true_correction_gives_the_designed_lens_back():
     """With the fit equal to the truth, table and map leave aberrations and distance;
     the spacer leaves aberrations.
     """
-    made = built.MadeLens(m.small(), m.OPTICS)
+    made = as_built_lens.MadeLens(m.small(), m.OPTICS)
     x = parameter_vector({k: v for k, v in m.TRUE.items() if k != "coma_x_rad"})
     plan = next_mask.propose_correction(
         m.small(), x, response=made.response, old=next_mask.present_bias(None)
@@ -119,7 +119,7 @@ def test_a_true_correction_gives_the_designed_lens_back():
     before, table, mapped, placed = steps
     goal = made.stack()
     first, last = (
-        built.psf_error(made.redrawn(p.lens).stack(p.parameters), goal)
+        as_built_lens.psf_error(made.redrawn(p.lens).stack(p.parameters), goal)
         for p in (before, placed)
     )
     assert first > 0.05

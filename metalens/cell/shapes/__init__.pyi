@@ -1,8 +1,8 @@
-from .every import Shape as Shape
 from .outline import EllipseArc as EllipseArc
 from .outline import Outline as Outline
 from .outline import PolygonLoop as PolygonLoop
 from .outline import rotate_corners as rotate_corners
+from .registry import Shape as Shape
 from .round import Circle as Circle
 from .round import Ellipse as Ellipse
 from .round import Ring as Ring

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from characterize.captures import electrons as clean
+from characterize.captures import calibration as clean
 from characterize.captures.capture import Capture
 from metalens.core.errors import CaptureError
 

@@ -139,7 +139,7 @@ def test_the_shares_of_a_mosaic_are_a_cause_of_their_own():
     """Pixels of 2 x 2 that see 1, 0.4, 0.4 and 0.2 of the light, less the gain: these
     three waves of it, no more.
     """
-    from characterize.inference.causes import _of_mosaic
+    from characterize.inference.systematic_effects import _of_mosaic
 
     light = np.random.default_rng(8).uniform(3, 9, (2, 5, 6))
     shares = np.tile(np.array([[1.0, 0.4], [0.4, 0.2]]), (3, 3))[:5]

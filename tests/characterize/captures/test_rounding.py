@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 from characterize.captures import Capture, SensorNoise, quantization_score, to_electrons
-from characterize.captures.electrons import photon_transfer
+from characterize.captures.calibration import photon_transfer
 from characterize.captures.rounding import DarkStatistics
 from characterize.inference import estimate, leastsquares, multistart, prepare
 from characterize.inference.leastsquares import FitImages

@@ -19,7 +19,7 @@ import characterize
 from characterize.inference import asbuilt
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.estimate import FitOptions
-from characterize.model import made
+from characterize.model import as_built
 from characterize.model.forward import ForwardModel, FrameSetting
 from characterize.model.parameters import (
     NAMES,
@@ -35,7 +35,7 @@ from metalens.cell.shapes import Rectangle
 from metalens.cli import main
 from metalens.core.errors import CaptureError, ConfigError, FitError
 from metalens.fabrication import Solved, proxy_sensitivity
-from metalens.psf.of_lens import View
+from metalens.psf.lens_psfs import View
 
 SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
 USUAL = FitOptions(scan_um=60.0)
@@ -293,7 +293,7 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
     true = b.truth().vector()
     want = psf.psf_stack(
         *(
-            f(made.as_built_transmission(b.lens(), b.RESPONSE, true))
+            f(as_built.as_built_transmission(b.lens(), b.RESPONSE, true))
             for f in (np.angle, np.abs)
         ),
         pitch_um=0.4,

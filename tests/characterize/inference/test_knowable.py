@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference import knowable
+from characterize.inference import identifiability
 from characterize.inference.asbuilt import AsBuilt
 from characterize.model import PARAMETERS, PLACE
 
@@ -22,7 +22,7 @@ TURN = np.linalg.qr(np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.2, 1.0
 
 def test_directions_are_in_typical_units():
     information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
-    values, vectors = knowable.information_eigenvectors(NAMES, information)
+    values, vectors = identifiability.information_eigenvectors(NAMES, information)
     assert values == pytest.approx([4.0, 90.0, 700.0])
     assert np.abs((vectors * TURN).sum(0)) == pytest.approx(np.ones(3))
 
@@ -32,16 +32,21 @@ def test_a_combination_is_told_where_frames_halve_what_was_known():
     halved by the latter two.
     """
     information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
-    told = knowable.identifiable_combinations(NAMES, information, 0.24 * SCALE)
+    told = identifiability.identifiable_combinations(NAMES, information, 0.24 * SCALE)
     assert [line.rsplit(" to ", 1)[1] for line in told] == ["0.038", "0.11"]
     largest = int(np.abs(TURN[:, 2]).argmax())
     assert f"{NAMES[largest]}/{SCALE[largest]:g}" in told[0].split(" to ")[0]
     assert (
-        len(knowable.identifiable_combinations(NAMES, information, np.full(3, np.inf)))
+        len(
+            identifiability.identifiable_combinations(
+                NAMES, information, np.full(3, np.inf)
+            )
+        )
         == 3
     )
     assert (
-        len(knowable.identifiable_combinations(NAMES, information, 0.2 * SCALE)) == 1
+        len(identifiability.identifiable_combinations(NAMES, information, 0.2 * SCALE))
+        == 1
     )  # 0.105 is more than half of 0.2
 
 
@@ -61,7 +66,7 @@ def test_what_was_known_of_a_combination_adds_its_parts_as_variances(ratio, told
     known = ratio * np.hypot(0.6 * 0.3, 0.8 * 0.7)
     turn = turned(along, [1, 0])
     values = np.array([0.1, 0.2, known**-2])
-    found = knowable.identifiable_combinations(
+    found = identifiability.identifiable_combinations(
         NAMES, (turn * values) @ turn.T / np.outer(SCALE, SCALE), prior * SCALE
     )
     assert len(found) == told
@@ -71,11 +76,11 @@ def test_what_was_known_of_a_combination_adds_its_parts_as_variances(ratio, told
 def test_a_combination_without_a_prior_is_told_however_little_is_known():
     """Half of infinity is far off; eigenvalues below 1 count as they are."""
     for value in (0.04, 0.3):
-        values, _ = knowable.information_eigenvectors(
+        values, _ = identifiability.information_eigenvectors(
             NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2
         )
         assert values == pytest.approx([value, 1.1, 2.3])
-        found = knowable.identifiable_combinations(
+        found = identifiability.identifiable_combinations(
             NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2, np.full(3, np.inf)
         )
         assert found[-1].rsplit(" to ", 1)[1] == f"{value**-0.5:.2g}"
@@ -97,7 +102,7 @@ def test_the_words_of_a_combination_name_its_large_parts_first(along, parts):
     scale = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     along = np.array(along) / np.linalg.norm(along)
     information = 900 * np.outer(along, along) / np.outer(scale, scale)
-    (line,) = knowable.identifiable_combinations(names, information, 3 * scale)
+    (line,) = identifiability.identifiable_combinations(names, information, 3 * scale)
     sign = 1 if line.startswith(f"{along[parts[0]]:+.2f}") else -1
     want = " ".join(f"{sign * along[i]:+.2f} {names[i]}/{scale[i]:g}" for i in parts)
     assert line == f"{want} to 0.033"
@@ -106,7 +111,7 @@ def test_the_words_of_a_combination_name_its_large_parts_first(along, parts):
 def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
     sigma = np.array([0.3, 2.0, 5.0])
     correlation = np.array([[1, -0.91, 0.2], [-0.91, 1, 0.89], [0.2, 0.89, 1.0]])
-    words = knowable.correlated_pairs(
+    words = identifiability.correlated_pairs(
         NAMES, correlation * np.outer(sigma, sigma), np.array([0.37, 2.6, np.inf])
     )
     assert len(words) == 2

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from characterize.inference.knowable import profile_density
+from characterize.inference.identifiability import profile_density
 from characterize.inference.leastsquares import (
     FitImages,
     FitProblem,

@@ -14,7 +14,7 @@ import bench_lens as b
 
 from characterize.bench import bench
 from characterize.model import ForwardModel, FrameSetting, parameter_vector
-from characterize.model import made as as_built
+from characterize.model import as_built as as_built
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Rectangle
 from metalens.lens import DiameterMap, Lens

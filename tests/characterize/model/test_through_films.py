@@ -18,7 +18,7 @@ import films as referee
 
 from characterize.bench import bench
 from characterize.bench.bench import BenchCamera, HiddenLens
-from characterize.model import forward, made
+from characterize.model import as_built, forward
 from characterize.model.forward import ForwardModel, FrameSetting
 from characterize.model.glass import AIR, FilmStack
 from characterize.model.parameters import NAMES, KnownValue, parameter_vector
@@ -162,7 +162,7 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
     far = snell(steep / math.sqrt(1 + steep**2), media)[0] / steep if steep else 0.0
     stack = referee.Stack(list(media), wavelength=WAVELENGTH, step=0.4, count=701)
     places = np.meshgrid(made_of.diameters.x_um, made_of.diameters.y_um)
-    pillars = made.as_built_transmission(made_of, b.RESPONSE, x)
+    pillars = as_built.as_built_transmission(made_of, b.RESPONSE, x)
     want = []
     for depth in DEPTHS.tolist():
         waves = stack.fields(

@@ -15,8 +15,8 @@ from characterize.model.parameters import KnownValue
 from codesign.adapt import source as finished
 from codesign.adapt import train as retraining
 from codesign.adapt.train import NetworkAccuracy, RetrainingOutcome
-from codesign.optics import formed
-from codesign.optics.built import MadeLens
+from codesign.optics import image_formation
+from codesign.optics.as_built_lens import MadeLens
 from codesign.optics.stack import PixelPsfStack
 from codesign.settings import RetrainConfig
 from codesign.train import assess, place_on_device
@@ -177,7 +177,7 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
         asked.append(image)
         return f"image {len(asked)}"
 
-    monkeypatch.setattr(formed, "image_tolerance_problem", above)
+    monkeypatch.setattr(image_formation, "image_tolerance_problem", above)
     source = finished.load_finished_run(folder)
     going = retraining.make_trainer(source, SHORT, (found.nominal,))
     told = retraining.retraining_outcome(
@@ -329,13 +329,13 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
     averaged over, 5 %.
     """
     settings = replace(m.SEEN, image="true", image_tolerance=0.1)
-    made = formed.make_imager(
+    made = image_formation.make_imager(
         settings, torch.zeros(0), 43, margin=4, made=found.judges[0]
     )
-    other = formed.make_imager(
+    other = image_formation.make_imager(
         settings, torch.zeros(0), 43, margin=4, made=found.nominal
     )
-    assert made is formed.make_imager(
+    assert made is image_formation.make_imager(
         settings, torch.zeros(0), 43, margin=4, made=found.judges[0]
     )
     centres = [
@@ -351,7 +351,7 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
     )  # depths differ: the image places its own nodes
     bare = PixelPsfStack(found.nominal.intensity, found.nominal.depths_um)
     with pytest.raises(TrainingError, match="PSFs on axis alone"):
-        formed.make_imager(settings, torch.zeros(0), 43, margin=4, made=bare)
+        image_formation.make_imager(settings, torch.zeros(0), 43, margin=4, made=bare)
 
 
 def _units(*stacks):

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches import flat, pool
-from codesign.batches.flat import SingleSurfaceFrames, flatten_layers, sensor_irradiance
+from codesign.batches import pool, surface_frames
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import EyeScenes, SceneConfig, draw_depth_scales
+from codesign.batches.surface_frames import (
+    SingleSurfaceFrames,
+    flatten_layers,
+    sensor_irradiance,
+)
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import SceneError, TrainingError
@@ -155,7 +159,7 @@ def test_pools_too_small_and_uneven_frames_are_refused():
     frames = flatten_layers(SCENES.rendered(0, 1).frames, torch.ones(1))
     with pytest.raises(SceneError, match=r"need \(n, y, x\) twice"):
         SingleSurfaceFrames(frames.light, frames.depth_um[:, :4], frames.scale)
-    assert flat.frame_samples(frames) == 80
+    assert surface_frames.frame_samples(frames) == 80
 
 
 def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():

@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 
 from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
-from codesign.adapt import retrained
+from codesign.adapt import retrained_network
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.optics import MadeLens, formed
+from codesign.optics import MadeLens, image_formation
 from layout.process import process
 from metalens import lens
 from metalens.cli import main
@@ -105,7 +105,7 @@ def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch
         monkeypatch.context() as patched
     ):  # images that miss what the run asks for, of every lens that judges
         patched.setattr(
-            formed,
+            image_formation,
             "image_tolerance_problem",
             lambda settings, image: "the image's error is too large",
         )
@@ -248,8 +248,8 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
         "out: through the lens as made"
         in (folder / "shown" / "report.html").read_text()
     )
-    made = retrained.load_retrained(folder / "out")
-    plain = retrained.load_retrained(folder / "run")
+    made = retrained_network.load_retrained(folder / "out")
+    plain = retrained_network.load_retrained(folder / "run")
     design = lens.load_plain(folder / "run" / "lens.h5")
     response = asbuilt.load(folder / "asbuilt.h5").response
     true = config.load(folder / "truth.toml", HiddenLens)
@@ -282,7 +282,7 @@ def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(
         (shutil.copytree if (folder / name).is_dir() else shutil.copy)(
             folder / name, tmp_path / name
         )
-    assert retrained.lens_of(tmp_path / "bowed") == "as fitted"
+    assert retrained_network.lens_of(tmp_path / "bowed") == "as fitted"
     assert _shown(tmp_path, "bowed/known.safetensors", out="shown") == 2
     assert (
         "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err

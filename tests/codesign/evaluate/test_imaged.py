@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from codesign.commands import view
-from codesign.evaluate import imaged
+from codesign.evaluate import scene_image
 from codesign.eye import CameraRig, PinholeCamera, dataset, render
 from metalens import cli, design, lens
 from metalens.cell import Film, Index
@@ -35,7 +35,7 @@ LENS = design.make(
 @pytest.fixture(scope="module")
 def found():
     states = dataset.states_at(torch.arange(2), 5)
-    return imaged.image_first_frames(
+    return scene_image.image_first_frames(
         LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera)
     )
 
@@ -96,7 +96,7 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
         seen.append(rig.sensor_distance_um)
         return render(states, rig=rig, camera=camera)
 
-    made = imaged.image_first_frames(behind, PinholeCamera(16, 4.0), RIG, rendered)
+    made = scene_image.image_first_frames(behind, PinholeCamera(16, 4.0), RIG, rendered)
     assert seen == [pytest.approx(280.0)]
     beside = 36  # samples of 4 um: half a window of 288 um
     rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 4.0 / 280.0))
@@ -106,7 +106,7 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
 
 
 def test_what_is_written_is_what_is_shown(found, tmp_path):
-    imaged.write_images(tmp_path, found, Provenance())
+    scene_image.write_images(tmp_path, found, Provenance())
     both, apart, points = view.image_panels(tmp_path / "image.h5")
     assert np.array_equal(both.values[1, 0], found.scene[1])
     assert np.array_equal(both.values[1, 1], found.image[1])
@@ -137,7 +137,7 @@ def test_light_that_the_pillars_are_not_known_for_is_told_and_no_error():
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (9.5, 12))
     states = dataset.states_at(torch.arange(1), 5)
-    made = imaged.image_first_frames(
+    made = scene_image.image_first_frames(
         known,
         PinholeCamera(16, 9.0),
         RIG,
@@ -174,7 +174,7 @@ def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
     with pytest.raises(
         SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"
     ):
-        imaged.image_first_frames(
+        scene_image.image_first_frames(
             near,
             PinholeCamera(12, 9.0),
             CameraRig(),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.eye.worn import draw_lashes
+from codesign.eye.appearance import draw_lashes
 
 SIZE, TOP, BOTTOM, LEFT, RIGHT = (
     120,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches.flat import flatten_layers
 from codesign.batches.scenes import EyeScenes, SceneConfig
+from codesign.batches.surface_frames import flatten_layers
+from codesign.eye import appearance as wear
 from codesign.eye import renderer
-from codesign.eye import worn as wear
 from codesign.eye.renderer import FrameLabels, RenderedFrames
 from metalens.image import Frames
 

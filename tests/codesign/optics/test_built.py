@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from characterize.model import made
+from characterize.model import as_built
 from characterize.model.parameters import PLACE, parameter_vector
-from codesign.optics import built
+from codesign.optics import as_built_lens
 from codesign.optics import stack as optics
 from codesign.optics.stack import PixelPsfStack
 from metalens import psf
@@ -26,8 +26,8 @@ def _engine(x, settings):
     """The same PSFs from every pillar, integrated over samples whose light is
     low-passed to their grid.
     """
-    lens, known = m.small(), built.at_rest(x)
-    t = made.as_built_transmission(lens, proxy_sensitivity(lens), known)
+    lens, known = m.small(), as_built_lens.at_rest(x)
+    t = as_built.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85, depths_um=settings.depths_um.numpy(),
@@ -50,17 +50,17 @@ def _engine(x, settings):
 
 @pytest.mark.parametrize("x", [parameter_vector(), X], ids=["design", "made"])
 def test_psfs_agree_with_the_sum_over_every_pillar(x):
-    got = built.MadeLens(m.small(), m.OPTICS).stack(x)
+    got = as_built_lens.MadeLens(m.small(), m.OPTICS).stack(x)
     want = _engine(x, m.OPTICS)
     assert (
-        built.psf_error(got, want) < 6e-3
+        as_built_lens.psf_error(got, want) < 6e-3
     )  # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
     assert (
         got.intensity.sum((1, 2)) / want.intensity.sum((1, 2)) - 1
     ).abs().max() < 0.02  # half a pitch at the rim is 1.3 % of the light
-    far = built.MadeLens(m.small(), m.OPTICS).stack()
+    far = as_built_lens.MadeLens(m.small(), m.OPTICS).stack()
     assert (
-        x is not X or built.psf_error(far, want) > 0.05
+        x is not X or as_built_lens.psf_error(far, want) > 0.05
     )  # the errors of this lens are far above the tolerance
 
 
@@ -68,10 +68,12 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     """By which the true image of a made lens tells what cells of pillars leave out of
     it.
     """
-    known = built.at_rest(X)
-    want = made.as_built_transmission(m.small(), proxy_sensitivity(m.small()), known)
+    known = as_built_lens.at_rest(X)
+    want = as_built.as_built_transmission(
+        m.small(), proxy_sensitivity(m.small()), known
+    )
     got = (
-        built.MadeLens(m.small(), m.OPTICS)
+        as_built_lens.MadeLens(m.small(), m.OPTICS)
         .stack(X)
         .plane.wave.pillar_transmission(0.85, 0.0)
         .numpy()
@@ -87,7 +89,7 @@ def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
     """
     settings = dataclasses.replace(m.OPTICS, window_samples=15)
     light = (
-        built.MadeLens(m.small(), settings)
+        as_built_lens.MadeLens(m.small(), settings)
         .stack(parameter_vector({"bias_x_nm": 10.0}))
         .intensity.double()
     )
@@ -110,16 +112,16 @@ def test_only_what_the_lens_keeps_enters():
             "log_gain": 3.0,
         }
     )
-    made_lens = built.MadeLens(m.small(), m.OPTICS)
+    made_lens = as_built_lens.MadeLens(m.small(), m.OPTICS)
     assert torch.equal(made_lens.stack(bench).intensity, made_lens.stack().intensity)
 
 
 def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
     draws = np.array(
-        list(built.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
+        list(as_built_lens.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
     )
     again = np.array(
-        list(built.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
+        list(as_built_lens.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
     )
     assert np.array_equal(draws, again)
     bias = draws[:, PLACE["bias_nm"]]
@@ -129,8 +131,8 @@ def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
 
 def test_the_design_matches_the_smooth_lens_of_training():
     """Pillars against the phase they were made for: two ways to the same samples."""
-    got = built.MadeLens(m.small(), m.OPTICS).stack()
+    got = as_built_lens.MadeLens(m.small(), m.OPTICS).stack()
     want = optics.lens_psf_stack(m.OPTICS, torch.zeros(0))
     assert (
-        built.psf_error(got, want) < 0.25
+        as_built_lens.psf_error(got, want) < 0.25
     )  # the grids of both windows cut the band at different harmonics

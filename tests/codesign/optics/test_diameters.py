@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.optics import formed
+from codesign.optics import image_formation
 from codesign.optics.stack import OpticsConfig, count_parameters, trained_lens
 from codesign.train.trainer import make_model
 from metalens import lens
@@ -41,7 +41,7 @@ def test_the_gradient_is_that_of_differences():
     weight = torch.randn(3, 11, 11, generator=torch.Generator().manual_seed(4))
 
     def value(coefficients):
-        psfs = formed.lens.lens_psf_stack(SMALL, coefficients).intensity
+        psfs = image_formation.lens.lens_psf_stack(SMALL, coefficients).intensity
         return (psfs * weight).sum()
 
     moving = start.clone().requires_grad_()
@@ -61,7 +61,7 @@ def test_three_steps_lower_a_loss_and_the_file_holds_the_trained_lens(tmp_path):
     losses = []
     for _ in range(4):
         optimiser.zero_grad()
-        psfs = formed.lens.lens_psf_stack(SMALL, moving).intensity
+        psfs = image_formation.lens.lens_psf_stack(SMALL, moving).intensity
         loss = -psfs[0, 4:7, 4:7].sum()
         loss.backward()
         losses.append(float(loss.detach()))
@@ -87,7 +87,7 @@ def test_three_steps_lower_a_loss_and_the_file_holds_the_trained_lens(tmp_path):
     grid = Grid((side, side), 5.0, (2e3, 5e3), MARGIN, 11)
     field = (np.radians(2.0), 0.0)
     other = imager(file, grid, field=field, tolerance=0.05)
-    mine = formed.make_imager(SMALL, trained, FRAME, margin=MARGIN)
+    mine = image_formation.make_imager(SMALL, trained, FRAME, margin=MARGIN)
     frames = textured_frames(other.grid)
     want = other(frames)
     assert float((mine(frames) - want).norm() / want.norm()) < 1e-3

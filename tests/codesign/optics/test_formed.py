@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches import flat
-from codesign.optics import formed, stack
+from codesign.batches import surface_frames
+from codesign.optics import image_formation, stack
 from codesign.optics.lens_errors import LensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig
 from metalens.cell import Film, Index
@@ -33,7 +33,7 @@ FRAME, MARGIN = 32, 5
 
 @pytest.fixture(scope="module")
 def whole():
-    return formed.make_imager(SMALL, BENT, FRAME, margin=MARGIN)
+    return image_formation.make_imager(SMALL, BENT, FRAME, margin=MARGIN)
 
 
 def test_on_the_axis_it_holds_the_psfs_of_the_other_engine(whole):
@@ -69,7 +69,7 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     weight = torch.randn(1, 22, 22, generator=draw)
 
     def image(coefficients):
-        optics = formed.optics_of(SMALL, coefficients)
+        optics = image_formation.optics_of(SMALL, coefficients)
         y, x = torch.meshgrid(whole.plan.y_um, whole.plan.x_um, indexing="ij")
         light = sum_over_spectrum(
             optics,
@@ -81,10 +81,10 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
         psfs, _ = normalise_psfs(light.reshape(whole.stack.shape), optics, whole.plan)
         return (with_psfs(whole, psfs, whole.energy)(frames) * weight).sum()
 
-    ready = formed.make_differentiable_imager(SMALL, whole)
-    (flat.sensor_irradiance(frames, ready.ready) * weight).sum().backward()
+    ready = image_formation.make_differentiable_imager(SMALL, whole)
+    (surface_frames.sensor_irradiance(frames, ready.ready) * weight).sum().backward()
     moving = BENT.clone().requires_grad_()
-    optics = formed.optics_of(SMALL, moving)
+    optics = image_formation.optics_of(SMALL, moving)
     points = len(whole.plan.y_um) * len(whole.plan.x_um)
     terms = [
         gradient_term(optics, whole.plan, ready.light.grad, p, 0) for p in range(points)
@@ -113,7 +113,7 @@ def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_
     whole,
 ):
     pairs = draw_nodes(whole.plan, 3, torch.Generator().manual_seed(4))
-    ready = formed.make_differentiable_imager(SMALL, whole, pairs)
+    ready = image_formation.make_differentiable_imager(SMALL, whole, pairs)
     assert ready.ready.asked == set(pairs[0].tolist())
     frames = _frames(whole)
     seen = ready.ready(frames)
@@ -129,12 +129,12 @@ def _frames(made):
 
 def test_flat_frames_take_the_true_image_as_one_sheet(whole):
     draw = np.random.default_rng(3)
-    frames = flat.SingleSurfaceFrames(
+    frames = surface_frames.SingleSurfaceFrames(
         draw.integers(10, 250, (2, FRAME, FRAME), dtype=np.uint8),
         np.full((2, FRAME, FRAME), 20_000, np.uint16), np.array([0.9, 1.1], np.float32),
     )  # fmt: skip
-    assert float(flat.depth_um(frames)[0, 0, 0]) == pytest.approx(18_000)
-    got = flat.sensor_irradiance(frames, whole)
+    assert float(surface_frames.depth_um(frames)[0, 0, 0]) == pytest.approx(18_000)
+    got = surface_frames.sensor_irradiance(frames, whole)
     light = torch.from_numpy(frames.light / 255.0).float()
     cover = torch.ones(2, 1, FRAME, FRAME)
     depth = (
@@ -157,10 +157,10 @@ def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
     assert wide.light.fwhm_nm == pytest.approx(24.0)  # 3-4-5: 30 * 40 / 50
     assert wide.passed == pytest.approx(0.8)
     assert SMALL.light is None
-    whole = formed.make_imager(
+    whole = image_formation.make_imager(
         replace(wide, polynomials=0, image_tolerance=0.4), torch.zeros(0), 20, margin=5
     )
-    bare = formed.make_imager(
+    bare = image_formation.make_imager(
         replace(wide, polynomials=0, image_tolerance=0.4, fwhm_nm=24.0, filter_nm=0.0),
         torch.zeros(0),
         20,
@@ -189,8 +189,8 @@ def test_impossible_sources_are_refused(change, message):
 def test_psfs_of_one_chief_ray_cannot_stand_for_the_field():
     made = stack.lens_psf_stack(replace(SMALL, image="uniform"), BENT)
     with pytest.raises(TrainingError, match="cannot stand for the field"):
-        formed.make_imager(SMALL, BENT, FRAME, margin=MARGIN, made=made)
-    one = formed.make_imager(
+        image_formation.make_imager(SMALL, BENT, FRAME, margin=MARGIN, made=made)
+    one = image_formation.make_imager(
         replace(SMALL, image="uniform"), BENT, FRAME, margin=MARGIN, made=made
     )
     assert one.light.uniform
@@ -201,9 +201,9 @@ def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole
     what errs of the round lens.
     """
     assert isinstance(whole, Imager)
-    far = formed.uniform_image_error(SMALL, 3 * BENT, FRAME, margin=MARGIN)
+    far = image_formation.uniform_image_error(SMALL, 3 * BENT, FRAME, margin=MARGIN)
     still = replace(SMALL, polynomials=0, focus_mm=22.0)
-    near = formed.uniform_image_error(
+    near = image_formation.uniform_image_error(
         still, torch.zeros(0), 20, margin=5
     )  # a round lens over half of the field
     assert 0.02 < near < far < 1.0
@@ -212,8 +212,8 @@ def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole
 def test_made_lenses_differ_and_lose_light_to_haze():
     loose = replace(SMALL, spread=LensErrors(focus_um=20.0, height_nm=30.0))
     error = loose.spread.draw(torch.Generator().manual_seed(3))
-    made = formed.make_imager(loose, BENT, 20, margin=5, error=error)
-    plain = formed.make_imager(loose, BENT, 20, margin=5)
+    made = image_formation.make_imager(loose, BENT, 20, margin=5, error=error)
+    plain = image_formation.make_imager(loose, BENT, 20, margin=5)
     assert torch.allclose(made.stack.sum((-2, -1)), torch.ones(()), atol=1e-4)
     kept = math.exp(-variance_rad2(error.state(), loose.phase_rates))
     shadow = (11 * 12.0) ** 2 / (
@@ -244,10 +244,10 @@ def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
     assert float(lit[1][0] / lit[0][0]) == pytest.approx(
         0.25 * near, rel=0.03
     )  # of the light beyond the window
-    through = [formed.optics_of(s, none) for s in (open_, stopped)]
+    through = [image_formation.optics_of(s, none) for s in (open_, stopped)]
     assert [plane.layers.stop for plane in through] == [None, Stop(75.0, 300.0)]
     assert through[0].wave.focus.layers.front == glass
-    image = formed.make_imager(stopped, none, FRAME, margin=MARGIN)
+    image = image_formation.make_imager(stopped, none, FRAME, margin=MARGIN)
     middle = image.energy[len(image.plan.y_um) // 2, len(image.plan.x_um) // 2]
     assert (
         float(middle.min()) > 0.85

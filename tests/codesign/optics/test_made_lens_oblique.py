@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from characterize.model import made
+from characterize.model import as_built
 from characterize.model.parameters import PLACE, parameter_vector
-from codesign.optics import built
+from codesign.optics import as_built_lens
 from codesign.optics.stack import PixelPsfStack
 from metalens import psf
 from metalens.fabrication import proxy_sensitivity
@@ -24,8 +24,8 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     light of other orders leave 3 % here.
     """
     settings = dataclasses.replace(m.OPTICS, angle_deg=angle_deg)
-    lens, known = m.small(), built.at_rest(X)
-    t = made.as_built_transmission(lens, proxy_sensitivity(lens), known)
+    lens, known = m.small(), as_built_lens.at_rest(X)
+    t = as_built.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85,
@@ -43,7 +43,7 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     rows = settings.sample_um / window * (1 + 2 * (waves * kept).sum(-1))
     light = np.asarray(found.intensity).reshape(3, samples, samples)
     want = PixelPsfStack(torch.as_tensor(rows @ light @ rows.T), settings.depths_um)
-    got = built.MadeLens(lens, settings).stack(X)
-    assert built.psf_error(got, want) < 0.03
-    on_axis = built.MadeLens(lens, m.OPTICS).stack(X)
-    assert built.psf_error(on_axis, want) > 0.1
+    got = as_built_lens.MadeLens(lens, settings).stack(X)
+    assert as_built_lens.psf_error(got, want) < 0.03
+    on_axis = as_built_lens.MadeLens(lens, m.OPTICS).stack(X)
+    assert as_built_lens.psf_error(on_axis, want) > 0.1

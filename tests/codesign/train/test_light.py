@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.optics import formed, stack
+from codesign.optics import image_formation, stack
 from codesign.optics.stack import OpticsConfig
 from codesign.train import run
 from codesign.train.imaging import StepImaging
@@ -57,7 +57,7 @@ window_samples = 11
 """
 
 
-LIVE = formed.make_differentiable_imager
+LIVE = image_formation.make_differentiable_imager
 
 
 def _never(step):

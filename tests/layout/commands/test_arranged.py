@@ -10,7 +10,7 @@ import pytest
 
 import layout
 from layout.commands import make
-from layout.formats import gdsii_write, handover
+from layout.formats import gdsii_write, job_files
 from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
 from metalens import cli, lens
 from metalens.cell.record import Cell
@@ -184,7 +184,7 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
     assert "pads.gds" in sheet
     assert f"{len(dies)} whole dies" in page
     assert (tmp_path / "m" / "wafer.png").is_file()
-    held = handover.read_dose_table(tmp_path / "m" / "doses.csv")
+    held = job_files.read_dose_table(tmp_path / "m" / "doses.csv")
     assert held[1, 0] == 1.0
     assert held[1, 1] == held[20, 3] == 1.5
 
@@ -241,7 +241,7 @@ def test_doses_of_lenses_and_their_surroundings_are_corrected_each(
     assert run(folder, text, tmp_path / "m", "--json") == 0
     values = json.loads(capsys.readouterr().out)
     assert values["failures"] == []
-    held = handover.read_dose_table(tmp_path / "m" / "doses.csv")
+    held = job_files.read_dose_table(tmp_path / "m" / "doses.csv")
     assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(
         n == 1 for n, _ in held
     )

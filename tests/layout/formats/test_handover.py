@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import handover
+from layout.formats import job_files
 from layout.formats.library import library_of
 from layout.mask import fields
 from layout.process.process import DieSettings, ExposureSettings, Process, WriteField
@@ -36,7 +36,7 @@ def made():
 
 def test_fields_go_row_by_row_and_back_and_hold_every_pillar_once(made, tmp_path):
     source, split = lens_map(), made[1]
-    steps = handover.field_sequence(split)
+    steps = job_files.field_sequence(split)
     assert len(steps) == split.used < split.pillars.size
     rows = [[s for s in steps if s.y_um == y] for y in sorted({s.y_um for s in steps})]
     assert [s for row in rows for s in row] == steps
@@ -51,7 +51,7 @@ def test_fields_go_row_by_row_and_back_and_hold_every_pillar_once(made, tmp_path
         )
         assert inside.sum() == s.pillars > 0
     assert sum(s.pillars for s in steps) == len(i)
-    handover.write_fields(steps, tmp_path / "fields.csv")
+    job_files.write_fields(steps, tmp_path / "fields.csv")
     with open(tmp_path / "fields.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [int(line["pillars"]) for line in lines] == [s.pillars for s in steps]
@@ -92,7 +92,7 @@ def test_the_charge_is_dose_times_area(made):
         * 1e-8
         * 370.0
     )
-    found = handover.charge_uC(areas, plan.doses, PROCESS)
+    found = job_files.charge_uC(areas, plan.doses, PROCESS)
     assert found["pillars"] == pytest.approx(want, rel=1e-12)
     assert found["aperture"] == pytest.approx(areas[2, 0] * 1e-8 * 370.0, rel=1e-12)
 
@@ -112,7 +112,7 @@ def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
     plan = layout.plan(lens_map(), process)
     if process.exposure.corrected:
         plan = layout.correct(plan, process.exposure)
-    marks = handover.marks_um(plan)
+    marks = job_files.marks_um(plan)
     crosses = [m for m in marks if m[2:] == (80.0, 80.0)]
     assert len(marks) == 9  # four crosses, coarse and fine, and the F
     assert len(crosses) == 4
@@ -139,7 +139,7 @@ def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
 
 def test_the_sheet_names_files_doses_fields_and_leaves_currents_open(made):
     plan, split = made
-    text = handover.job_sheet(
+    text = job_files.job_sheet(
         plan, PROCESS, split, {"mask.oas": 1234567}, "FAILS: one thing"
     )
     lines = text.splitlines()
@@ -156,4 +156,4 @@ def test_a_dose_table_that_an_editor_saved_is_read(tmp_path):
     path.write_text(
         "layer,datatype,relative_dose\n7,3,1.375\n2,0,0.9\n", encoding="utf-8-sig"
     )
-    assert handover.read_dose_table(path) == {(7, 3): 1.375, (2, 0): 0.9}
+    assert job_files.read_dose_table(path) == {(7, 3): 1.375, (2, 0): 0.9}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import handover
+from layout.formats import job_files
 from layout.mask import fields
 from layout.process.process import DesignRules, DieSettings, ExposureSettings, Process
 from metalens.core.errors import ProcessError
@@ -126,10 +126,10 @@ def test_fine_crosses_are_a_fifth_of_the_coarse_ones_beside_them():
     made = process(mark_um=150.0, mark_width_um=10.0)
     plan = layout.plan(lens_map(), made)
     found = [
-        (x, y) for x, y, wide, high in handover.marks_um(plan) if wide == high == 150.0
+        (x, y) for x, y, wide, high in job_files.marks_um(plan) if wide == high == 150.0
     ]
     fine = [
-        (x, y) for x, y, wide, high in handover.marks_um(plan) if wide == high == 30.0
+        (x, y) for x, y, wide, high in job_files.marks_um(plan) if wide == high == 30.0
     ]
     assert len(found) == len(fine) == 4
     # beside each in the direction of the middle: arms of 75 and 15 um and 10 um between
@@ -144,7 +144,7 @@ def test_verniers_are_said_on_the_job_sheet_and_can_be_left_out():
         made = process(verniers=wanted)
         plan = layout.plan(lens_map(), made)
         split = fields.split_write_fields(lens_map(), made)
-        sheet = handover.job_sheet(plan, made, split, {}, "fine")
+        sheet = job_files.job_sheet(plan, made, split, {}, "fine")
         assert (f"{STEP_NM:g} nm longer from bar to bar" in sheet) == wanted
         assert any(f.name == "VERNIERS" for f in plan.figures) == wanted
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import erf
 
-from layout.pec.drawn import DrawnDiscs, DrawnOutlines
+from layout.pec.pillar_exposure import DrawnDiscs, DrawnOutlines
 from layout.pec.psf import PointExposure
 
 POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))

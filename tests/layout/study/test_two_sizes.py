@@ -25,8 +25,8 @@ from metalens.fabrication import (
     State,
     draw_lenses,
     names_of_kind,
-    own,
     pair_sensitivities,
+    solved_rates,
 )
 from metalens.fabrication import two_sizes as by_pairs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
@@ -189,7 +189,7 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
 
     def solved(lens, width_um, length_um):
         asked.append(np.stack([width_um, length_um], 1))
-        made = own.ResponseRates(
+        made = solved_rates.ResponseRates(
             np.stack([width_um, length_um], 1),
             rates(width_um, length_um),
             0.03,

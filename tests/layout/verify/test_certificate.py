@@ -11,12 +11,12 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.formats import handover
+from layout.formats import job_files
 from layout.pec import polygon_edges, psf
 from layout.pec.polygon_edges import ExposedPolygons
 from layout.process.process import EtchProfile, ExposureSettings, Process
-from layout.verify.as_written import LensRows
 from layout.verify.exposure import verify_exposure
+from layout.verify.written_lens import LensRows
 from metalens.cell import Cell
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
@@ -43,11 +43,11 @@ def written(process, furnished=True):
     plan = layout.correct(bare, process.exposure) if known else bare
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
-        handover.write_dose_table(plan, process, Path(folder) / "doses.csv")
+        job_files.write_dose_table(plan, process, Path(folder) / "doses.csv")
         return (
             plan,
             layout.read_oasis(Path(folder) / "m.oas"),
-            handover.read_dose_table(Path(folder) / "doses.csv"),
+            job_files.read_dose_table(Path(folder) / "doses.csv"),
         )
 
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.formats import handover
+from layout.formats import job_files
 from layout.pec import polygon_edges
 from layout.pec.polygon_edges import ExposedPolygons
 from layout.process.process import DieSettings, ExposureSettings, Process
@@ -71,7 +71,7 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
     process = Process(exposure=ExposureSettings(**beam))
     plan = corrected(lens_map(*source), process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
+    job_files.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     assert len(drawn) == plan.counts()[1:].sum()
     terms = [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -115,7 +115,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     made = of_two_sizes(lens_map(29, 0.4, thinnest_um, 0.29, 0.7), thinnest_um, 0.29)
     plan = corrected(made, process)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
+    job_files.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     resist = plain_exposure.Resist(
         drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -123,7 +123,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     found = verify(
         plan,
         layout.read_gdsii(tmp_path / "m.gds"),
-        handover.read_dose_table(tmp_path / "doses.csv"),
+        job_files.read_dose_table(tmp_path / "doses.csv"),
         process,
     ).report.edges
     assert set(found.layer.tolist()) == {

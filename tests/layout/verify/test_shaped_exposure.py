@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import handover
+from layout.formats import job_files
 from layout.process.process import DieSettings, ExposureSettings, Process
-from layout.verify.as_written import LensRows
 from layout.verify.exposure import verify_exposure
+from layout.verify.written_lens import LensRows
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
 from metalens.fabrication import Bias
@@ -94,11 +94,11 @@ def test_every_shape_comes_out_with_its_area_and_the_certificate_says_how_nearly
     source = lens(*made)
     plan = corrected(source, process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
+    job_files.write_dose_table(plan, process, tmp_path / "doses.csv")
     found = certified(
         layout.read_gdsii(tmp_path / "m.gds"),
         plan,
-        handover.read_dose_table(tmp_path / "doses.csv"),
+        job_files.read_dose_table(tmp_path / "doses.csv"),
         process,
     )
     assert len(found) == plan.counts()[1:].sum()
@@ -138,12 +138,12 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     source = lens(corner, lattice, (0.22, 0.226), turned=False)
     plan = corrected(source, process, furnished=False)
     layout.write_oasis(plan, tmp_path / "m.oas")
-    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
+    job_files.write_dose_table(plan, process, tmp_path / "doses.csv")
     rows = LensRows(plan)
     verify_exposure(
         layout.read_oasis(tmp_path / "m.oas"),
         plan,
-        handover.read_dose_table(tmp_path / "doses.csv"),
+        job_files.read_dose_table(tmp_path / "doses.csv"),
         process,
         keep=rows.take,
     )
@@ -193,9 +193,9 @@ def test_lone_pillars_of_any_shape_and_lattice_come_out_as_designed(tmp_path, ca
     source = lens(*made, empty=0.0)
     plan = corrected(source, process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
+    job_files.write_dose_table(plan, process, tmp_path / "doses.csv")
     content = layout.read_gdsii(tmp_path / "m.gds")
-    table = handover.read_dose_table(tmp_path / "doses.csv")
+    table = job_files.read_dose_table(tmp_path / "doses.csv")
     found, d = verify(plan, content, table, process), source.diameters
     x, y, size = found.x_um, found.y_um, found.made_nm
     row = np.rint(y / d.steps_um[1] + (len(d.y_um) - 1) / 2)

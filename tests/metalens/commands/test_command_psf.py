@@ -16,7 +16,7 @@ from metalens.commands.psf import Options, PsfSettings
 from metalens.core.errors import ConfigError
 from metalens.lens import NeighbourRows
 from metalens.library.proxy import Proxy
-from metalens.psf import of_lens
+from metalens.psf import lens_psfs
 
 SETTINGS = """
 depths_mm = [0.8, 2.0, 0.4]
@@ -137,7 +137,7 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
     assert asked == [(6, 9, 12)]  # NA 0.11: 19 pillars in a zone, more than a row takes
     assert rough.budget.neighbours > 0
     made = small_lens()
-    edge = of_lens.sine_aperture(made, (0.0, 0.0))
+    edge = lens_psfs.sine_aperture(made, (0.0, 0.0))
     kept = integrate.quad(
         lambda s: float(abs(known.mean(np.array(s))) ** 2) * 2 * s / edge**2, 0, edge
     )[0]

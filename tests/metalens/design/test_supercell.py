@@ -15,7 +15,7 @@ from metalens.core.errors import CellError
 from metalens.design import neighbours as supercell
 from metalens.design.profiles import Focus
 from metalens.library.proxy import Proxy
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 
 CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6), substrate="SiO2")
 GLASS = dataclasses.replace(CELL, pillar=Index(1.05))
@@ -309,7 +309,7 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     want = solved * np.array([(1 - sine**2) ** -0.25, (1 - sine**2) ** 0.25])
     along, down = np.indices((24, 24))[::-1]
     turns = 2 * np.pi / count * (along + down if diagonal else along)
-    got = among.apply_jones_coupling(
+    got = neighbour_coupling.apply_jones_coupling(
         torch.tensor(np.angle(np.exp(1j * turns))),
         torch.ones(24, 24).double(),
         rows,

@@ -14,9 +14,9 @@ from metalens.fabrication import (
     ResponseError,
     inapplicable_names,
     names_of_kind,
-    own,
     own_rates,
     response,
+    solved_rates,
 )
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
@@ -58,7 +58,7 @@ def lens(cell=CELL, *, hand="", tilted_light=False):
 @pytest.fixture
 def few_orders(monkeypatch):
     """Three harmonics, where a solve takes milliseconds."""
-    monkeypatch.setattr(own, "_TRUNCATIONS", (2, 3))
+    monkeypatch.setattr(solved_rates, "_TRUNCATIONS", (2, 3))
 
 
 def changed(name, x):
@@ -110,7 +110,9 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
 
     def solved(lens, size_um):
         rates = np.array([table(rows.get(i, {}), size_um) for i in range(len(ROWS))])
-        return own.ResponseRates(size_um[:, None], rates, 0.013, table(edge, size_um))
+        return solved_rates.ResponseRates(
+            size_um[:, None], rates, 0.013, table(edge, size_um)
+        )
 
     monkeypatch.setattr(response, "own_rates", solved)
     found = response.proxy_sensitivity(lens())
@@ -184,7 +186,7 @@ def test_the_error_is_the_largest_change_from_the_coarser_truncation(
     straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
     sizes = np.array([0.17, 0.26])
     fine = own_rates(straight, sizes)
-    monkeypatch.setattr(own, "_TRUNCATIONS", (1, 2))
+    monkeypatch.setattr(solved_rates, "_TRUNCATIONS", (1, 2))
     coarse = own_rates(straight, sizes)
     pairs = zip(
         *(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True

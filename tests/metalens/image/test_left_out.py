@@ -10,7 +10,7 @@ import torch
 
 from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window, psfs
-from metalens.image.left_out import (
+from metalens.image.model_error import (
     JudgedPsfs,
     choose_polarisation,
     folding_error,

@@ -14,7 +14,7 @@ from metalens.cell import Cell, Film, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import SceneError
 from metalens.design import Focus, profiles
-from metalens.image import Grid, Optics, PillarWave, Window, imager, left_out, psfs
+from metalens.image import Grid, Optics, PillarWave, Window, imager, model_error, psfs
 from metalens.image.texture import texture_error
 from metalens.lens import DiameterMap, Lens, NeighbourRows
 from metalens.library import Proxy
@@ -77,7 +77,7 @@ def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
     )[0, 0]
     assert float(texture_error(got.double(), want)) < 3e-2
     assert float(got.sum() / want.sum()) == pytest.approx(1, abs=2.5e-2)
-    said = left_out.gathering_error(
+    said = model_error.gathering_error(
         optics, 0.85, Window(SAMPLES, STEP), (at, torch.tensor([4e3]))
     )
     true = float(texture_error(got.double() / got.sum(), want / want.sum()))

@@ -11,7 +11,7 @@ import torch
 from metalens import psf
 from metalens.core.errors import PropagationError
 from metalens.lens import NeighbourRows
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 from tests.referees import vectorial
 
 WAVE, PITCH = 0.85, 0.4
@@ -55,13 +55,15 @@ def test_a_grating_has_the_factor_of_its_slope_and_azimuth_on_each_field(azimuth
     its own.
     """
     phase = torch.tensor(np.angle(np.exp(1j * grating(0.41, azimuth))))
-    got = among.apply_jones_coupling(phase, torch.full_like(phase, 0.8), ROWS, PITCH)
+    got = neighbour_coupling.apply_jones_coupling(
+        phase, torch.full_like(phase, 0.8), ROWS, PITCH
+    )
     along, across = ROWS.at(np.array(0.41), azimuth)
     c, s = math.cos(azimuth), math.sin(azimuth)
     assert got.xx.numpy() == pytest.approx(along * c * c + across * s * s, rel=1e-9)
     assert got.yy.numpy() == pytest.approx(along * s * s + across * c * c, rel=1e-9)
     assert got.xy.numpy() == pytest.approx((along - across) * c * s, rel=1e-9, abs=1e-9)
-    turned, level = among.apply_scalar_coupling(
+    turned, level = neighbour_coupling.apply_scalar_coupling(
         phase, torch.full_like(phase, 0.8), ROWS, PITCH
     )
     mean = (along + across) / 2
@@ -77,21 +79,24 @@ def test_slopes_of_a_lens_are_those_of_its_paths_and_shares_of_rows_make_no_diff
     """
     phase, level, sines = lens()
     light = torch.polar(torch.tensor(level), torch.tensor(phase))
-    slopes = among.phase_slopes(light, PITCH)
+    slopes = neighbour_coupling.phase_slopes(light, PITCH)
     for got, want in zip(slopes, sines, strict=True):
         error = np.abs(got.numpy() * WAVE / (2 * np.pi) - want)
         inner = (
-            among._around(
+            neighbour_coupling._around(
                 torch.tensor(level[:, 1:] * level[:, :-1]).to(light), along=-1
             ).real.numpy()
             == 20
         )
         assert error[inner].max() < 1e-3 * 0.51
         assert error[level > 0].max() < 0.02 * 0.51
-    whole = among.mean_coupling(light, ROWS, PITCH)
-    monkeypatch.setattr(among, "ROWS", 7)
+    whole = neighbour_coupling.mean_coupling(light, ROWS, PITCH)
+    monkeypatch.setattr(neighbour_coupling, "ROWS", 7)
     assert (
-        float((among.mean_coupling(light, ROWS, PITCH) - whole).abs().max()) < 1e-13
+        float(
+            (neighbour_coupling.mean_coupling(light, ROWS, PITCH) - whole).abs().max()
+        )
+        < 1e-13
     )  # of 1: a few roundings of other lanes
     far = torch.tensor(
         np.hypot(*np.indices((100, 100)) - 2.0) > 130
@@ -242,7 +247,7 @@ def test_factors_made_once_serve_as_the_rows_do():
         samples=12,
         polarisation="flux",
     )
-    fields = among.apply_jones_coupling(
+    fields = neighbour_coupling.apply_jones_coupling(
         torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH
     )
     got, want = (

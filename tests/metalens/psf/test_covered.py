@@ -13,7 +13,7 @@ from scipy import optimize
 from metalens.cell import Film, Index
 from metalens.optics import Layers, Media
 from metalens.propagate import PropagationCase
-from metalens.psf import of_lens, vector
+from metalens.psf import lens_psfs, vector
 
 EDGE, DISTANCE, FILM, GLASS, GEL = (
     200.2,
@@ -62,7 +62,7 @@ def test_the_aperture_is_that_of_the_medium_at_the_sensor(angle):
     slope = math.hypot(math.tan(angle[0]), math.tan(angle[1]))
     centre = reach(math.sin(math.atan(slope)))
     want = (sine(centre + EDGE) - sine(centre - EDGE)) / 2
-    assert of_lens.sine_aperture(lens(), angle) == pytest.approx(want, rel=1e-9)
+    assert lens_psfs.sine_aperture(lens(), angle) == pytest.approx(want, rel=1e-9)
 
 
 def test_obliquity_is_that_of_the_medium_at_the_sensor():
@@ -73,7 +73,7 @@ def test_obliquity_is_that_of_the_medium_at_the_sensor():
         1 / math.sqrt(1 - sine(EDGE * math.sqrt((i + 0.5) / 400)) ** 2)
         for i in range(400)
     ]
-    assert of_lens.obliquity_variation(lens(), (0.0, 0.0)) == pytest.approx(
+    assert lens_psfs.obliquity_variation(lens(), (0.0, 0.0)) == pytest.approx(
         np.std(steep) / np.mean(steep), rel=1e-4
     )
 

@@ -14,7 +14,7 @@ import torch
 from metalens import propagate, psf
 from metalens.core.errors import PropagationError
 from metalens.optics import Layers
-from metalens.psf import of_lens, spectrum
+from metalens.psf import lens_psfs, spectrum
 from metalens.psf.cells import nyquist_um
 from tests.referees import vectorial
 
@@ -193,7 +193,7 @@ def test_what_one_scalar_misses_is_below_what_is_said_of_light_from_the_side(
         diameters=SimpleNamespace(radius_um=radius, pitch_um=0.0),
     )
     said = psf.scalar_error(
-        of_lens.sine_aperture(lens, angle), of_lens.obliquity_variation(lens, angle)
+        lens_psfs.sine_aperture(lens, angle), lens_psfs.obliquity_variation(lens, angle)
     )
     assert 0.1 * said < true < said
 

@@ -240,7 +240,7 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens, response
     from metalens.library import Proxy
-    from metalens.psf.of_lens import library_incidence
+    from metalens.psf.lens_psfs import library_incidence
 
     angled = (
         np.array([[[1.3, 4.0]], [[0.4, 0.0]]]),

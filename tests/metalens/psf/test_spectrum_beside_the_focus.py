@@ -17,7 +17,7 @@ from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
-from metalens.psf.of_lens import paths_um
+from metalens.psf.lens_psfs import paths_um
 
 PHASE = np.array(
     [[0.0, 1.15 * math.pi], [-0.4, -1.9]]

@@ -16,9 +16,8 @@ from metalens.core.store import Provenance
 from metalens.lens import Lens, response
 from metalens.optics import media
 from metalens.propagate import paths
-from metalens.psf import among
+from metalens.psf import neighbour_coupling
 from metalens.psf import spectrum as spectra
-from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import (
     NEIGHBOURS,
     RINGS,
@@ -33,6 +32,7 @@ from metalens.psf.budget import (
     worst_of_budgets,
 )
 from metalens.psf.extended import Extent, source_image_reach
+from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import MeasuredSpectrum, Source, SpectralNodes
 from metalens.psf.stack import psf_stack
@@ -499,8 +499,8 @@ def all_maps(
         return (phase, level), None
     coupling = phase, level, lens.neighbours, lens.diameters.pitch_um
     if scalar:
-        return among.apply_scalar_coupling(*coupling), None
-    return (phase, level), among.apply_jones_coupling(*coupling)
+        return neighbour_coupling.apply_scalar_coupling(*coupling), None
+    return (phase, level), neighbour_coupling.apply_jones_coupling(*coupling)
 
 
 def passed_um2(

@@ -10,14 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import joined, parts, separation, wafer
+from layout.arrange import assembly, parts, separation, wafer
 from layout.arrange.record import CellPart, DieFloorplan, Placement, WaferSettings
 from layout.commands import make, page
 from layout.commands.job import FloorplanWork, Options, StageTimes
 from layout.drc.klayout import write_lyp
 from layout.drc.lattice import check_plan
 from layout.drc.library import check_library
-from layout.formats import compare, gdsii_write, handover, oasis_write
+from layout.formats import compare, gdsii_write, job_files, oasis_write
 from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, library_of
 from layout.formats.reading import read_mask
@@ -99,13 +99,13 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
     work.failures += spaces[:_LISTED] + ([f"{unlisted} more"] if unlisted > 0 else [])
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    die = joined.die_cell(name, work.placed, kept=kept)
+    die = assembly.die_cell(name, work.placed, kept=kept)
     return die if record.wafer is None else _stepped(work, record.wafer, die, marks)
 
 
 def _parts(
     work: FloorplanWork,
-) -> tuple[list[joined.PartPlacement], parts.DieComponent | None]:
+) -> tuple[list[assembly.PartPlacement], parts.DieComponent | None]:
     """Everything that stands on the die, and the alignment mark of the wafer.
 
     All lenses and frames are drawn first, and corrected together, so that they share
@@ -114,7 +114,7 @@ def _parts(
     record = work.record
     process = work.process
     size = work.record.wafer
-    files = [joined.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
+    files = [assembly.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
     drawings = []
     for part in record.lens:
         path = work.options.lens.parent / part.file
@@ -125,14 +125,14 @@ def _parts(
     plans = [drawing.made.plan for drawing in drawings]
     if record.die is not None:
         sketches = [
-            joined.PartPlacement(
+            assembly.PartPlacement(
                 parts.of_plan(part.name, plan, process, corrected=False), part.at
             )
             for part, plan in zip(record.lens, plans, strict=True)
         ]
         box = (
             separation.extent_of_copies([*sketches, *files], exposed=True)
-            / joined.PER_UM
+            / assembly.PER_UM
         )
         plans.append(
             build.die_surroundings(
@@ -160,7 +160,7 @@ def _parts(
         solved_plans = make.correct_doses(plans, process, corrected=work.corrected)
     mark = _frame_part(work, solved_plans.pop()[0]) if has_marks else None
     placed = [
-        joined.PartPlacement(_lens_part(work, drawing, solved_plan), part.at)
+        assembly.PartPlacement(_lens_part(work, drawing, solved_plan), part.at)
         for part, drawing, solved_plan in zip(
             record.lens, drawings, solved_plans, strict=False
         )
@@ -168,7 +168,7 @@ def _parts(
     placed += files
     if record.die is not None:
         around = _frame_part(work, solved_plans[-1][0])
-        placed.append(joined.PartPlacement(around, (Placement(),)))
+        placed.append(assembly.PartPlacement(around, (Placement(),)))
     return placed, mark
 
 
@@ -281,7 +281,9 @@ def _stepped(
         mark: alignment mark; None: no marks.
     """
     scatter_um = separation.reach_um(work.process)
-    exposed_box = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
+    exposed_box = (
+        separation.extent_of_copies(work.placed, exposed=True) / assembly.PER_UM
+    )
     need = max(scatter_um, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(exposed_box[2 + axis] - exposed_box[axis])
@@ -290,15 +292,15 @@ def _stepped(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
                 f"need {need:.4g}"
             )
-    box = separation.extent_of_copies(work.placed) / joined.PER_UM
+    box = separation.extent_of_copies(work.placed) / assembly.PER_UM
     left, bottom, right, top = box.tolist()
-    margin = max(scatter_um, joined.MARGIN_UM)
+    margin = max(scatter_um, assembly.MARGIN_UM)
     box_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
-    steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=joined.PER_UM)
+    steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=assembly.PER_UM)
     at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
-    marks = None if mark is None else joined.PartPlacement(mark, at)
-    return joined.wafer_cell(work.record.name, die, steps, marks)
+    marks = None if mark is None else assembly.PartPlacement(mark, at)
+    return assembly.wafer_cell(work.record.name, die, steps, marks)
 
 
 def _write(work: FloorplanWork, library: MaskLibrary) -> None:
@@ -325,14 +327,14 @@ def _write(work: FloorplanWork, library: MaskLibrary) -> None:
 def _accompany(work: FloorplanWork, library: MaskLibrary) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
     work.areas_um2 = library.areas_um2()
-    fields = list(joined.place_fields(work.placed, work.splits))
-    handover.write_fields(fields, work.folder / "fields.csv")
+    fields = list(assembly.place_fields(work.placed, work.splits))
+    job_files.write_fields(fields, work.folder / "fields.csv")
     work.notes += [
         f"{name}: copies that are turned by no quarter have no write fields"
-        for name in joined.without_fields(work.placed, work.splits)
+        for name in assembly.without_fields(work.placed, work.splits)
     ]
     write_lyp(library, work.folder / "mask.lyp")
-    handover.write_dose_table(library, work.process, work.folder / "doses.csv")
+    job_files.write_dose_table(library, work.process, work.folder / "doses.csv")
     limit = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
     dose_count = len(
@@ -368,7 +370,7 @@ def _values(work: FloorplanWork, library: MaskLibrary) -> dict[str, Any]:
         "failures": work.failures,
         "notes": work.notes,
         "unchecked": work.unchecked,
-        "charge_uC": handover.charge_uC(work.areas_um2, library.doses, work.process),
+        "charge_uC": job_files.charge_uC(work.areas_um2, library.doses, work.process),
         "dies": 1 if work.dies is None else len(work.dies.index),
         "cells": len(library.cells),
         "doses": len(library.doses),
@@ -425,11 +427,11 @@ def _sheet(work: FloorplanWork, library: MaskLibrary, fields: int) -> list[str]:
     return [
         *lines,
         "",
-        *handover.charge_lines(handover.charge_uC(areas, library.doses, process)),
+        *job_files.charge_lines(job_files.charge_uC(areas, library.doses, process)),
         f"Write fields: {fields}{many}, part by part, in the order of fields.csv",
         "  they cover the pillars of the lenses alone",
         "",
-        *handover.dose_lines(areas, library.doses, library.layer_names, process),
+        *job_files.dose_lines(areas, library.doses, library.layer_names, process),
     ]
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from scipy import stats
 
 from characterize.captures import shift_frames
-from characterize.inference import causes
-from characterize.inference.causes import ImageChange
+from characterize.inference import systematic_effects
 from characterize.inference.leastsquares import FitSolution
 from characterize.inference.multistart import SearchTask
+from characterize.inference.systematic_effects import ImageChange
 from characterize.model import PLACE, background_planes
 from metalens.core.arrays import Array
 
@@ -27,9 +27,9 @@ _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost: number and range
 _PATCHY, _SPOT = 3.0, 0.2
 
 _CURES = {
-    causes.LAMP: "state the light of every frame, by a monitor diode, in proportion as "
+    systematic_effects.LAMP: "state the light of every frame, by a monitor diode, in proportion as "
     "exposure_s of stage.csv",
-    causes.WINDOWS: "cut the frames of every angle about its chief ray, distance times "
+    systematic_effects.WINDOWS: "cut the frames of every angle about its chief ray, distance times "
     "tan(angle) off that on the axis",
 }
 
@@ -171,7 +171,7 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     )
     tests, unstated = list[ScoreTest](), list[ImageChange]()
     by_name = dict(zip(task.names, mode.slopes, strict=True))
-    for effect in causes.systematic_changes(task, x, by_name):
+    for effect in systematic_effects.systematic_changes(task, x, by_name):
         change = (effect.images * root).reshape(len(effect.images), -1)
         test = dataclasses.replace(
             fit.score_test(effect.cause, change),

@@ -10,7 +10,7 @@ import numpy as np
 
 from layout.arrange.parts import UNIT_NM, DieComponent, moved_cell
 from layout.arrange.record import Placement
-from layout.formats import handover
+from layout.formats import job_files
 from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
 from layout.mask.fields import FieldPlan
 from layout.process.process import LayerNumber
@@ -194,7 +194,7 @@ def _take(
 
 def place_fields(
     placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
-) -> Iterator[handover.WriteStep]:
+) -> Iterator[job_files.WriteStep]:
     """Write fields of all lenses on the die, part by part in their order of writing.
 
     A field has sides along x and y: copies that are turned by no quarter have none
@@ -207,7 +207,7 @@ def place_fields(
     for part_placement in placed:
         if part_placement.part.name not in splits:
             continue
-        steps = handover.field_sequence(splits[part_placement.part.name])
+        steps = job_files.field_sequence(splits[part_placement.part.name])
         centres = np.array([(step.x_um, step.y_um) for step in steps])
         for copies in part_placement.copies(part_placement.part.top):
             if not copies.turn.quarter:
@@ -220,7 +220,7 @@ def place_fields(
                 for n, step in enumerate(steps):
                     sides = step.width_um, step.height_um
                     width, height = sides if is_level else sides[::-1]
-                    yield handover.WriteStep(
+                    yield job_files.WriteStep(
                         float(x[n]) + copy_x / PER_UM,
                         float(y[n]) + copy_y / PER_UM,
                         width,
