@@ -25,7 +25,7 @@ _MOST_NODES = 600
 _CELL = 0.005  # relative width of the cells of distance, each with its coupling terms
 _STEP = 1e-3  # relative step of the distance for derivatives of the terms
 # samples of a window over those of the sampling theorem, and beyond its ends
-_ROOM, _BEYOND = 1.2, 3
+_ROOM, _BEYOND = 1.6, 3
 _MIXED = 0.1  # share of the tolerance for the functions of p in the terms
 # the same where terms are left out too: it adds an eighth to their error
 _MIXED_FEW = 0.5
