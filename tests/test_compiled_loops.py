@@ -57,4 +57,4 @@ def test_what_a_cached_loop_calls_is_put_into_it(module):
 
 def test_the_loops_are_found():
     assert MODULES
-    assert "frames" in dict(loops("codesign.eye.kernel"))
+    assert "render_strips" in dict(loops("codesign.eye.kernel"))

@@ -30,7 +30,7 @@ from metalens.cell.shapes import Circle, Rectangle
 from metalens.core.errors import ConfigError, FitError, ProcessError
 from metalens.fabrication import (
     Bias,
-    Printed,
+    PrintedProcess,
     ResponseError,
     Spread,
     State,
@@ -251,7 +251,9 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
         tolerance.analyse_tolerance(plain, Process(spread=Spread.only(turn_deg=0.2)))
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
-        ErrorBudget(plain, BudgetInputs(mask=Printed(spread=Spread.only(width_nm=1.0))))
+        ErrorBudget(
+            plain, BudgetInputs(mask=PrintedProcess(spread=Spread.only(width_nm=1.0)))
+        )
     assert State.of({"width_nm": 3.0}).response_amounts()[
         names_of_kind(ResponseError).index("width_nm")
     ] == pytest.approx(3e-3)

@@ -197,7 +197,9 @@ def fmmax_solver(order: int) -> Any:
         u=CELL.pitch_um * fmmax_basis.X, v=CELL.pitch_um * fmmax_basis.Y
     )
     expansion = fmmax_basis.generate_expansion(
-        lattice, (2 * order + 1) ** 2, truncation=fmmax_basis.Truncation.PARALLELOGRAMIC
+        lattice,
+        (2 * order + 1) ** 2,
+        truncation=fmmax_basis.TruncatedSolution.PARALLELOGRAMIC,
     )
     zero = int(
         np.flatnonzero((np.asarray(expansion.basis_coefficients) == 0).all(1))[0]

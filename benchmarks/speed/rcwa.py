@@ -180,7 +180,9 @@ def fmmax_solver(
     lattice = fmmax.LatticeVectors(u=cell.pitch_um * fmmax.X, v=cell.pitch_um * fmmax.Y)
     reach = np.arange(-harmonics, harmonics + 1)
     terms = int(np.count_nonzero(reach[:, None] ** 2 + reach**2 <= harmonics**2))
-    expansion = fmmax.generate_expansion(lattice, terms, fmmax.Truncation.CIRCULAR)
+    expansion = fmmax.generate_expansion(
+        lattice, terms, fmmax.TruncatedSolution.CIRCULAR
+    )
 
     def modes(permittivity: Any) -> Any:
         return fmmax.eigensolve_isotropic_media(

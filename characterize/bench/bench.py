@@ -74,7 +74,8 @@ class BenchCamera:
             )
         if not 0 <= self.hot_share < 1:
             raise FitError(
-                f"camera.hot_share = {self.hot_share}: need a share of the pixels, 0 to below 1"
+                f"camera.hot_share = {self.hot_share}: need a share of the pixels, 0 "
+                "to below 1"
             )
 
 
@@ -104,7 +105,8 @@ class HiddenLens:
     def __post_init__(self) -> None:
         if not self.depths_um or min(self.depths_um) <= 0 or not self.peak_e > 0:
             raise FitError(
-                "need depths_um with at least one source depth above 0, and peak_e above 0"
+                "need depths_um with at least one source depth above 0, and peak_e "
+                "above 0"
             )
 
     def vector(self) -> Array:
@@ -193,7 +195,8 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
     )
     if depth.min() <= 0:
         raise FitError(
-            f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens"
+            f"true source depth {depth.min():.0f} um: stage_zero_um puts the source "
+            "behind the lens"
         )
     generator = np.random.default_rng(truth.seed + 1)
     noise = generator.standard_normal(lens.diameters.diameter_um.shape)

@@ -56,11 +56,13 @@ class IntervalRequirement:
     def __post_init__(self) -> None:
         if self.name not in PLACE:
             raise FitError(
-                f"wanted {self.name!r}: no such parameter{nearest_name_hint(self.name, NAMES)}"
+                f"wanted {self.name!r}: no such "
+                f"parameter{nearest_name_hint(self.name, NAMES)}"
             )
         if not (self.within > 0 and math.isfinite(self.within)):
             raise FitError(
-                f"wanted {self.name}: within = {self.within}; need a finite number above 0"
+                f"wanted {self.name}: within = {self.within}; need a finite number "
+                "above 0"
             )
 
 
@@ -101,7 +103,8 @@ class BenchProtocol:
         nearest, farthest = self.depths_um
         if not (0 < nearest < farthest and self.depth_count >= 2 and self.frames >= 1):
             raise FitError(
-                f"depths_um {self.depths_um}, depth_count {self.depth_count}, frames {self.frames}: need "
+                f"depths_um {self.depths_um}, depth_count {self.depth_count}, frames "
+                f"{self.frames}: need "
                 "0 < nearest < farthest, two depths or more and one frame or more"
             )
         if not (
@@ -111,7 +114,8 @@ class BenchProtocol:
             and min(self.peak_e, self.pixel_um) > 0
         ):
             raise FitError(
-                "need at least one of angles_deg and exposures; exposures, peak_e and pixel_um above 0"
+                "need at least one of angles_deg and exposures; exposures, peak_e and "
+                "pixel_um above 0"
             )
 
 
@@ -348,14 +352,17 @@ def _missed_requirements(
                 for cause in np.argsort(-unstated.by_cause[:, index])[:3]
             ]
             sentences.append(
-                f"{expected}: within the model it is +- {within_model:.2g}, more frames do not help; state what else there "
-                f"is or is not, first of all {', '.join(causes)} (capture.toml, [[known]])"
+                f"{expected}: within the model it is +- {within_model:.2g}, more "
+                "frames do not help; state what else there "
+                f"is or is not, first of all {', '.join(causes)} (capture.toml, "
+                "[[known]])"
             )
         elif total > requirement.within * (1 + 1e-9):
             light_factor = within_model**2 / (requirement.within**2 - unstated_half**2)
             sentences.append(
                 f"{expected}: {light_factor:.1f} times the light "
-                f"({math.ceil(count * light_factor)} such frames), other depths or angles, or an independent measurement"
+                f"({math.ceil(count * light_factor)} such frames), other depths or "
+                "angles, or an independent measurement"
             )
     return sentences
 
@@ -369,7 +376,8 @@ def _place_warnings(frames: Array) -> list[str]:
         return []
     consequence = "is refused" if places == 1 else "cannot be tested on frames left out"
     return [
-        f"frames at {places} of the depths and angles: a fit of fewer than {2 if places == 1 else 4} {consequence}; "
+        f"frames at {places} of the depths and angles: a fit of fewer than "
+        f"{2 if places == 1 else 4} {consequence}; "
         "allow more frames"
     ]
 
@@ -392,14 +400,18 @@ def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> li
     sentences = []
     if waves.max() < _DEFOCUS_WAVES:
         sentences.append(
-            f"all depths are in focus (defocus of {waves.max():.2g} waves at most): a symmetric lens in focus fixes "
-            "its bias, height and even aberrations poorly; go on to half a wave or more on both sides"
+            f"all depths are in focus (defocus of {waves.max():.2g} waves at most): a "
+            "symmetric lens in focus fixes "
+            "its bias, height and even aberrations poorly; go on to half a wave or "
+            "more on both sides"
         )
     elif chosen_um.min() > focus or chosen_um.max() < focus:
         side = "farther" if chosen_um.min() > focus else "nearer"
         sentences.append(
-            f"all frames are {side} than the focus at {focus:.4g} um: the signs of astigmatism, of spherical "
-            "aberration and of the bias hang on defocus alone; take some on the other side"
+            f"all frames are {side} than the focus at {focus:.4g} um: the signs of "
+            "astigmatism, of spherical "
+            "aberration and of the bias hang on defocus alone; take some on the other "
+            "side"
         )
     return sentences
 

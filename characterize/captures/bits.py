@@ -52,7 +52,8 @@ def right_align(
         if bits is not None and images.max() >= 1 << bits:
             raise CaptureError(
                 f"{where}: counts are real numbers up to {images.max():.6g}, the "
-                f"capture states {bits} bits (at most {(1 << bits) - 1}); correct bits, "
+                f"capture states {bits} bits (at most {(1 << bits) - 1}); correct "
+                "bits, "
                 "or divide by the shift"
             )
         note += "counts are real numbers: taken as they are"
@@ -149,7 +150,8 @@ def _check_signs(stacks: Sequence[Array], where: str) -> None:
     if smallest < _WRAPPED:
         raise CaptureError(
             f"{where}: signed counts down to {smallest}: words of 16 bits without a "
-            "sign that were saved as signed, or with 32768 taken off; save them as unsigned "
+            "sign that were saved as signed, or with 32768 taken off; save them as "
+            "unsigned "
             "(uint16)"
         )
 
@@ -185,7 +187,9 @@ def _full_scale(images: Array, bits: int, where: str) -> int:
         if np.abs(shares * scale - np.rint(shares * scale)).max() < _ROUNDING:
             return scale
     raise CaptureError(
-        f"{where}: real numbers up to {images.max():.3g}, no counts over the full scale "
-        f"of {bits} bits; save counts as they come from the camera, or multiply frames, "
+        f"{where}: real numbers up to {images.max():.3g}, no counts over the full "
+        "scale "
+        f"of {bits} bits; save counts as they come from the camera, or multiply "
+        "frames, "
         "dark and flat by the full scale in counts"
     )

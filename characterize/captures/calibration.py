@@ -123,7 +123,8 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
     variance = np.array([_pair_variance(np.stack(pair)) for pair in pairs])
     if not (variance > 0).all() or not (mean > 0).all():
         raise CaptureError(
-            "photon transfer: flats without noise or light; take them anew, evenly lit to half the well"
+            "photon transfer: flats without noise or light; take them anew, evenly lit "
+            "to half the well"
         )
     dark_part = floor or 0.0
     expected = (
@@ -136,7 +137,8 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
     if inverse <= (_SIGMA_LIMIT * sigma if has_dark else 0):
         raise CaptureError(
             "photon transfer: the noise does not grow with light (by "
-            f"{inverse:.2g} +- {sigma:.2g} counts² a count); the flats are saturated or processed"
+            f"{inverse:.2g} +- {sigma:.2g} counts² a count); the flats are saturated "
+            "or processed"
         )
     gain = 1 / inverse
     read_noise_e = math.sqrt(max(floor - 1 / 12, 0)) * gain
@@ -173,7 +175,8 @@ def to_electrons(capture: Capture) -> ElectronFrames:
         level = well
     if saturated.any():
         notes.append(
-            f"{saturated.mean():.2%} of the pixels saturated at {level:g} counts: taken as lower bounds"
+            f"{saturated.mean():.2%} of the pixels saturated at {level:g} counts: "
+            "taken as lower bounds"
         )
     if bad.all() or (saturated | bad).all():
         raise CaptureError(

@@ -70,7 +70,8 @@ class Capture:
         shape = self.frames.shape[1:]
         if self.frames.ndim != 3 or n == 0 or min(shape) < 3:
             raise CaptureError(
-                f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3"
+                f"frames of shape {self.frames.shape}: need (n, y, x) with at least "
+                "one frame of 3 x 3"
             )
         for name, expected_shape in (
             ("position_um", (n,)),
@@ -79,13 +80,15 @@ class Capture:
         ):
             if getattr(self, name).shape != expected_shape:
                 raise CaptureError(
-                    f"{name} has shape {getattr(self, name).shape}, need {expected_shape} for {n} frames"
+                    f"{name} has shape {getattr(self, name).shape}, need "
+                    f"{expected_shape} for {n} frames"
                 )
         for name in ("dark", "flat"):
             image = getattr(self, name)
             if image is not None and image.shape[1:] != shape:
                 raise CaptureError(
-                    f"{name} frames are {image.shape[1:]}, the frames {shape}; crop them alike"
+                    f"{name} frames are {image.shape[1:]}, the frames {shape}; crop "
+                    "them alike"
                 )
 
     @property
@@ -115,7 +118,8 @@ def load(path: str | Path) -> Capture:
     path = Path(path)
     if not path.exists():
         raise CaptureError(
-            f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)"
+            f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a "
+            "folder of them)"
         )
     logging.getLogger("tifffile").setLevel(
         logging.CRITICAL
@@ -204,7 +208,8 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
     suffix = path.suffix.lower()
     if suffix in LOSSY:
         raise CaptureError(
-            f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5"
+            f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save "
+            "TIFF, PNG or HDF5"
         )
     read_tiff = partial(
         tiff_pages.read_tiff,
@@ -222,7 +227,8 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
     if reader is None:
         kind = suffix or "a file without suffix"
         raise CaptureError(
-            f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.conversion_hint(suffix)}"
+            f"{path}: cannot read {kind}; need TIFF, PNG or "
+            f"HDF5{folder.conversion_hint(suffix)}"
         )
     images = reader(path)
     return images[None] if images.ndim == 2 else images
@@ -385,13 +391,16 @@ def _listed_frames(
         pages_taken[name] += 1
         if stated is None and len(stack) not in (1, row_count[name]):
             raise CaptureError(
-                f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and stands in {row_count[name]} rows; say "
-                f"with a column page (from 0) which one each row means, or, if its {stack.shape} are not (n, y, x) but "
+                f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and "
+                f"stands in {row_count[name]} rows; say "
+                "with a column page (from 0) which one each row means, or, if its "
+                f"{stack.shape} are not (n, y, x) but "
                 '(y, x, n), axes = "yxn" in capture.toml'
             )
         if not 0 <= page < len(stack):
             raise CaptureError(
-                f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which holds {len(stack)}"
+                f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which "
+                f"holds {len(stack)}"
             )
         images.append(stack[page][None])
     return _join(images, [folder_path / name for name in rows.files]), [
@@ -404,7 +413,8 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
     for stack, path in zip(stacks, files, strict=True):
         if stack.shape[1:] != stacks[0].shape[1:] or stack.dtype != stacks[0].dtype:
             raise CaptureError(
-                f"{path}: frame of {stack.shape[1:]} {stack.dtype}, others {stacks[0].shape[1:]} {stacks[0].dtype}"
+                f"{path}: frame of {stack.shape[1:]} {stack.dtype}, others "
+                f"{stacks[0].shape[1:]} {stacks[0].dtype}"
             )
     return np.concatenate(stacks)
 
@@ -428,7 +438,8 @@ def _frames_of(path: Path, file: h5py.File) -> Array:
     """The data set ``frames``."""
     if "frames" not in file:
         raise CaptureError(
-            f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}"
+            f"{path}: no data set 'frames' (n, y, x); found "
+            f"{', '.join(sorted(file)) or 'nothing'}"
         )
     if not isinstance(file.get("frames", getlink=True), h5py.HardLink):
         raise CaptureError(f"{path}: 'frames' is a link; need the data set itself")
@@ -447,10 +458,12 @@ def _check_values(images: Array, path: Path) -> None:
         )
     if images.dtype.kind == "f" and images.dtype.itemsize < 4:
         raise CaptureError(
-            f"{path}: values of type {images.dtype} round counts above 2048; save whole numbers"
+            f"{path}: values of type {images.dtype} round counts above 2048; save "
+            "whole numbers"
         )
     if images.dtype.kind == "f" and not np.isfinite(images).all():
         frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
         raise CaptureError(
-            f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}"
+            f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column "
+            f"{column}"
         )

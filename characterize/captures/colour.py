@@ -47,7 +47,8 @@ class ColourChannels:
         mosaic = about.pop("mosaic", "")
         if channel is not None and channel not in CHANNELS:
             raise CaptureError(
-                f"{where}: channel = {channel!r} in the capture's description; need one of {CHANNELS}"
+                f"{where}: channel = {channel!r} in the capture's description; need "
+                f"one of {CHANNELS}"
             )
         letters = str(mosaic).upper()
         if mosaic and (len(letters) != 4 or sorted(letters) != ["B", "G", "G", "R"]):
@@ -83,16 +84,20 @@ class ColourChannels:
             return self._grey(images, path, grey=grey)
         if images.ndim != 4 or images.shape[-1] not in (3, 4):
             raise CaptureError(
-                f"{path}: images of shape {images.shape}; need grey frames (n, y, x), or colour (n, y, x, 3)"
+                f"{path}: images of shape {images.shape}; need grey frames (n, y, x), "
+                "or colour (n, y, x, 3)"
             )
         if self.mosaic:
             raise CaptureError(
-                f"{path}: colour images of shape {images.shape[1:]}, the capture's description says mosaic = "
-                f"{self.mosaic!r}: their colours were put together already; leave mosaic out, or save raw frames"
+                f"{path}: colour images of shape {images.shape[1:]}, the capture's "
+                "description says mosaic = "
+                f"{self.mosaic!r}: their colours were put together already; leave "
+                "mosaic out, or save raw frames"
             )
         if self.channel is None:
             raise CaptureError(
-                f"{path}: colour images of shape {images.shape[1:]}; grey frames straight from the sensor are best, "
+                f"{path}: colour images of shape {images.shape[1:]}; grey frames "
+                "straight from the sensor are best, "
                 'else say which of them is lit: channel = "green" (or "red", "blue") in capture.toml'
             )
         return images[..., CHANNELS.index(self.channel)]
@@ -103,7 +108,8 @@ class ColourChannels:
             return images[:, row::2, column::2]
         if self.channel is not None and not grey:
             raise CaptureError(
-                f"{path}: grey images, the capture's description says channel = {self.channel!r}; leave it out for a "
+                f"{path}: grey images, the capture's description says channel = "
+                f"{self.channel!r}; leave it out for a "
                 'sensor without colours, and of a raw Bayer mosaic say how its pixels lie: mosaic = "RGGB"'
             )
         return images
@@ -112,10 +118,12 @@ class ColourChannels:
         """Notes on the use of one colour channel; empty for grey frames."""
         if self.mosaic:
             return [
-                f"channel {self.channel} used: one pixel in four of a mosaic {self.mosaic}, at twice the pitch"
+                f"channel {self.channel} used: one pixel in four of a mosaic "
+                f"{self.mosaic}, at twice the pitch"
             ]
         if self.channel is None:
             return []
         return [
-            f"channel {self.channel} used: where colours were interpolated, neighbouring pixels share their noise"
+            f"channel {self.channel} used: where colours were interpolated, "
+            "neighbouring pixels share their noise"
         ]

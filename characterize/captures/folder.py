@@ -102,7 +102,8 @@ def find_table(folder: Path, kind: str) -> Path | None:
         None,
     ):
         raise CaptureError(
-            f"{unread}: not read, and nothing else says what it may say; save it as {kind}{suffixes[0]}"
+            f"{unread}: not read, and nothing else says what it may say; save it as "
+            f"{kind}{suffixes[0]}"
         )
     return None
 
@@ -125,7 +126,8 @@ def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]
     for path in unread:
         if path.stem.lower() in {"dark", "flat"} - set(beside):
             raise CaptureError(
-                f"{path}: cannot read {path.suffix}, and it would not be used{conversion_hint(path.suffix.lower())}"
+                f"{path}: cannot read {path.suffix}, and it would not be "
+                f"used{conversion_hint(path.suffix.lower())}"
             )
     names = ", ".join(reading.to_valid_utf8(path.name) for path in unread[:5])
     return (
@@ -166,8 +168,10 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
     if max(steps) > smallest:
         gap = steps.index(max(steps))
         raise CaptureError(
-            f"{folder}: {files[gap + 1].name} is {steps[gap]} numbers after {files[gap].name}, others {smallest}: is a "
-            "frame missing? step_um would give the next one its place; list frames and depths in stage.csv"
+            f"{folder}: {files[gap + 1].name} is {steps[gap]} numbers after "
+            f"{files[gap].name}, others {smallest}: is a "
+            "frame missing? step_um would give the next one its place; list frames and "
+            "depths in stage.csv"
         )
 
 

@@ -54,7 +54,8 @@ def _check_blocks(path: Path) -> None:
                 or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size
             ):
                 raise CaptureError(
-                    f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)"
+                    f"{path}: truncated or not a PNG file ({size} bytes, its head "
+                    "claims more or fails)"
                 )
             if block and name == b"IHDR":
                 raise CaptureError(f"{path}: not a PNG file (a second head)")
@@ -62,5 +63,6 @@ def _check_blocks(path: Path) -> None:
             block = name
     if block != b"IEND" or offset > size:
         raise CaptureError(
-            f"{path}: truncated or not a PNG file (a block ends at byte {offset}, the file at {size})"
+            f"{path}: truncated or not a PNG file (a block ends at byte {offset}, the "
+            f"file at {size})"
         )

@@ -300,7 +300,8 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
     )
     if separator:
         raise CaptureError(
-            f"{path}: columns parted by {separator!r}; save it with commas, and points in the numbers"
+            f"{path}: columns parted by {separator!r}; save it with commas, and points "
+            "in the numbers"
         )
     table = [
         _normalized_keys(entries, path, row) for row, entries in enumerate(table, 2)
@@ -323,7 +324,8 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
                 )
             if key not in _COLUMNS:
                 raise CaptureError(
-                    f"{path}, row {row}: unknown column {key!r}{nearest_name_hint(str(key), _COLUMNS)}"
+                    f"{path}, row {row}: unknown column "
+                    f"{key!r}{nearest_name_hint(str(key), _COLUMNS)}"
                 )
         if not entries.get("file"):
             raise CaptureError(
@@ -333,7 +335,8 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
     for kind in (_POSITIONS, _ANGLES, _ANGLES_Y, _EXPOSURES):
         if len(duplicates := [key for key in kind if key in head]) > 1:
             raise CaptureError(
-                f"{path}: columns {' and '.join(duplicates)} say the same; leave the one that holds"
+                f"{path}: columns {' and '.join(duplicates)} say the same; leave the "
+                "one that holds"
             )
     position_column = next((key for key in _POSITIONS if key in head), None)
     exposure_column = next((key for key in _EXPOSURES if key in head), None)
@@ -364,7 +367,8 @@ def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str,
     """A row with column names in small letters, without blanks, micro signs as u."""
     if None in entries:
         raise CaptureError(
-            f"{path}, row {row}: more values than columns ({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
+            f"{path}, row {row}: more values than columns "
+            f"({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
             "a number? write it with a point (0.73)"
         )
     plain = {
@@ -373,7 +377,8 @@ def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str,
     }
     if len(plain) < len(entries):
         raise CaptureError(
-            f"{path}: columns {', '.join(entries)} are not all different; leave the ones that hold"
+            f"{path}: columns {', '.join(entries)} are not all different; leave the "
+            "ones that hold"
         )
     return plain
 
@@ -395,12 +400,14 @@ def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
     for name in unlisted:
         if kind := re.match(r"(dark|flat)s?(?![a-z])", name.lower()):
             raise CaptureError(
-                f"{rows.source}: {name!r} is not named there and would not be used; put all {kind[1]} frames into one "
+                f"{rows.source}: {name!r} is not named there and would not be used; "
+                f"put all {kind[1]} frames into one "
                 f"stack {kind[1]}.tif"
             )
     return (
         (
-            f"{len(unlisted)} images that {rows.source} does not name left out: {', '.join(unlisted[:5])}",
+            f"{len(unlisted)} images that {rows.source} does not name left out: "
+            f"{', '.join(unlisted[:5])}",
         )
         if unlisted
         else ()
@@ -416,7 +423,8 @@ def unread_keys_text(about: dict[str, Any]) -> tuple[str, ...]:
     unread = [reading.to_valid_utf8(name) for name in about if name not in _KNOWN]
     return (
         (
-            f"entries of the description that change nothing, kept as notes: {', '.join(unread[:8])}",
+            "entries of the description that change nothing, kept as notes: "
+            f"{', '.join(unread[:8])}",
         )
         if unread
         else ()
@@ -447,7 +455,8 @@ def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
     for row, time in enumerate(times, 2):
         if time <= 0:
             raise CaptureError(
-                f"{path}, row {row}: {key} is {time:g}, need above 0; leave the column out if unknown"
+                f"{path}, row {row}: {key} is {time:g}, need above 0; leave the column "
+                "out if unknown"
             )
     return times
 

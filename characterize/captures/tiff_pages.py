@@ -123,8 +123,10 @@ def _read_images(path: Path, file: Any) -> Array:
     size = path.stat().st_size
     if int(first.compression) != 1 or offset + count * first.nbytes > size:
         raise CaptureError(
-            f"{path}: says {count} images, as ImageJ writes large stacks, and has room for "
-            f"{max((size - offset) // first.nbytes, 1)} ({size} bytes): truncated, or cut out of a stack; save it anew"
+            f"{path}: says {count} images, as ImageJ writes large stacks, and has room "
+            "for "
+            f"{max((size - offset) // first.nbytes, 1)} ({size} bytes): truncated, or "
+            "cut out of a stack; save it anew"
         )
     dtype = first.dtype.newbyteorder(file.byteorder)
     values = np.fromfile(path, dtype, count * math.prod(first.shape), offset=offset)

@@ -184,7 +184,7 @@ def _micrograph(
         _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
     )
     pillars = sem.measure_diameters(
-        image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm)
+        image, sem.SemMicrograph(pixel, options.pitch_nm, options.edge_bias_nm)
     )
     on_mask: overlay.MaskOverlay | None = None
     table: overlay.Table = []

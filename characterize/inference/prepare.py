@@ -18,7 +18,7 @@ from characterize.inference.leastsquares import FitImages
 from characterize.model import ForwardModel, FrameSetting, KnownValue, usual_parameters
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
-from metalens.fabrication import Kinds, Sensitivity
+from metalens.fabrication import PillarKinds, Sensitivity
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
@@ -317,7 +317,7 @@ def _beyond_table(lens: Lens) -> list[str]:
     """
     if lens.pairs is None:
         return []
-    kinds = Kinds.of(lens.diameters)
+    kinds = PillarKinds.of(lens.diameters)
     reach_um = usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3
     at_ends = np.zeros(len(kinds.count), bool)
     for size, axis in (

@@ -36,7 +36,7 @@ _UNSURE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Micrograph:
+class SemMicrograph:
     """Scale of a micrograph.
 
     pixel_nm: size of a pixel. pitch_nm: lattice constant of the pillars, 0 if unknown.
@@ -125,7 +125,7 @@ class MeasuredDiameters:
         )
 
 
-def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
+def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     """Diameters of all pillars on the lattice of a top-down micrograph.
 
     Rims must be brighter than the gaps. Where most sites hold no round pillar, lattices
@@ -176,7 +176,7 @@ def _shifted_lattices(lattice: ImageLattice) -> list[ImageLattice]:
 
 
 def _measure_on_lattice(
-    flat: Array, lattice: ImageLattice, about: Micrograph, *, sample: int = 0
+    flat: Array, lattice: ImageLattice, about: SemMicrograph, *, sample: int = 0
 ) -> MeasuredDiameters:
     """Pillars at the sites of a lattice in a levelled picture.
 

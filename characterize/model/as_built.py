@@ -15,8 +15,8 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
     CDError,
-    Kinds,
     PairTable,
+    PillarKinds,
     Sensitivity,
     WavefrontError,
     bias_ratio,
@@ -77,7 +77,7 @@ def _of_two_sizes(
     Sites without a pillar get the t of some pillar; the caller masks them.
     """
     d = lens.diameters
-    kinds = Kinds.of(lens.diameters)
+    kinds = PillarKinds.of(lens.diameters)
     pairs = response.pairs
     if pairs is None:
         raise FitError("pillars of two sizes: slopes of such pillars are needed")

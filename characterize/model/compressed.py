@@ -145,7 +145,7 @@ class SmoothKernel:
         window of half sides (wy, wx): k times the largest slope of F - F_middle.
         """
         t = np.linspace(-1, 1, 9)
-        p, q = (mapped(span, t) for span in (self.p, self.q))
+        p, q = (map_to_span(span, t) for span in (self.p, self.q))
         Y, X, q, p = np.meshgrid(wy * t, wx * t, q, p, indexing="ij", sparse=True)
 
         def path(x: Any, y: Any) -> Array:
@@ -159,7 +159,7 @@ class SmoothKernel:
         return y, x
 
 
-def mapped(span: tuple[float, float], t: Array) -> Array:
+def map_to_span(span: tuple[float, float], t: Array) -> Array:
     """Places ``t`` on [-1, 1], mapped to a span."""
     return np.asarray((span[0] + span[1]) / 2 + (span[1] - span[0]) / 2 * t)
 
@@ -697,7 +697,7 @@ class CompressedLens:
         wx).
         """
         probes = np.array([-1.0, 0.0, 1.0])
-        p, q = (mapped(span, probes) for span in (kernel.p, kernel.q))
+        p, q = (map_to_span(span, probes) for span in (kernel.p, kernel.q))
         across = {"p": p, "q": q, "X": wx * probes, "Y": wy * probes}
 
         def count(name: str, span: tuple[float, float]) -> int:
@@ -708,7 +708,7 @@ class CompressedLens:
             }
 
             def lines(t: Array) -> Array:
-                return kernel.remainder(**at, **{name: mapped(span, t)})
+                return kernel.remainder(**at, **{name: map_to_span(span, t)})
 
             return needed_nodes(lines, self.tolerance / 10)
 

@@ -20,7 +20,7 @@ from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
-    Kinds,
+    PillarKinds,
     Sensitivity,
     inapplicable_names,
     own_rates,
@@ -49,7 +49,7 @@ def log_response_slopes(lens: Lens, *, names: Container[str] = ()) -> Sensitivit
     The causes are those of :mod:`metalens.fabrication.perturbations`.
 
     Upright round pillars whose proxy is that of the cell: a table of t by the modal
-    method (:class:`metalens.fabrication.Solved`) at every diameter that a bias can
+    method (:class:`metalens.fabrication.SolvedResponse`) at every diameter that a bias can
     reach, five heights and seven indices within the bounds of the fit. Its error is
     3e-3 there, and up to 0.03 between them where a resonance moves by.
 
@@ -93,7 +93,7 @@ def log_response_slopes(lens: Lens, *, names: Container[str] = ()) -> Sensitivit
 
 def _of_pairs(lens: Lens) -> Sensitivity:
     """Of pillars of two sizes, for the light of the lens."""
-    kinds = Kinds.of(lens.diameters)
+    kinds = PillarKinds.of(lens.diameters)
     sizes = repr(kinds.width_um.tolist()), repr(kinds.length_um.tolist())
     description = _about(lens, ["two sizes", lens.light, *sizes])
     return _cached(

@@ -16,8 +16,8 @@ from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
-    Kinds,
     PairTable,
+    PillarKinds,
     RelativeResponse,
     ResponseError,
     Sensitivity,
@@ -300,7 +300,7 @@ class PairedPillars(PillarResponse):
             raise FitError("pillars of two sizes: slopes of such pillars are needed")
         self._table, self._sizes = (
             PairTable.of(self.lens),
-            Kinds.of(self.lens.diameters),
+            PillarKinds.of(self.lens.diameters),
         )
         self._rates = pairs.at(self._sizes.width_um, self._sizes.length_um)
         return self._sizes.width_um

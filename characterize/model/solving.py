@@ -15,7 +15,7 @@ from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import (
     ResponseError,
-    Solved,
+    SolvedResponse,
     changed_pillar,
     designed_transmission,
     prior_scale,
@@ -40,7 +40,7 @@ _AMOUNTS = {
 }
 
 
-def solved_transmission(lens: Lens) -> Solved | None:
+def solved_transmission(lens: Lens) -> SolvedResponse | None:
     """Table of t by the modal solver over diameter, height and index of the pillars.
 
     Polynomials through five heights over +-30 nm, scaled for longer waves
@@ -77,7 +77,9 @@ def solved_transmission(lens: Lens) -> Solved | None:
 
 
 @functools.lru_cache(maxsize=8)
-def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> Solved:
+def _solved(
+    cell: Cell, wavelength_um: float, low_um: float, high_um: float
+) -> SolvedResponse:
     """:func:`solved_transmission` of a cell on an even grid of diameters, cached.
 
     One rational curve over the diameter for every amount of every cause; cells that
@@ -105,7 +107,7 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     with threads.one_blas_thread():
         threads.run_split(len(distinct), solve_cells)
     columns = np.array([curves[changed] for changed in cells]).T
-    return Solved(wavelength_um, diameters, _powers(columns, changes))
+    return SolvedResponse(wavelength_um, diameters, _powers(columns, changes))
 
 
 def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:

@@ -20,7 +20,7 @@ from metalens.cell import Incidence
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, LensError
 from metalens.design import neighbours as supercell
-from metalens.fabrication import Printed, State, draw_lenses
+from metalens.fabrication import PrintedProcess, State, draw_lenses
 from metalens.image import Imager, Optics, node_light, normalise_psfs, with_psfs
 from metalens.lens import Lens, NeighbourRows
 from metalens.library import PillarLibrary, engines
@@ -93,7 +93,7 @@ class BudgetInputs:
     """
 
     fwhm_nm: float = 0.0
-    mask: Printed | None = None
+    mask: PrintedProcess | None = None
     library: PillarLibrary | None = None
     asbuilt: AsBuilt | None = None
     run: FinishedRun | None = None

@@ -9,8 +9,8 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.fabrication import (
-    Kinds,
     PairTable,
+    PillarKinds,
     ResponseRates,
     State,
     perturbed_transmission,
@@ -87,7 +87,7 @@ def classify_pillars(
         (y, x) kind of each site, from 1 on, 0 for none; (kinds,) number of pillars of
         each; and the kinds, which give their transmission.
     """
-    kinds = Kinds.of(lens.diameters)
+    kinds = PillarKinds.of(lens.diameters)
     index = (kinds.index(lens.diameters) + 1) % (len(kinds.count) + 1)
     if sens.sizes_um.shape[1] == 1:
         return (

@@ -258,11 +258,11 @@ class PsfSettings:
         )
 
     @property
-    def source(self) -> "psf.Extent | None":
+    def source(self) -> "psf.SourceExtent | None":
         """Size and shape of the source, None for a point."""
         if not (self.source_um or self.source_deg):
             return None
-        return psf.Extent(
+        return psf.SourceExtent(
             self.source_shape,
             self.source_um,
             2 * math.tan(math.radians(self.source_deg) / 2),

@@ -4,11 +4,11 @@ from .bias import Bias as Bias
 from .bias import read_csv as read_csv
 from .perturbations import PERTURBATIONS as PERTURBATIONS
 from .perturbations import CDError as CDError
-from .perturbations import Drawn as Drawn
-from .perturbations import Guide as Guide
+from .perturbations import DrawnPerturbation as DrawnPerturbation
 from .perturbations import Perturbation as Perturbation
 from .perturbations import ResponseError as ResponseError
 from .perturbations import WavefrontError as WavefrontError
+from .perturbations import WaveguideModel as WaveguideModel
 from .perturbations import changed_pillar as changed_pillar
 from .perturbations import derivative_maps as derivative_maps
 from .perturbations import inapplicable_names as inapplicable_names
@@ -20,7 +20,7 @@ from .perturbations import wavelength_scale as wavelength_scale
 from .perturbations import with_missing as with_missing
 from .process import DRAWN as DRAWN
 from .process import Draw as Draw
-from .process import Printed as Printed
+from .process import PrintedProcess as PrintedProcess
 from .process import Spread as Spread
 from .process import State as State
 from .process import draw_lenses as draw_lenses
@@ -28,7 +28,7 @@ from .process import of_process as of_process
 from .process import with_table as with_table
 from .response import RelativeResponse as RelativeResponse
 from .response import Sensitivity as Sensitivity
-from .response import Solved as Solved
+from .response import SolvedResponse as SolvedResponse
 from .response import bias_ratio as bias_ratio
 from .response import designed_transmission as designed_transmission
 from .response import effective_indices as effective_indices
@@ -38,6 +38,6 @@ from .response import proxy_sensitivity as proxy_sensitivity
 from .solved_rates import ResponseRates as ResponseRates
 from .solved_rates import own_rates as own_rates
 from .solved_rates import pair_rates as pair_rates
-from .two_sizes import Kinds as Kinds
 from .two_sizes import PairTable as PairTable
+from .two_sizes import PillarKinds as PillarKinds
 from .two_sizes import pair_sensitivities as pair_sensitivities

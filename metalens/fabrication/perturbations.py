@@ -18,7 +18,7 @@ Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
 
 
 @dataclass(frozen=True, slots=True)
-class Guide:
+class WaveguideModel:
     """Pillars as single-mode waveguides over their diameters, for the quick
     derivatives.
 
@@ -55,10 +55,10 @@ class ResponseError:
         :func:`metalens.fabrication.changed_pillar` names them, by cell and size of the
         pillar; {} where such a pillar cannot have the perturbation.
     exact: the number of the cell that tables of t follow by powers
-        (:class:`metalens.fabrication.Solved`), empty where none does.
+        (:class:`metalens.fabrication.SolvedResponse`), empty where none does.
     """
 
-    quick: Callable[[Guide], Array]
+    quick: Callable[[WaveguideModel], Array]
     numbers: Callable[[Cell, float], dict[str, float]]
     exact: Literal["height_um", "n", ""] = ""
 
@@ -76,7 +76,7 @@ Kind = type[CDError] | type[ResponseError] | type[WavefrontError]
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class DrawnPerturbation:
     """How a process spreads a cause, by its entry in PROCESS.toml's table ``spread``.
 
     name, sigma: entry and its default standard deviation. share: factor of the entry's
@@ -114,7 +114,7 @@ class Perturbation:
     acts: CDError | ResponseError | WavefrontError
     unit: float = 1.0
     free: bool = True
-    drawn: Drawn | None = None
+    drawn: DrawnPerturbation | None = None
     plausible: float = 0.0
     effect: str = ""
     probe: float = 0.0
@@ -122,12 +122,12 @@ class Perturbation:
     measured_by: str = ""
 
 
-def _height_rate(g: Guide) -> Array:
+def _height_rate(g: WaveguideModel) -> Array:
     """d ln t / d height of pillars, per um: i k n_eff."""
     return 1j * g.k * g.effective
 
 
-def _index_rate(g: Guide) -> Array:
+def _index_rate(g: WaveguideModel) -> Array:
     """d ln t / d n of pillars: i k h (b n + n D b' / 2) / n_eff.
 
     b = (n_eff² - n_0²) / (n² - n_0²), with n_0 of the surroundings, is a function of
@@ -140,7 +140,7 @@ def _index_rate(g: Guide) -> Array:
     return 1j * g.k * g.height_um * bracket / g.effective
 
 
-def _sidewall_rate(g: Guide) -> Array:
+def _sidewall_rate(g: WaveguideModel) -> Array:
     """d ln t / d sidewall angle of pillars, per rad: i k n_eff'' s h³ / 3.
 
     The diameter is that at half height, so that the wall acts in second order.
@@ -148,7 +148,7 @@ def _sidewall_rate(g: Guide) -> Array:
     return 1j * g.k * g.curvature * g.sidewall_rad * g.height_um**3 / 3
 
 
-def _side_rate(g: Guide) -> Array:
+def _side_rate(g: WaveguideModel) -> Array:
     """d ln t / d width or length of pillars, per um: i k h n_eff' / 2.
 
     The mean over both polarisations is half of the diameter's derivative.
@@ -156,7 +156,7 @@ def _side_rate(g: Guide) -> Array:
     return 0.5j * g.k * g.height_um * g.slope
 
 
-def _zero_rate(g: Guide) -> Array:
+def _zero_rate(g: WaveguideModel) -> Array:
     """Zeros: round pillars without films do not depend on a turn or on films."""
     return np.zeros_like(g.effective, complex)
 
@@ -287,7 +287,7 @@ def _unstated(
         acts,
         1e-3,
         free=False,
-        drawn=Drawn(name, 0.0),
+        drawn=DrawnPerturbation(name, 0.0),
     )
 
 
@@ -302,7 +302,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         15.0,
         26.0,
         ((1, 0, 0),),
-        drawn=Drawn("bias_nm", 4.0),
+        drawn=DrawnPerturbation("bias_nm", 4.0),
         reversible=True,
         measured_by="CDs at the centre (SEM)",
     ),
@@ -312,7 +312,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         10.0,
         15.0,
         ((1, 1, 0),),
-        drawn=Drawn("gradient_nm", 3.0, 0.5),
+        drawn=DrawnPerturbation("gradient_nm", 3.0, 0.5),
         reversible=True,
         measured_by="CDs at both rims (SEM)",
     ),
@@ -322,7 +322,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         10.0,
         15.0,
         ((1, 0, 1),),
-        drawn=Drawn("gradient_nm", 3.0, 0.5),
+        drawn=DrawnPerturbation("gradient_nm", 3.0, 0.5),
         reversible=True,
         measured_by="CDs at both rims (SEM)",
     ),
@@ -332,7 +332,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         10.0,
         15.0,
         ((1, 2, 0), (1, 0, 2), (-0.5, 0, 0)),
-        drawn=Drawn("bow_nm", 2.0),
+        drawn=DrawnPerturbation("bow_nm", 2.0),
         reversible=True,
         measured_by="CDs along a radius (SEM)",
     ),
@@ -367,7 +367,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         28.0,
         ResponseError(_height_rate, _height_numbers, "height_um"),
         1e-3,
-        drawn=Drawn("height_nm", 7.0),
+        drawn=DrawnPerturbation("height_nm", 7.0),
         measured_by="the height (AFM) or the power",
     ),
     Perturbation(
@@ -379,7 +379,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.075,
         ResponseError(_index_rate, _cell_number("pillar.n"), "n"),
         free=False,
-        drawn=Drawn("index", 0.02),
+        drawn=DrawnPerturbation("index", 0.02),
         effect="another refractive index",
         probe=0.01,
         measured_by="the index (ellipsometer)",
@@ -394,7 +394,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         ResponseError(_sidewall_rate, _cell_number("sidewall_rad")),
         DEG,
         free=False,
-        drawn=Drawn("sidewall_deg", 0.5),
+        drawn=DrawnPerturbation("sidewall_deg", 0.5),
         plausible=2.0,
         effect="a tilted side wall",
         probe=0.5,
@@ -422,7 +422,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         ResponseError(_zero_rate, _turn_numbers),
         DEG,
         free=False,
-        drawn=Drawn("turn_deg", 0.0),
+        drawn=DrawnPerturbation("turn_deg", 0.0),
     ),
     _unstated(
         "pedestal_nm",

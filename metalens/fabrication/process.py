@@ -20,7 +20,7 @@ from metalens.fabrication.bias import Bias, read_csv
 from metalens.fabrication.perturbations import (
     PERTURBATIONS,
     CDError,
-    Drawn,
+    DrawnPerturbation,
     Kind,
     ResponseError,
     WavefrontError,
@@ -31,7 +31,7 @@ from metalens.fabrication.perturbations import (
 )
 
 DIAMETER_STEP_NM = 2  # one class of pillars each
-DRAWN: dict[str, Drawn] = {
+DRAWN: dict[str, DrawnPerturbation] = {
     row.drawn.name: row.drawn for row in PERTURBATIONS if row.drawn
 }  # by entry, in the table's order
 _Entries: Any = dataclasses.make_dataclass(
@@ -207,7 +207,7 @@ def draw_lenses(spread: Spread, count: int, *, seed: int) -> list[Draw]:
 
 
 @dataclass(frozen=True, slots=True)
-class Printed:
+class PrintedProcess:
     """bias: of what is drawn. spread: of the process. diameter_step_nm: of the mask's
     pillars.
     """
@@ -217,7 +217,7 @@ class Printed:
     diameter_step_nm: float = DIAMETER_STEP_NM
 
 
-def of_process(path: str | Path) -> Printed:
+def of_process(path: str | Path) -> PrintedProcess:
     """Bias, spread and diameter step of a PROCESS.toml; ``layout`` reads its other
     tables.
 
@@ -231,14 +231,14 @@ def of_process(path: str | Path) -> Printed:
         ProcessError: a bias table that is unreadable or impossible.
     """
     path = Path(path)
-    table = config.read(path, Printed)
+    table = config.read(path, PrintedProcess)
     entries: dict[str, Any] = {
         name: table[name] for name in ("bias", "spread") if name in table
     }
     rules = table.get("rules", {})
     if isinstance(rules, dict) and "diameter_step_nm" in rules:
         entries["diameter_step_nm"] = rules["diameter_step_nm"]
-    printed = config.from_table(entries, Printed, where=str(path))
+    printed = config.from_table(entries, PrintedProcess, where=str(path))
     return dataclasses.replace(printed, bias=with_table(printed.bias, path.parent))
 
 

@@ -11,7 +11,11 @@ from numpy.polynomial import polynomial
 from metalens.cell import Cell, index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.perturbations import Guide, response_errors, with_missing
+from metalens.fabrication.perturbations import (
+    WaveguideModel,
+    response_errors,
+    with_missing,
+)
 from metalens.fabrication.solved_rates import ResponseRates, own_rates
 from metalens.lens import Lens
 from metalens.library import Proxy
@@ -23,7 +27,7 @@ _DEGREE = 5  # of the polynomials through these
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solved:
+class SolvedResponse:
     """Complex t of pillars as power series in single fabrication errors.
 
     Cubic splines between the diameters. Between the solved amounts a series misses
@@ -71,7 +75,7 @@ class Sensitivity:
     error: float = math.nan
     low_um: float = -math.inf
     high_um: float = math.inf
-    solved: Solved | None = None
+    solved: SolvedResponse | None = None
     edges: Array | None = None
     pairs: ResponseRates | None = None
 
@@ -227,7 +231,7 @@ def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
 
 def effective_indices(
     cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array
-) -> Guide:
+) -> WaveguideModel:
     """Effective index n_eff of pillars over the diameter, with two derivatives.
 
     phase(D) - phase(D_0) = k h (n_eff(D) - n_eff(D_0)), smoothed by a polynomial. At
@@ -258,7 +262,7 @@ def effective_indices(
     n_eff = np.polynomial.Polynomial.fit(
         offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * h), _DEGREE
     )
-    return Guide(
+    return WaveguideModel(
         k,
         diameter_um,
         n_eff(offset),

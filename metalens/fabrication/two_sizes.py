@@ -84,7 +84,7 @@ class PairTable:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Kinds:
+class PillarKinds:
     """The kinds of pillars that a lens has: (kinds,) width_um, length_um and count of
     each, rising.
 
@@ -97,7 +97,7 @@ class Kinds:
     keys: Array
 
     @classmethod
-    def of(cls, diameters: DiameterMap) -> "Kinds":
+    def of(cls, diameters: DiameterMap) -> "PillarKinds":
         """Of a map; pillars of one size have a length of 0."""
         all_sites = _keys(diameters, slice(None), slice(None))
         used, count = np.unique(all_sites, return_counts=True)
@@ -167,7 +167,7 @@ def pair_sensitivities(lens: Lens, *, count: int = _PAIRS) -> dict[str, Response
     Raises:
         CellError, MaterialError: from the solver.
     """
-    kinds = Kinds.of(lens.diameters)
+    kinds = PillarKinds.of(lens.diameters)
     pairs = np.stack([kinds.width_um, kinds.length_um], 1)
     width, length = pairs[_farthest_points(pairs, int(kinds.count.argmax()), count)].T
     solved = pair_rates(lens, width, length)

@@ -17,7 +17,7 @@ from .information import optics_loss as optics_loss
 from .information import pixel_information as pixel_information
 from .information import texture_information as texture_information
 from .plan import Grid as Grid
-from .plan import Plan as Plan
+from .plan import ImagingPlan as ImagingPlan
 from .points import Optics as Optics
 from .points import Window as Window
 from .points import psfs as psfs

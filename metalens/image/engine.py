@@ -13,7 +13,7 @@ from metalens.core.errors import SceneError
 from metalens.image import model_error
 from metalens.image.forming import Imager, build_imager
 from metalens.image.low_rank import frame_maps, plane_images
-from metalens.image.plan import Grid, Plan, plan_nodes, sum_over_spectrum
+from metalens.image.plan import Grid, ImagingPlan, plan_nodes, sum_over_spectrum
 from metalens.image.points import Optics, sampling
 from metalens.image.scene import Frames
 from metalens.image.splines import spline_matrix
@@ -143,7 +143,7 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
 
 
 def node_psfs(
-    optics: Optics, plan: Plan, device: torch.device | str = "cpu"
+    optics: Optics, plan: ImagingPlan, device: torch.device | str = "cpu"
 ) -> tuple[Tensor, Tensor]:
     """PSFs of all nodes, each of sum 1, and their relative illumination.
 
@@ -168,7 +168,9 @@ def node_psfs(
     return normalise_psfs(light, optics, plan)
 
 
-def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
+def normalise_psfs(
+    light: Tensor, optics: Optics, plan: ImagingPlan
+) -> tuple[Tensor, Tensor]:
     """PSFs of sum 1, and relative illumination: light in the window times cos⁴ θ.
 
     Args:
@@ -203,7 +205,7 @@ def _cosine4(
     return torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)) ** 2)
 
 
-def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
+def _folded(optics: Optics, plan: ImagingPlan, device: torch.device | str) -> Tensor:
     """(nodes, nodes, depths, h, w) PSFs of a round lens on a square grid on its axis.
 
     One eighth of the nodes is computed. The others follow by mirror images in x, in y

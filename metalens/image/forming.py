@@ -20,11 +20,11 @@ from metalens.image.low_rank import (
     low_rank_psfs,
     principal_kernels,
 )
-from metalens.image.plan import KERNELS, Grid, Plan
+from metalens.image.plan import KERNELS, Grid, ImagingPlan
 from metalens.image.points import Window
 from metalens.image.scene import Frames
 from metalens.image.slopes import by_nodes
-from metalens.image.stray import Stray, add_stray
+from metalens.image.stray import StrayLight, add_stray
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near sheet
 # Kernels of coverage, of those of light and at least: it matters at the borders of
@@ -57,14 +57,14 @@ class Imager:
     """
 
     grid: Grid
-    plan: Plan
+    plan: ImagingPlan
     stack: Tensor
     energy: Tensor
     basis: KernelBasis
     light: LowRankPsfs
     cover: LowRankPsfs
     parts: Mapping[str, float]
-    stray: Stray | None = field(default=None)
+    stray: StrayLight | None = field(default=None)
     asked: Set[int] | None = field(default=None)
 
     @property
@@ -210,7 +210,7 @@ class Imager:
 
 
 def build_imager(
-    grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float
+    grid: Grid, plan: ImagingPlan, stack: Tensor, energy: Tensor, *, tolerance: float
 ) -> Imager:
     """Imager of the PSFs at a plan's nodes, expanded in low-rank kernels.
 
@@ -255,7 +255,7 @@ def uniform_imager(
         raise SceneError(f"depths {depths_um.tolist()} um: need ascending ones")
     unit = psf / psf.sum((-2, -1), keepdim=True)
     axis, window = torch.zeros(1), Window(grid.window, grid.step_um)
-    plan = Plan(axis, axis, depths_um, None, window, False)  # type: ignore[arg-type]
+    plan = ImagingPlan(axis, axis, depths_um, None, window, False)  # type: ignore[arg-type]
     illumination = torch.ones_like(unit[None, None, :, 0, 0]).detach()
     field = PsfField(unit[None, None], illumination, depths_um)
     basis = principal_kernels(field, grid.frame, tolerance=tolerance)
@@ -282,7 +282,7 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
 
 def _assembled(
     grid: Grid,
-    plan: Plan,
+    plan: ImagingPlan,
     field: PsfField,
     basis: KernelBasis,
     parts: Mapping[str, float],

@@ -107,7 +107,7 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Plan:
+class ImagingPlan:
     """Nodes of a field of PSFs.
 
     y_um, x_um: rows and columns of the nodes on the sensor, from the first to the last
@@ -141,7 +141,7 @@ def plan_nodes(
     tolerance: float,
     folds: bool,
     polarisation: Polarisation = "auto",
-) -> Plan:
+) -> ImagingPlan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
     Field nodes are tried on a line at 0.6 of the half height, depth nodes at two field
@@ -206,7 +206,7 @@ def plan_nodes(
         * torch.linspace(-1, 1, _along(columns, length / half[1]), dtype=torch.float64)
         for centre, length in zip(middle_um[::-1], half, strict=True)
     )
-    return Plan(
+    return ImagingPlan(
         y, x, depth_nodes(grid, depths), waves, window, folds and half[0] == half[1]
     )
 

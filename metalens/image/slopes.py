@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from metalens.image.low_rank import PsfField, fast_shape, frame_maps
-from metalens.image.plan import Plan, sum_over_spectrum
+from metalens.image.plan import ImagingPlan, sum_over_spectrum
 from metalens.image.points import Optics, psfs
 from metalens.image.splines import TAPS, spline_coefficients, spline_taps
 
@@ -119,7 +119,7 @@ def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
     return torch.stack(shares)
 
 
-def node_light(optics: Optics, plan: Plan) -> Tensor:
+def node_light(optics: Optics, plan: ImagingPlan) -> Tensor:
     """(rows, columns, depths, h, w) light of all nodes, as a leaf tensor.
 
     It has no graph of its own and receives the gradient of the loss.
@@ -137,7 +137,7 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
 
 
 def surrogate_loss(
-    optics: Optics, plan: Plan, gradient: Tensor, pairs: tuple[Tensor, Tensor]
+    optics: Optics, plan: ImagingPlan, gradient: Tensor, pairs: tuple[Tensor, Tensor]
 ) -> Tensor:
     """A scalar whose expected gradient to the phase is that of the loss.
 
@@ -159,7 +159,7 @@ def surrogate_loss(
 
 
 def draw_nodes(
-    plan: Plan, draws: int, generator: torch.Generator | None = None
+    plan: ImagingPlan, draws: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
     """(draws,) random field points, uniform, and wavelengths, by their weights.
 
@@ -180,7 +180,7 @@ def draw_nodes(
 
 
 def gradient_term(
-    optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int
+    optics: Optics, plan: ImagingPlan, gradient: Tensor, point: int, wave: int
 ) -> Tensor:
     """The term of one draw: number of field points · <G_point, light_point,wave>.
 

@@ -20,7 +20,7 @@ ORDERS = (-1, 0, 2, 3)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stray:
+class StrayLight:
     """Discs of other orders about every source.
 
     shares: of the light on the aperture in each order.
@@ -38,7 +38,7 @@ class Stray:
     shape: tuple[int, int]
     illumination: Tensor
 
-    def to(self, device: torch.device | str) -> "Stray":
+    def to(self, device: torch.device | str) -> "StrayLight":
         """The same on a device."""
         moves = [(rows.to(device), columns.to(device)) for rows, columns in self.moves]
         return replace(
@@ -52,7 +52,7 @@ class Stray:
 class _Footprint(NamedTuple):
     """The part of the lens that sources illuminate: its radius; its middle (rows,
     columns), um, for every row and column of the frame, None where that is the lens's;
-    illumination as in :class:`Stray`.
+    illumination as in :class:`StrayLight`.
     """
 
     radius_um: float
@@ -62,7 +62,7 @@ class _Footprint(NamedTuple):
 
 def stray_of(
     optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]
-) -> Stray | None:
+) -> StrayLight | None:
     """Stray light of the diffraction orders that do not focus; None for a smooth phase.
 
     Order m spreads over a disc on the sensor: the image of the aperture times
@@ -105,7 +105,7 @@ def stray_of(
     discs = torch.stack(transfers)
     if not moves:
         discs = discs.sum(0, keepdim=True)
-    return Stray(shares, discs, moves, shape, footprint.illumination)
+    return StrayLight(shares, discs, moves, shape, footprint.illumination)
 
 
 def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
@@ -216,7 +216,7 @@ def _reduced(optics: Optics, depth_um: float) -> float:
     return optics.layers.before(depth_um, optics.wave.focus.wavelength_um).reduced_um  # type: ignore[attr-defined]
 
 
-def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
+def add_stray(image: Tensor, light: Tensor, stray: StrayLight, grid: Grid) -> Tensor:
     """(frames, y, x) image plus the discs of stray light of all sources.
 
     Args:

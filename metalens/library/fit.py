@@ -245,7 +245,7 @@ def _gaps(
     return tuple(gaps)
 
 
-class Fault(NamedTuple):
+class LibraryFault(NamedTuple):
     """Diameters that no lens should have: (n,) mask, reason, and its numbers."""
 
     mask: Array
@@ -266,7 +266,7 @@ def find_faults(
     least_transmission: float,
     hole: bool,
     resonances: Sequence[Sequence[float]],
-) -> list[Fault]:
+) -> list[LibraryFault]:
     """Faults of pillars over the diameter, at any wavelength, angle or polarisation.
 
     They are: |t| below a limit; a phase that falls with the diameter (for openings,
@@ -287,15 +287,15 @@ def find_faults(
     step = np.diff(np.unwrap(np.angle(t), axis=-1), axis=-1) * (-1 if hole else 1)
     reversal = np.pad((step < 0).any(axis=0), 1)
     faults = [
-        Fault(
+        LibraryFault(
             weak, "|t| falls", f" to {level.min():.2f}, below {least_transmission:g}"
         ),
-        Fault(
+        LibraryFault(
             reversal[1:] | reversal[:-1],
             "the phase rises" if hole else "the phase falls",
             " with the size of the opening" if hole else " with the diameter",
         ),
-        Fault(
+        LibraryFault(
             np.asarray((bars > UNKNOWN * level).any(axis=0)),
             "an error bar above half of |t|",
             f" ({bars.max():.2g})",
@@ -309,7 +309,7 @@ def find_faults(
             f", {np.degrees(angle):.3g} deg" if angle else ""
         )
         place = f" at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({light})"
-        faults.append(Fault(near, "a narrow resonance", place))
+        faults.append(LibraryFault(near, "a narrow resonance", place))
     return faults
 
 
@@ -319,7 +319,7 @@ def find_runs(good: Array) -> list[slice]:
     return [slice(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def _ends(run: slice, d: Array, faults: list[Fault]) -> tuple[str, ...]:
+def _ends(run: slice, d: Array, faults: list[LibraryFault]) -> tuple[str, ...]:
     """What bounds a run on either side, in words.
 
     Args:

@@ -10,7 +10,7 @@ from .budget import scalar_error as scalar_error
 from .budget import sine_aperture as sine_aperture
 from .directions import FarField as FarField
 from .directions import far_field as far_field
-from .extended import Extent as Extent
+from .extended import SourceExtent as SourceExtent
 from .focus import focus_metrics as focus_metrics
 from .lens_psfs import View as View
 from .lens_psfs import all_maps as all_maps

@@ -31,7 +31,7 @@ REACH = {"disc": 0.5, "square": 0.5, "gaussian": 4 * SIGMA["gaussian"]}
 
 
 @dataclass(frozen=True, slots=True)
-class Extent:
+class SourceExtent:
     """Size and shape of an incoherent source, parallel to the lens, of even radiance
     (Gaussian: falling off).
 
@@ -94,7 +94,7 @@ def _sinc_slope(u: Any) -> Array:
     )
 
 
-def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
+def source_to_image_matrices(case: PropagationCase, extent: SourceExtent) -> Array:
     """(depth, 2, 2) matrices from the source, in its sizes, to the sensor, in um.
 
     Rows and columns are [x, y]. A matrix is the product, times the size, of
@@ -116,7 +116,9 @@ def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
     )
 
 
-def _tangent_change(case: PropagationCase, extent: Extent, inverse: float) -> Array:
+def _tangent_change(
+    case: PropagationCase, extent: SourceExtent, inverse: float
+) -> Array:
     """(2, 2) change of the tangents [x, y] by one size of the source along x and y.
 
     Args:
@@ -175,7 +177,7 @@ def _slopes(of: Any, case: PropagationCase) -> Array:
 
 
 def widen_case(
-    fine: PropagationCase, extent: Extent
+    fine: PropagationCase, extent: SourceExtent
 ) -> tuple[PropagationCase, tuple[int, int]]:
     """The case with a wider window, and the samples (y, x) added on each side.
 
@@ -208,7 +210,10 @@ def widen_case(
 
 
 def blur_by_source(
-    light: torch.Tensor, case: PropagationCase, extent: Extent, more: tuple[int, int]
+    light: torch.Tensor,
+    case: PropagationCase,
+    extent: SourceExtent,
+    more: tuple[int, int],
 ) -> tuple[torch.Tensor, float]:
     """(depth, y, x) light of a finite source on the window, and its relative L2 error.
 
@@ -234,7 +239,7 @@ def blur_by_source(
     return _cropped(whole, more).clamp_min(0), error
 
 
-def source_image_reach(case: PropagationCase, extent: Extent) -> tuple[int, int]:
+def source_image_reach(case: PropagationCase, extent: SourceExtent) -> tuple[int, int]:
     """(y, x) half width of the source's image in samples, the largest over depths.
 
     Args:
@@ -251,7 +256,7 @@ def _cropped(light: torch.Tensor, more: tuple[int, int]) -> torch.Tensor:
 
 
 def _filtered(
-    light: torch.Tensor, case: PropagationCase, extent: Extent, which: int
+    light: torch.Tensor, case: PropagationCase, extent: SourceExtent, which: int
 ) -> torch.Tensor:
     """(depth, y, x) light filtered by the source's transform, with zero padding.
 
@@ -282,7 +287,7 @@ def _filtered(
 def shift_invariance_error(
     light: torch.Tensor,
     case: PropagationCase,
-    extent: Extent,
+    extent: SourceExtent,
     probe: Callable[[PropagationCase], torch.Tensor],
 ) -> float:
     """Relative L2 error of one PSF for all points of the source.

@@ -40,7 +40,7 @@ from metalens.psf.cells import (
     integrate_cells,
     plan_pixel_cells,
 )
-from metalens.psf.extended import Extent
+from metalens.psf.extended import SourceExtent
 from metalens.psf.vector import PolarizationMixing, has_faces, s_and_p
 
 # standard deviation of a pillar's phasor and relative error of three transforms, by
@@ -76,7 +76,7 @@ class IntensityRequest:
     mixing: PolarizationMixing | None = None
     layers: Layers | None = None
     integrate: bool = True
-    source: Extent | None = None
+    source: SourceExtent | None = None
 
     @property
     def differentiable(self) -> bool:
@@ -278,7 +278,10 @@ def _on_cells(
 
 
 def _blurred(
-    request: IntensityRequest, part: PropagationCase, fine: PixelCells, source: Extent
+    request: IntensityRequest,
+    part: PropagationCase,
+    fine: PixelCells,
+    source: SourceExtent,
 ) -> IntensityResult:
     """Irradiance of a source of finite size, on the points of the cells.
 

@@ -31,7 +31,7 @@ from metalens.psf.budget import (
     with_model,
     worst_of_budgets,
 )
-from metalens.psf.extended import Extent, source_image_reach
+from metalens.psf.extended import SourceExtent, source_image_reach
 from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import MeasuredSpectrum, Source, SpectralNodes
@@ -63,7 +63,7 @@ class View:
     window_um: float | tuple[float, float] = 72.0
     samples: int | tuple[int, int] = 96
     offset_um: tuple[float, float] = (0.0, 0.0)
-    source: Extent | None = None
+    source: SourceExtent | None = None
 
     @property
     def arguments(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from metalens.optics import Layers
 from metalens.propagate import PropagationCase
 from metalens.psf import neighbour_coupling
 from metalens.psf.budget import Polarisation
-from metalens.psf.extended import Extent
+from metalens.psf.extended import SourceExtent
 from metalens.psf.intensity import (
     ROUNDING,
     IntensityRequest,
@@ -46,7 +46,7 @@ def psf_stack(
     layers: Layers | None = None,
     polarisation: Polarisation = "scalar",
     integrate: bool = True,
-    source: Extent | None = None,
+    source: SourceExtent | None = None,
     neighbours: NeighbourRows | NeighbourJonesFactors | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,

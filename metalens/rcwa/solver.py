@@ -114,7 +114,7 @@ class CellProblem:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Truncation:
+class TruncatedSolution:
     """Solution at one truncation: both: (2, 2, 2) t and r; energy: (2,)."""
 
     both: Array
@@ -593,7 +593,7 @@ def _is_square(problem: CellProblem) -> bool:
     )
 
 
-def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
+def solve_problem(problem: CellProblem, reach: int, stages: int) -> TruncatedSolution:
     """t and r of the problem's polarisations at one truncation.
 
     Each symmetry class is solved by itself: modes of its layers (collocation for tilted
@@ -646,10 +646,10 @@ def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
                 both[1, row, column] = sign * row_sign * scattered.r[leaving]
     if square:
         both[:, 1, 1], energy[1] = both[:, 0, 0], energy[0]
-    return Truncation(both, energy)
+    return TruncatedSolution(both, energy)
 
 
-def _film_response(problem: CellProblem) -> Truncation:
+def _film_response(problem: CellProblem) -> TruncatedSolution:
     """Exact t and r with each section replaced by a film of its surroundings."""
     cell, media, light = problem.cell, problem.media, problem.light
     k0 = 2 * math.pi / light.wavelength_um
@@ -668,7 +668,7 @@ def _film_response(problem: CellProblem) -> Truncation:
         t, r = scattered.t[incident], scattered.r[incident]
         both[:, column, column] = t, r
         energy[column] = abs(t) ** 2 + abs(r) ** 2
-    return Truncation(both, energy)
+    return TruncatedSolution(both, energy)
 
 
 def _is_homogeneous(problem: CellProblem) -> bool:
@@ -692,7 +692,7 @@ def _is_homogeneous(problem: CellProblem) -> bool:
 def _response(
     problem: CellProblem,
     reach: int,
-    truncation: Truncation,
+    truncation: TruncatedSolution,
     error: float,
     converged: bool,
     reason: str,

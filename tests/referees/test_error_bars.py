@@ -164,7 +164,7 @@ def test_the_fit_knows_how_much_its_frames_tell():
     )
     truth = start[[PLACE[name] for name in task.names]]
     found = leastsquares.fit_levenberg_marquardt(
-        task.problem(),
+        task.posed().model,
         task.data,
         truth,
         prior=task.prior,

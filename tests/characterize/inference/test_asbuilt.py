@@ -34,7 +34,7 @@ from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
 from metalens.core.errors import CaptureError, ConfigError, FitError
-from metalens.fabrication import Solved, proxy_sensitivity
+from metalens.fabrication import SolvedResponse, proxy_sensitivity
 from metalens.psf.lens_psfs import View
 
 SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
@@ -271,7 +271,7 @@ def test_saved_result_comes_back(fitted, tmp_path):
 def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
     rng = np.random.default_rng(3)
     powers = rng.normal(size=(3, 4, 7)) + 1j * rng.normal(size=(3, 4, 7))
-    solved = Solved(0.8471, np.linspace(0.071, 0.233, 7), powers)
+    solved = SolvedResponse(0.8471, np.linspace(0.071, 0.233, 7), powers)
     built = dataclasses.replace(
         fitted, response=dataclasses.replace(fitted.response, solved=solved)
     )

@@ -54,7 +54,7 @@ def test_dark_tops_within_bright_rims_are_measured_at_their_outer_edge(
     farther out, of all alike.
     """
     picture, diameter = drawn(top=top, ground=ground, rim=1.0, width=4.0)
-    found = sem.measure_diameters(picture, sem.Micrograph(1.0, stated))
+    found = sem.measure_diameters(picture, sem.SemMicrograph(1.0, stated))
     assert found.lattice.kind == "square"
     assert found.lattice.pitch_px == pytest.approx(
         PITCH, rel=0.03
@@ -73,7 +73,7 @@ def test_pillars_longer_than_wide_by_a_sixth_are_named_and_others_have_the_circl
     long, oval
 ):
     picture, diameter = drawn(top=0.8, ground=0.2, rim=1.0, width=3.0, long=long)
-    found = sem.measure_diameters(picture, sem.Micrograph(1.0, PITCH))
+    found = sem.measure_diameters(picture, sem.SemMicrograph(1.0, PITCH))
     assert len(found.row) >= 9
     assert (found.oval == oval).all()
     assert (np.isfinite(found.diameter_nm) != oval).all()
@@ -84,7 +84,7 @@ def test_pillars_longer_than_wide_by_a_sixth_are_named_and_others_have_the_circl
 def test_noise_makes_no_discs_oval():
     picture, _ = drawn(top=0.7, ground=0.2, rim=1.0, width=3.0, seed=8)
     noisy = picture + 0.2 * np.random.default_rng(4).standard_normal(picture.shape)
-    assert not sem.measure_diameters(noisy, sem.Micrograph(1.0, PITCH)).oval.any()
+    assert not sem.measure_diameters(noisy, sem.SemMicrograph(1.0, PITCH)).oval.any()
 
 
 def test_the_command_tells_of_oval_pillars_and_of_rims_too_thin_for_dark_tops(

@@ -85,7 +85,7 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
     place = lattice(turn, angle, ratio, shape)
     truth = np.random.default_rng(5).uniform(140, 230, len(place))
     found = sem.measure_diameters(
-        picture(place, truth, shape, top=top), sem.Micrograph(PIXEL)
+        picture(place, truth, shape, top=top), sem.SemMicrograph(PIXEL)
     )
     assert found.lattice.kind == kind
     assert not (found.missing | found.collapsed).any()
@@ -102,7 +102,7 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
 def test_a_picture_of_one_line_of_waves_is_refused():
     waves = np.sin(np.arange(200) / 5)[None] + 0 * np.arange(160)[:, None]
     with pytest.raises(CaptureError, match="no lattice"):
-        sem.measure_diameters(waves, sem.Micrograph(PIXEL))
+        sem.measure_diameters(waves, sem.SemMicrograph(PIXEL))
 
 
 def drawn(rows=40, columns=44):
@@ -122,7 +122,7 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
     side = int(n * p)
     found = sem.measure_diameters(
         picture(place, made.ravel(), (side, side), top=0.9),
-        sem.Micrograph(PIXEL, PITCH),
+        sem.SemMicrograph(PIXEL, PITCH),
     )
     laid = overlay.overlay_design(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
     assert laid.clearly
@@ -168,7 +168,7 @@ def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(
     )
     wide = mask[tuple(index.T)] - 3.1
     found = sem.measure_diameters(
-        picture(place, wide, shape), sem.Micrograph(PIXEL, PITCH)
+        picture(place, wide, shape), sem.SemMicrograph(PIXEL, PITCH)
     )
     laid = overlay.overlay_design(found, made)
     assert laid.clearly
@@ -190,7 +190,8 @@ def test_a_picture_across_the_mask_is_refused():
     shape = (330, 370)
     place = lattice(30.0, 60.0, 1.0, shape)
     found = sem.measure_diameters(
-        picture(place, np.full(len(place), 180.0), shape), sem.Micrograph(PIXEL, PITCH)
+        picture(place, np.full(len(place), 180.0), shape),
+        sem.SemMicrograph(PIXEL, PITCH),
     )
     made = DiameterMap(
         np.where(np.indices((44, 60)).sum(0) % 2, 0, 0.18),

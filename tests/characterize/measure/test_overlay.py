@@ -1,4 +1,4 @@
-"""Micrograph on design: the scatter at every shift by plain least squares, the standard
+"""SemMicrograph on design: the scatter at every shift by plain least squares, the standard
 error of each knot.
 """
 

@@ -11,7 +11,7 @@ from characterize.measure.lattice import ImageLattice
 from metalens.core.errors import CaptureError
 
 PIXEL, PITCH = 4.0, 400.0
-ABOUT = sem.Micrograph(PIXEL, PITCH)
+ABOUT = sem.SemMicrograph(PIXEL, PITCH)
 
 
 def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5):
@@ -92,10 +92,10 @@ def test_bias_becomes_prior_knowledge_of_the_fit():
 def test_wrong_pitch_is_refused():
     with pytest.raises(CaptureError, match="no lattice"):
         sem.measure_diameters(
-            render(np.full((4, 4), 200.0)), sem.Micrograph(PIXEL, 533.0)
+            render(np.full((4, 4), 200.0)), sem.SemMicrograph(PIXEL, 533.0)
         )
     with pytest.raises(CaptureError, match="6 or more pixels"):
-        sem.Micrograph(100.0, 400.0)
+        sem.SemMicrograph(100.0, 400.0)
 
 
 def test_scale_bar_gives_the_pixel():
@@ -110,7 +110,7 @@ def test_calibrated_edge_bias_comes_off_both_sides():
     image = render(np.random.default_rng(4).uniform(160, 260, (4, 4)))
     plain = sem.measure_diameters(image, ABOUT).diameter_nm
     calibrated = sem.measure_diameters(
-        image, sem.Micrograph(PIXEL, PITCH, edge_bias_nm=3.7)
+        image, sem.SemMicrograph(PIXEL, PITCH, edge_bias_nm=3.7)
     ).diameter_nm
     assert plain - calibrated == pytest.approx(np.full(16, 7.4), abs=1e-9)
 

@@ -51,7 +51,7 @@ def measured(diameter, blur, *, noise, rng, pitch=None):
     picture = 37.0 + 290.0 * (
         blurred(flat, blur) + noise * rng.standard_normal(flat.shape)
     )
-    found = sem.measure_diameters(picture, sem.Micrograph(1.0, pitch))
+    found = sem.measure_diameters(picture, sem.SemMicrograph(1.0, pitch))
     whole = np.isfinite(found.diameter_nm)
     assert whole.sum() >= 19  # of 25, less those that the picture's edge cuts
     return found.diameter_nm[whole] - diameter, found.sigma_nm[whole]

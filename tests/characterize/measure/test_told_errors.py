@@ -59,7 +59,9 @@ def test_nineteen_of_twenty_true_diameters_lie_within_two_errors(long):
     for blur, noise in CASES:
         picture, wide = drawn(rng, pitch=45.3, blur=blur, noise=noise, long=long)
         score.append(
-            told(sem.measure_diameters(picture, sem.Micrograph(1.0, 45.3)), wide, 45.3)
+            told(
+                sem.measure_diameters(picture, sem.SemMicrograph(1.0, 45.3)), wide, 45.3
+            )
         )
     whole = np.concatenate(score)
     whole = whole[np.isfinite(whole)]

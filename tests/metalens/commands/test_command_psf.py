@@ -261,7 +261,7 @@ def test_a_finite_source_from_the_command_line(folder):
         ((np.deg2rad(4.0), 0.0),),
         16.0,
         24,
-        source=psf.Extent("square", 0.0, size),
+        source=psf.SourceExtent("square", 0.0, size),
     )
     assert psf.from_lens(small_lens(), view, tolerance=0.05).intensity == pytest.approx(
         stack.intensity, abs=1e-9

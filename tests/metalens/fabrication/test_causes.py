@@ -13,12 +13,12 @@ from metalens.fabrication import perturbations, response
 from metalens.fabrication.perturbations import (
     PERTURBATIONS,
     CDError,
-    Guide,
     ResponseError,
     WavefrontError,
+    WaveguideModel,
 )
 from metalens.fabrication.process import State
-from metalens.fabrication.response import RelativeResponse, Sensitivity, Solved
+from metalens.fabrication.response import RelativeResponse, Sensitivity, SolvedResponse
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
@@ -131,7 +131,7 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
     step = 1e-4
     up, down = effective(d + step, n), effective(d - step, n)
     here = effective(d, n)
-    guide = Guide(
+    guide = WaveguideModel(
         k,
         d,
         here,
@@ -315,7 +315,7 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     powers = np.zeros((3, 2, 4), complex)
     powers[:, 0] = 0.8 * np.exp(1j * (7.2 * at + 19 * at**2))
     powers[1, 1] = (3 + 2j) * at
-    solved = Solved(0.85, at, powers)
+    solved = SolvedResponse(0.85, at, powers)
     slopes = Sensitivity(
         np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved
     )
@@ -342,7 +342,7 @@ def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
     powers[:, 0] = 0.31 * np.exp(5j * at)
     powers[0, 1] = 0.7j * powers[0, 0]
     slopes = Sensitivity(
-        np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers)
+        np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=SolvedResponse(0.85, at, powers)
     )
     amounts = answering(0.02)
     got = response.perturbed_transmission(Line(), slopes, at, 0.85, amounts)

@@ -1,14 +1,14 @@
 """What is known of a mask without drawing one is what its maker's rules say."""
 
 from layout.process.process import DesignRules
-from metalens.fabrication import Printed, of_process
+from metalens.fabrication import PrintedProcess, of_process
 
 
 def test_pillars_of_no_stated_mask_come_in_the_steps_of_the_default_rules(tmp_path):
     """The one number that both hold: metalens does not load layout."""
-    assert Printed().diameter_step_nm == DesignRules().diameter_step_nm
+    assert PrintedProcess().diameter_step_nm == DesignRules().diameter_step_nm
     (tmp_path / "p.toml").write_text("[rules]\nminimum_gap_nm = 61.0\n")
-    assert of_process(tmp_path / "p.toml") == Printed()
+    assert of_process(tmp_path / "p.toml") == PrintedProcess()
 
 
 def test_a_table_of_the_bias_lies_beside_the_file_that_names_it(tmp_path):

@@ -11,7 +11,7 @@ from metalens.cell import Film, Index
 from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window
 from metalens.image.engine import normalise_psfs
-from metalens.image.plan import Plan
+from metalens.image.plan import ImagingPlan
 from metalens.image.points import psfs
 from metalens.optics import Layers, Stop
 from metalens.psf import SpectralNodes
@@ -86,7 +86,7 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
     at = torch.stack([x_um, torch.zeros(2, dtype=torch.float64)], -1)
     window = Window(81, 4.0)
     light = psfs(optics, at, depths_um=depths, wavelength_um=0.85, window=window)
-    plan = Plan(
+    plan = ImagingPlan(
         torch.zeros(1),
         x_um,
         depths,

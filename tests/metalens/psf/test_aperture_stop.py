@@ -19,7 +19,7 @@ from metalens.image import Optics, SmoothWave, Window
 from metalens.image.points import psfs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.optics import Layers, Stop, media
-from metalens.psf import Extent, View, blur_um, from_lens, psf_stack
+from metalens.psf import SourceExtent, View, blur_um, from_lens, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
 K = 2 * math.pi / WAVE
@@ -345,7 +345,7 @@ def test_points_of_a_source_cast_shadows_of_their_own_and_the_budget_says_so() -
         "depths_um": [depth],
     }
     about |= {
-        "source": Extent("square", size),
+        "source": SourceExtent("square", size),
         "tolerance": 1e-2,
         "integrate": False,
         **WINDOW,

@@ -155,7 +155,7 @@ def test_a_finite_source_is_the_sum_of_its_points(shape):
     window, samples = (12.0, 8.4), (10, 7)
     stack = psf.psf_stack(
         *lens(), **GEOMETRY, depths_um=depth, angle_rad=angle, window_um=window, samples=samples, tolerance=2e-2,
-        source=psf.Extent(shape, size_um=size),
+        source=psf.SourceExtent(shape, size_um=size),
     )  # fmt: skip
     at = grid([D * np.tan(a) for a in angle], samples, 1.2)
     middle = -depth * np.tan(angle)
@@ -186,7 +186,7 @@ def test_a_source_at_infinity_has_its_size_as_an_angle():
     samples, angle, size = (8, 10), (-0.05, 0.12), 0.06
     stack = psf.psf_stack(
         *lens(), **GEOMETRY, depths_um=np.inf, angle_rad=angle, window_um=(9.6, 12.0), samples=samples, tolerance=2e-2,
-        source=psf.Extent("square", size_rad=size),
+        source=psf.SourceExtent("square", size_rad=size),
     )  # fmt: skip
     at = grid([D * np.tan(a) for a in angle], samples, 1.2)
     want = 0
@@ -204,15 +204,15 @@ def test_what_no_source_or_window_can_be_is_refused_by_name():
         with pytest.raises(PropagationError, match=words):
             psf.psf_stack(*lens(), **given | dict(window_um=window))
     with pytest.raises(PropagationError, match="at infinity"):
-        psf.psf_stack(*lens(), **given, source=psf.Extent("disc", size_um=10.0))
+        psf.psf_stack(*lens(), **given, source=psf.SourceExtent("disc", size_um=10.0))
     with pytest.raises(PropagationError, match="image of the source"):
-        psf.psf_stack(*lens(), **given, source=psf.Extent("disc", size_rad=150.0))
+        psf.psf_stack(*lens(), **given, source=psf.SourceExtent("disc", size_rad=150.0))
     with pytest.raises(PropagationError, match="Nyquist"):
         psf.psf_stack(
             *lens(),
             **given | dict(samples=2),
             integrate=False,
-            source=psf.Extent(size_rad=0.01),
+            source=psf.SourceExtent(size_rad=0.01),
         )
     for wrong in (
         dict(),
@@ -221,7 +221,7 @@ def test_what_no_source_or_window_can_be_is_refused_by_name():
         dict(size_um=np.nan),
     ):
         with pytest.raises(PropagationError, match="need one of both"):
-            psf.Extent("disc", **wrong)
+            psf.SourceExtent("disc", **wrong)
 
 
 def test_depths_in_shares_are_the_same_psfs(monkeypatch):

@@ -38,7 +38,9 @@ def drawn(rng):
         polarisation=str(rng.choice(KINDS)),
     )
     if rng.random() < 0.1:
-        about |= dict(source=psf.Extent("disc", size_rad=rng.uniform(0.001, 0.02)))
+        about |= dict(
+            source=psf.SourceExtent("disc", size_rad=rng.uniform(0.001, 0.02))
+        )
     maps = (
         phase.astype("f4"),
         ((np.hypot(x, y) < half) * rng.uniform(0.5, 1, x.shape)).astype("f4"),

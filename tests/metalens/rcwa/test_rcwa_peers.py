@@ -82,7 +82,9 @@ def fmmax_rectangle(width, length, *, terms=61):
     inside = (np.abs(x)[:, None] < width / 2) & (np.abs(x) < length / 2)
     share = inside.reshape(pixels, fine, pixels, fine).mean(axis=(1, 3))
     lattice = fmmax.LatticeVectors(u=0.35 * fmmax.X, v=0.35 * fmmax.Y)
-    expansion = fmmax.generate_expansion(lattice, terms, fmmax.Truncation.CIRCULAR)
+    expansion = fmmax.generate_expansion(
+        lattice, terms, fmmax.TruncatedSolution.CIRCULAR
+    )
     flat = [jnp.full((1, 1), n**2 + 0j) for n in (1.45, 1.0)]
     layers = [
         fmmax.eigensolve_isotropic_media(
