@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from benchmarks.studies.shaped_cells import DrawnPerturbation, fitting
+from benchmarks.studies.shaped_cells import Drawn, fitting
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import (
@@ -64,7 +64,7 @@ def _kind(
     *,
     light: str = "normal",
     **how: Any,
-) -> Callable[[np.random.Generator], DrawnPerturbation]:
+) -> Callable[[np.random.Generator], Drawn]:
     """Cells of a shape, wider than lenses have them: index 1.4 to 4, 0.3 to 1.6 waves
     in a pitch, flat to tall.
 
@@ -72,7 +72,7 @@ def _kind(
     ``_cell``.
     """
 
-    def draw(rng: np.random.Generator) -> DrawnPerturbation:
+    def draw(rng: np.random.Generator) -> Drawn:
         pitch = float(rng.uniform(0.25, 0.7))
         cell = _cell(
             rng, pitch, shape(rng), lattices[int(rng.integers(len(lattices)))], **how
@@ -82,7 +82,7 @@ def _kind(
         azimuth = float(
             rng.uniform(-3.1, 3.1) if light == "any" else rng.integers(4) * math.pi / 2
         )
-        return DrawnPerturbation(
+        return Drawn(
             cell,
             fitting(cell, pitch * rng.uniform(0.2, 0.9), 0.03),
             wavelength,
@@ -176,7 +176,7 @@ def _one_of(shapes: tuple[Shaped, ...], *, hole: bool = False) -> Shaped:
 
 ANY = _one_of(tuple(SHAPES.values()))
 GROWING = _one_of(tuple(SHAPES[n] for n in SHAPES if n != "polygons"))
-KINDS: dict[str, Callable[[np.random.Generator], DrawnPerturbation]] = {
+KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     **{name: _kind(shape) for name, shape in SHAPES.items() if name != "circles"},
     "holes": _kind(_one_of(HOLES, hole=True)),
     "hexagonal lattice": _kind(
@@ -256,7 +256,7 @@ def within(shape: Any, size: float, grow: float, x: Array, y: Array) -> Array:
     )
 
 
-def slabs(one: DrawnPerturbation, steps: int) -> tuple[list[Array], list[float]]:
+def slabs(one: Drawn, steps: int) -> tuple[list[Array], list[float]]:
     """Permittivities on the raster and heights in pitches, foot first; films and
     half-spaces are left out.
     """
@@ -272,7 +272,7 @@ def slabs(one: DrawnPerturbation, steps: int) -> tuple[list[Array], list[float]]
     return found, heights
 
 
-def permittivity(one: DrawnPerturbation, layer: Layer, grow_um: float) -> Array:
+def permittivity(one: Drawn, layer: Layer, grow_um: float) -> Array:
     """Of one section, on the raster."""
     cell = one.cell
     pillar, around = (
@@ -331,7 +331,7 @@ def _compiled(lattice: Lattice, terms: int) -> Callable[..., Any]:
     return solve
 
 
-def fmmax_both(one: DrawnPerturbation, terms: int, steps: int) -> Array:
+def fmmax_both(one: Drawn, terms: int, steps: int) -> Array:
     """(2, 2, 2): t and r of fmmax in the basis of :func:`metalens.rcwa.jones`."""
     import jax.numpy as jnp
 
@@ -380,7 +380,7 @@ def _amplitudes(eps: float, sine: float, along: Array, oblique: bool) -> Array:
     return waves if oblique else waves[::-1]
 
 
-def shares(one: DrawnPerturbation) -> tuple[float, float, float]:
+def shares(one: Drawn) -> tuple[float, float, float]:
     """|difference| over the sum of both bars, the largest of t and r; both bars."""
     most = rcwa.most_harmonics(
         one.cell, one.size_um, angle_rad=one.angle_rad, azimuth_rad=one.azimuth_rad
