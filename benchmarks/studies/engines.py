@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import Row
 from benchmarks.studies.hard_cells import KINDS as HARD
-from benchmarks.studies.hard_cells import DrawnPerturbation
+from benchmarks.studies.hard_cells import Drawn
 from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 from metalens.core.errors import CellError
@@ -27,10 +27,10 @@ TOLERANCE = 1e-2  # of the modal method
 HARMONICS = {False: 10, True: 8}  # of RCWA, by whether the light is oblique
 
 
-def _ordinary(oblique: bool) -> Callable[[np.random.Generator], DrawnPerturbation]:
+def _ordinary(oblique: bool) -> Callable[[np.random.Generator], Drawn]:
     """Cells as lenses have them, nothing looked for."""
 
-    def draw(rng: np.random.Generator) -> DrawnPerturbation:
+    def draw(rng: np.random.Generator) -> Drawn:
         pitch = rng.uniform(0.25, 0.5)
         wavelength = rng.uniform(0.5, 1.2)
         about = [
@@ -57,7 +57,7 @@ def _any(
     waves: tuple[float, float] = (0.4, 2.6),
     heights: tuple[float, float] = (0.05, 6.0),
     low_contrast: bool = False,
-) -> Callable[[np.random.Generator], DrawnPerturbation]:
+) -> Callable[[np.random.Generator], Drawn]:
     """Cells far beyond those of lenses. angle: in rad. rarer: share of discs of the
     rarer medium.
 
@@ -65,7 +65,7 @@ def _any(
     logarithm.
     """
 
-    def draw(rng: np.random.Generator) -> DrawnPerturbation:
+    def draw(rng: np.random.Generator) -> Drawn:
         pitch, thin = rng.uniform(0.2, 1.0), rng.uniform(1.0, 2.2)
         dense = (
             thin * math.sqrt(rng.uniform(1.02, 2.0))

@@ -30,7 +30,7 @@ SEED = 8023  # no factor of the estimate was chosen on its cells
 FINER = 3  # first level of the referee
 SHARE = 0.2  # of the bar, that the referee may be uncertain by
 TOLERANCES = (1e-2, 1e-3)
-DrawnPerturbation = tuple[
+Drawn = tuple[
     Cell, float, float, float, str
 ]  # cell, diameter, wavelength, angle, polarisation
 
@@ -46,7 +46,7 @@ def _any(
     }
 
 
-def _cutoff(rng: np.random.Generator) -> DrawnPerturbation:
+def _cutoff(rng: np.random.Generator) -> Drawn:
     """Within 1 % of the cutoff of an order of substrate or cover, on either side of it;
     half of them oblique.
     """
@@ -65,7 +65,7 @@ def _cutoff(rng: np.random.Generator) -> DrawnPerturbation:
     )
 
 
-def _resonant(rng: np.random.Generator) -> DrawnPerturbation:
+def _resonant(rng: np.random.Generator) -> Drawn:
     """High index, slightly oblique: resonances that normal incidence does not excite
     are sharp.
     """
@@ -82,8 +82,8 @@ def _resonant(rng: np.random.Generator) -> DrawnPerturbation:
 
 def _shaped(
     low: float, high: float, heights: tuple[float, float], k: float
-) -> Callable[[np.random.Generator], DrawnPerturbation]:
-    def draw(rng: np.random.Generator) -> DrawnPerturbation:
+) -> Callable[[np.random.Generator], Drawn]:
+    def draw(rng: np.random.Generator) -> Drawn:
         pitch = rng.uniform(0.3, 0.45)
         cell = Cell(
             pitch, rng.uniform(*heights), **_any(rng, k=k * 10 ** rng.uniform(-2, 0))
@@ -93,7 +93,7 @@ def _shaped(
     return draw
 
 
-def _many_waves(rng: np.random.Generator) -> DrawnPerturbation:
+def _many_waves(rng: np.random.Generator) -> Drawn:
     """High index and a wide pitch: more than two waves of the pillar's index across the
     cell, several orders.
     """
@@ -108,7 +108,7 @@ def _many_waves(rng: np.random.Generator) -> DrawnPerturbation:
     )
 
 
-KINDS: dict[str, Callable[[np.random.Generator], DrawnPerturbation]] = {
+KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "at a cutoff": _cutoff,
     "at a resonance": _resonant,
     "nearly touching": _shaped(0.9, 0.985, (0.3, 0.9), 0.0),
