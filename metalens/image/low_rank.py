@@ -336,13 +336,16 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
     Least squares of the plane's relative error by conjugate gradients (CGLS: Hestenes
     and Stiefel 1952), from a factor of 1, until no sample errs by more than
     :data:`EVEN`. Samples within half a window of the border, which lack light from
-    beyond it, do not count.
+    beyond it, do not count. In double precision, so that rounding does not decide
+    where the iterations end.
 
     Args:
         sources: (rank, y, x) weights times illumination.
         kernels: (rank, h, w) low-rank kernels.
         target: (y, x) image of the plane.
     """
+    kind = target.dtype
+    sources, kernels, target = sources.double(), kernels.double(), target.double()
     rows, columns = target.shape
     h, w = kernels.shape[-2:]
     shape = fast_shape((rows + h - 1, columns + w - 1))
@@ -376,7 +379,7 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
         residual = residual - step * change
         gradient = adjoint(residual)
         direction = gradient + gradient.square().sum() / power * direction
-    return factor
+    return factor.to(kind)
 
 
 def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:
