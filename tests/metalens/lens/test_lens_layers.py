@@ -41,9 +41,7 @@ def test_a_design_corrected_for_its_films_focuses_to_the_diffraction_limit(proxy
     one, quality = made(proxy)
     found = check_focus(one)
     assert found.passed
-    assert found.figures.strehl == pytest.approx(
-        1.0, abs=3 * found.figures.strehl_error
-    )
+    assert found.figures.strehl == pytest.approx(1.0, abs=1e-3)  # of the PSF
     # the ray through the rim obeys Snell's law in every medium: reach = sum t tan
     angles = [np.arcsin(quality.numerical_aperture / n) for n in (1.21, 1.52, 1.9)]
     assert sum(
