@@ -20,7 +20,7 @@ from characterize.captures.capture import Capture
 from characterize.inference.estimate import FitOptions, fit
 from characterize.model.parameters import KnownValue
 from characterize.model.pillar_slopes import log_response_slopes
-from metalens import design, profiles
+from metalens import design
 from metalens.cell.record import Cell
 from metalens.library.proxy import Proxy
 
@@ -35,7 +35,7 @@ phase[0, :3], phase[1, :2], level[0] = (
     (0.88, -0.03, 0.02, 0.03),
 )
 proxy = Proxy(phase, level, (0.09, 0.26), (0.83, 0.87), 1e-3, 1e-3)
-focus = profiles.Focus(0.85, 110.0, 600.0)
+focus = design.Focus(0.85, 110.0, 600.0)
 shape = design.phase_of(None, focus, radius_um=20.0)
 lens, quality = design.make(
     shape, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy

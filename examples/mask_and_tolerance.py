@@ -136,10 +136,10 @@ print(
 # differences of the solver. What all pillars share is only a common phase; what counts is how *differently* they answer.
 
 # %%
-answers = sensitivity.compute_sensitivities(lens, count=9)
-study = tolerance.analyse_tolerance(lens, rules, sens=answers, draws=60)
+rates = sensitivity.compute_sensitivities(lens, count=9)
+study = tolerance.analyse_tolerance(lens, rules, sens=rates, draws=60)
 print(
-    f"t(D) under all causes lives in {study.rank} dimensions (error {study.error:.0e}); derivatives to {100 * answers.error:.0f} %"
+    f"t(D) under all causes lives in {study.rank} dimensions (error {study.error:.0e}); derivatives to {100 * rates.error:.0f} %"
 )
 print("cause            sigma   phase/rad   peak/%   efficiency/%   PSF/%   I(z)/%")
 for e in study.effects:

@@ -8,7 +8,6 @@ from . import lens as lens
 from . import library as library
 from . import materials as materials
 from . import modal as modal
-from . import profiles as profiles
 from . import propagate as propagate
 from . import proxy as proxy
 from . import psf as psf

@@ -8,7 +8,7 @@ from characterize.bench import bench
 from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.model.forward import ForwardModel, FrameSetting
 from characterize.model.parameters import KnownValue
-from metalens import design, profiles
+from metalens import design
 from metalens.cell.record import Cell
 from metalens.lens.record import Lens
 from tests.characterize import bench_lens
@@ -29,7 +29,7 @@ def shoot() -> tuple[Lens, float, np.ndarray]:
     """(design, seconds that the sum over every pillar took, noise-free light of the
     bench).
     """
-    focus = profiles.Focus(0.85, 2000.0, 20000.0)
+    focus = design.Focus(0.85, 2000.0, 20000.0)
     phase = design.phase_of(None, focus, radius_um=500.0)
     lens = design.make(
         phase,

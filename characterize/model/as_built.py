@@ -70,7 +70,7 @@ def as_built_transmission(
 
 
 def _of_two_sizes(
-    lens: Lens, response: Sensitivity, bias_um: Array, answers: Array
+    lens: Lens, response: Sensitivity, bias_um: Array, response_amounts: Array
 ) -> Array:
     """(y, x) t of pillars of two sizes by the table of the lens.
 
@@ -82,7 +82,9 @@ def _of_two_sizes(
     if pairs is None:
         raise FitError("pillars of two sizes: slopes of such pillars are needed")
     index = np.minimum(kinds.index(d), len(kinds.count) - 1)
-    change = np.exp(np.tensordot(answers, pairs.at(kinds.width_um, kinds.length_um), 1))
+    change = np.exp(
+        np.tensordot(response_amounts, pairs.at(kinds.width_um, kinds.length_um), 1)
+    )
     width, length = (
         size[index] + bias_um for size in (kinds.width_um, kinds.length_um)
     )
@@ -97,7 +99,7 @@ def _of_one_size(
     Sites without a pillar get the t of some pillar; the caller masks them.
     """
     d = lens.diameters
-    answers = process_state_of(x).response_amounts()
+    response_amounts = process_state_of(x).response_amounts()
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
@@ -105,7 +107,7 @@ def _of_one_size(
     place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
     diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
     t = perturbed_transmission(
-        lens.proxy, response, diameter, wave, answers, angle_rad=angle_rad
+        lens.proxy, response, diameter, wave, response_amounts, angle_rad=angle_rad
     )
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]

@@ -47,7 +47,7 @@ class PillarChange:
     Zeros are the design.
     """
 
-    answers: tuple[float, ...] = (0.0,) * len(_ROWS)
+    response_amounts: tuple[float, ...] = (0.0,) * len(_ROWS)
     wavelength_um: float = 0.0
 
 
@@ -60,7 +60,7 @@ class ChangeRange:
     """
 
     bias_um: float = 0.03
-    answers: tuple[float, ...] = tuple(
+    response_amounts: tuple[float, ...] = tuple(
         _ROOM * max(-row.low, row.high) * row.unit for row in _ROWS
     )
     wavelength_um: float = 0.006
@@ -69,20 +69,20 @@ class ChangeRange:
     def of(cls, wavelength_um: float) -> "ChangeRange":
         """The range for a wavelength: lengths grow with it (:func:`wavelength_scale`)."""
         more = wavelength_scale(wavelength_um)
-        rows = zip(_ROWS, cls().answers, strict=True)
-        answers = tuple(
+        rows = zip(_ROWS, cls().response_amounts, strict=True)
+        response_amounts = tuple(
             amount * prior_scale(row.name, wavelength_um) for row, amount in rows
         )
-        return cls(more * cls().bias_um, answers, more * cls().wavelength_um)
+        return cls(more * cls().bias_um, response_amounts, more * cls().wavelength_um)
 
     def within(self, cell: Cell) -> "ChangeRange":
         """Without what pillars of this cell cannot have."""
         absent = inapplicable_names(cell)
-        answers = (
+        response_amounts = (
             0.0 if row.name in absent else amount
-            for row, amount in zip(_ROWS, self.answers, strict=True)
+            for row, amount in zip(_ROWS, self.response_amounts, strict=True)
         )
-        return dataclasses.replace(self, answers=tuple(answers))
+        return dataclasses.replace(self, response_amounts=tuple(response_amounts))
 
 
 class PillarResponse:
@@ -145,7 +145,9 @@ class PillarResponse:
         self.nodes_um = unit * self.span.bias_um
         share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
         self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
-        self._answer, self._bias_factor = self._answers(self.nodes_um[:, None])
+        self._relative, self._bias_factor = self._relative_response(
+            self.nodes_um[:, None]
+        )
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         # rms of t outside the first functions
@@ -155,7 +157,9 @@ class PillarResponse:
         rank = max(1, int((tail > tolerance).sum()))
         self.basis = np.ascontiguousarray(u[:, :rank].T.conj())
 
-    def _answers(self, nodes: Array) -> tuple[RelativeResponse, Array | float]:
+    def _relative_response(
+        self, nodes: Array
+    ) -> tuple[RelativeResponse, Array | float]:
         """Response to the pillar-response errors, and factor of the bias, at (b, 1) nodes."""
         d = self.diameter_um + nodes
         return prepare_response(self.lens.proxy, self.response, d), bias_ratio(
@@ -168,7 +172,7 @@ class PillarResponse:
         """
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
-        amounts = np.array(change.answers)
+        amounts = np.array(change.response_amounts)
         return perturbed_transmission(
             self.lens.proxy,
             self.response,
@@ -204,7 +208,9 @@ class PillarResponse:
         """(pillar-response errors, b, r) derivatives of :meth:`coefficients` by the answering
         causes, in base units.
         """
-        rates = self._answer.rates(np.array(change.answers)) * self._at_nodes(change)
+        rates = self._relative.rates(
+            np.array(change.response_amounts)
+        ) * self._at_nodes(change)
         return np.asarray(self._to_series @ (rates @ self.basis.T))
 
     def _at_nodes(self, change: PillarChange) -> Array:
@@ -212,7 +218,7 @@ class PillarResponse:
         the pillar-response errors and of the bias.
         """
         designed = self._designed_at(self.lens.wavelength_um + change.wavelength_um)
-        factor = self._answer.factor(np.array(change.answers))
+        factor = self._relative.factor(np.array(change.response_amounts))
         return np.asarray(designed * factor * self._bias_factor)
 
     def _designed_at(self, wave_um: float) -> Array:
@@ -257,7 +263,9 @@ class PillarResponse:
         """Changes that the basis is computed from: none, each extreme, random ones."""
         s = self.span
         waves = self._waves()
-        single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
+        single = np.diag([*s.response_amounts, s.wavelength_um])[
+            : len(s.response_amounts) + waves
+        ]
         extremes = [
             PillarChange(tuple(sign * change[:-1]), sign * change[-1])
             for change in single
@@ -305,7 +313,9 @@ class PairedPillars(PillarResponse):
         self._rates = pairs.at(self._sizes.width_um, self._sizes.length_um)
         return self._sizes.width_um
 
-    def _answers(self, nodes: Array) -> tuple[RelativeResponse, Array | float]:
+    def _relative_response(
+        self, nodes: Array
+    ) -> tuple[RelativeResponse, Array | float]:
         return RelativeResponse(self._rates[:, None], None, np.ones(1)), 1.0
 
     def exact(self, bias_um: Array | float, change: PillarChange) -> Array:
@@ -314,7 +324,7 @@ class PairedPillars(PillarResponse):
             self._sizes.width_um + bias_um, self._sizes.length_um + bias_um
         )
         return np.asarray(
-            t * np.exp(np.tensordot(np.array(change.answers), self._rates, 1))
+            t * np.exp(np.tensordot(np.array(change.response_amounts), self._rates, 1))
         )
 
     def _designed_at(self, wave_um: float) -> Array:
@@ -377,11 +387,11 @@ def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
 
 def _draw(random: np.random.Generator, span: ChangeRange, waves: bool) -> PillarChange:
     """Random change within 0.7 of the range; with a wavelength where ``waves``."""
-    possible = np.flatnonzero(span.answers)
+    possible = np.flatnonzero(span.response_amounts)
     shares = random.uniform(-0.7, 0.7, len(possible) + 1)
     wave = shares[-1]
-    amounts = np.zeros(len(span.answers))
-    amounts[possible] = shares[:-1] * np.array(span.answers)[possible]
+    amounts = np.zeros(len(span.response_amounts))
+    amounts[possible] = shares[:-1] * np.array(span.response_amounts)[possible]
     return PillarChange(
         tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves
     )

@@ -112,7 +112,7 @@ class LayoutJob:
     outcome of reading it back}.
     verified: {file name: what the file and the dose table make, by the simulator}.
     made_rows: the lens that comes out.
-    answers_error: of --study, by how much the solver may miss how pillars answer to the
+    rates_error: of --study, by how much the solver may miss how pillars answer to the
     process, relative.
     """
 
@@ -129,7 +129,7 @@ class LayoutJob:
     compared: dict[str, compare.ReadbackComparison] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None
-    answers_error: float = 0.0
+    rates_error: float = 0.0
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -189,10 +189,10 @@ class LayoutJob:
         """Why the study of --study is none, for a person; empty where it is one. The
         mask is not touched by it.
         """
-        if self.answers_error <= MOST_ANSWERS_ERROR:
+        if self.rates_error <= MOST_ANSWERS_ERROR:
             return ""
         return (
-            f"--study: how these pillars answer to height, wall and index is known within {self.answers_error:.0%} "
+            f"--study: how these pillars answer to height, wall and index is known within {self.rates_error:.0%} "
             "alone, and its tolerances no better: take lower or wider pillars, or the mask without --study"
         )
 

@@ -306,6 +306,6 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
         "differences": {
             name: list(outcome.differences) for name, outcome in job.compared.items()
         },
-        "answers_error": job.answers_error,
+        "rates_error": job.rates_error,
         "seconds": job.seconds,
     }

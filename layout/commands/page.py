@@ -48,10 +48,10 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
     if job.options.study:
         from layout.study import page as study_page
 
-        answers = study_page.answers_of(job.source)
-        job.answers_error = max(one.error for one in answers.values())
+        rates = study_page.rates_by_light(job.source)
+        job.rates_error = max(one.error for one in rates.values())
         sections += study_page.study_sections(
-            job.source, job.process, job.fields, answers
+            job.source, job.process, job.fields, rates
         )
     read_back = {
         name: "; ".join(outcome.differences) or "as planned"

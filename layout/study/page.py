@@ -16,12 +16,12 @@ from metalens.core.units import deg
 from metalens.fabrication import ResponseRates, pair_sensitivities
 from metalens.lens import Lens
 
-Answers = Mapping[
+RatesByLight = Mapping[
     str, ResponseRates
 ]  # of light along "x" and "y"; of pillars of one size under ""
 
 
-def answers_of(lens: Lens) -> Answers:
+def rates_by_light(lens: Lens) -> RatesByLight:
     """Sensitivities of the pillars to height, wall, index and the like, by the solver.
 
     Args:
@@ -38,7 +38,7 @@ def answers_of(lens: Lens) -> Answers:
 
 
 def study_sections(
-    lens: Lens, process: Process, plan: FieldPlan, answers: Answers
+    lens: Lens, process: Process, plan: FieldPlan, rates: RatesByLight
 ) -> list[Section]:
     """Sections on stitching and tolerance.
 
@@ -50,13 +50,13 @@ def study_sections(
         lens: as designed.
         process: spread and write field.
         plan: write fields.
-        answers: :func:`answers_of` the lens.
+        rates: :func:`rates_by_light` of the lens.
     """
     if lens.pairs is None:
-        return _of_light(lens, process, plan, answers[""])
+        return _of_light(lens, process, plan, rates[""])
     return [
         replace(section, title=f"{section.title}, light along {light}")
-        for light, answer in answers.items()
+        for light, answer in rates.items()
         for section in _of_light(
             lens.seen("x" if light == "x" else "y"), process, plan, answer
         )
@@ -64,10 +64,10 @@ def study_sections(
 
 
 def _of_light(
-    lens: Lens, process: Process, plan: FieldPlan, answers: ResponseRates
+    lens: Lens, process: Process, plan: FieldPlan, rates: ResponseRates
 ) -> list[Section]:
     """Sections on stitching and tolerance for one polarisation."""
-    return [_stitching(lens, plan, process), tolerance_section(lens, process, answers)]
+    return [_stitching(lens, plan, process), tolerance_section(lens, process, rates)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
@@ -93,15 +93,15 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
     return Section("Stitching", text, [Table(("", "mean", "worst"), rows, digits=5)])
 
 
-def tolerance_section(lens: Lens, process: Process, answers: ResponseRates) -> Section:
+def tolerance_section(lens: Lens, process: Process, rates: ResponseRates) -> Section:
     """Each cause alone and all together, and what the numbers are not of.
 
     Args:
         lens: as designed.
         process: spread.
-        answers: sensitivities of the pillars.
+        rates: sensitivities of the pillars.
     """
-    study = tolerance.analyse_tolerance(lens, process, sens=answers)
+    study = tolerance.analyse_tolerance(lens, process, sens=rates)
     rows = [
         [
             effect.cause,
@@ -154,7 +154,7 @@ def tolerance_section(lens: Lens, process: Process, answers: ResponseRates) -> S
     text = (
         "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
-        f"derivatives of the solver (known to {100 * answers.error:.0f} %), {route}; the "
+        f"derivatives of the solver (known to {100 * rates.error:.0f} %), {route}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     ) + _beside(lens, process)
     about = (

@@ -1,5 +1,5 @@
 """What t of the pillars of a lens follows from, each kind of them once, under any local
-bias and answering cause.
+bias and pillar-response error.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class PillarKindsOfLens(Protocol):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OneSize:
-    """t by the proxy of the lens at its wavelength, and the answers of a solver;
+    """t by the proxy of the lens at its wavelength, and solved sensitivities;
     diameter_um: (kinds,).
     """
 

@@ -1,6 +1,4 @@
-"""How the transmission of a pillar answers to height, index, wall and every other cause
-of the table, by a solver.
-"""
+"""Sensitivities of a pillar's transmission to every fabrication error, by RCWA."""
 
 import numpy as np
 

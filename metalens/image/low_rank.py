@@ -286,15 +286,16 @@ def low_rank_psfs(
         weights = weights * field.illumination[..., None]
     maps = frame_maps(frame, psf.shape[:2], psf)
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
-    sources = values.detach().movedim(-1, 0)
+    # in double precision: rounding must not decide where the iterations end
+    sources = values.detach().movedim(-1, 0).double()
     targets = torch.ones_like(sources[0].movedim(-1, 0))  # of full coverage
     if illuminated:
-        targets = plane_images(field.light.detach(), maps)
+        targets = plane_images(field.light.detach(), maps).to(sources)
     factors = [
-        correct_plane(sources[..., z], kernels, target)
+        correct_plane(sources[..., z], kernels.to(sources), target)
         for z, target in enumerate(targets)
     ]
-    values = values * torch.stack(factors, -1)[..., None]
+    values = values * torch.stack(factors, -1)[..., None].to(values)
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
     return LowRankPsfs(kernels, transfer, shape, table, vergence)
@@ -336,16 +337,13 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
     Least squares of the plane's relative error by conjugate gradients (CGLS: Hestenes
     and Stiefel 1952), from a factor of 1, until no sample errs by more than
     :data:`EVEN`. Samples within half a window of the border, which lack light from
-    beyond it, do not count. In double precision, so that rounding does not decide
-    where the iterations end.
+    beyond it, do not count.
 
     Args:
         sources: (rank, y, x) weights times illumination.
         kernels: (rank, h, w) low-rank kernels.
         target: (y, x) image of the plane.
     """
-    kind = target.dtype
-    sources, kernels, target = sources.double(), kernels.double(), target.double()
     rows, columns = target.shape
     h, w = kernels.shape[-2:]
     shape = fast_shape((rows + h - 1, columns + w - 1))
@@ -363,8 +361,7 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
     def adjoint(error: Tensor) -> Tensor:
         spectrum = torch.fft.rfft2(error * scale, s=shape) * transfer.conj()
         whole = torch.fft.irfft2(spectrum, s=shape)[:, :rows, :columns]
-        back: Tensor = (sources * whole).sum(0)
-        return back
+        return torch.sum(sources * whole, 0)
 
     factor = torch.ones_like(target)
     residual = target * scale - image(factor)
@@ -379,7 +376,7 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
         residual = residual - step * change
         gradient = adjoint(residual)
         direction = gradient + gradient.square().sum() / power * direction
-    return factor.to(kind)
+    return factor
 
 
 def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:

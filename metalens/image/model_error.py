@@ -1,8 +1,6 @@
-"""Model errors of the field's PSFs: by the transform, by components of the field, and
-by pillars averaged over cells.
+"""Model errors of the field's PSFs: transform, field components, averaged pillars.
 
-Errors are of the image: those of PSFs count by their light, so that places in the
-shadow of a stop count little.
+PSFs count by their light, so that places in the shadow of a stop count little.
 """
 
 import functools

@@ -1,7 +1,7 @@
 """Posterior error of PSFs: direct sums over lens nodes at sampled points of the window.
 
-The nodes are finer than those the method uses. Rounding at the pillars and the
-interpolation inside their blocks is added as noise of the pillars.
+The nodes are finer than the method's. Rounding at the pillars and the interpolation
+inside their blocks is added as noise.
 """
 
 import math

@@ -18,7 +18,7 @@ from characterize.inference.multistart import SearchTask
 from characterize.model import NAMES, ForwardModel
 from characterize.model.parameters import KnownValue
 from characterize.model.setting import FrameSetting
-from metalens import design, profiles
+from metalens import design
 from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import Sensitivity
 from metalens.lens.record import DiameterMap, Lens
@@ -62,8 +62,8 @@ def lens(strength_rad: float = 0.0) -> Lens:
     """A hyperbolic lens of 40 um, with a cubic term on top where ``strength_rad`` is
     not 0.
     """
-    focus = profiles.Focus(0.85, 110.0, 600.0)
-    shape = profiles.Cubic(strength_rad) if strength_rad else None
+    focus = design.Focus(0.85, 110.0, 600.0)
+    shape = design.Cubic(strength_rad) if strength_rad else None
     return design.make(
         design.phase_of(shape, focus, radius_um=20.0),
         focus,

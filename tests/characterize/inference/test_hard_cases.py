@@ -19,7 +19,7 @@ from characterize.bench import bench
 from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.inference.estimate import FitOptions
 from characterize.model.parameters import KnownValue
-from metalens import design, profiles
+from metalens import design
 from metalens.cell.record import Cell
 from metalens.core.errors import FitError
 
@@ -150,8 +150,8 @@ def far_lens(twist=False):
     """0.4 mm wide, focused on 20 mm; with ``twist`` its image turns with depth (double
     helix).
     """
-    focus = profiles.Focus(0.85, 2000.0, 20e3)
-    shape = profiles.DoubleHelix(3) if twist else None
+    focus = design.Focus(0.85, 2000.0, 20e3)
+    shape = design.DoubleHelix(3) if twist else None
     phase = design.phase_of(shape, focus, radius_um=200.0)
     return design.make(
         phase, focus, aperture_um=400.0, cell=Cell(pitch_um=0.4), proxy=b.proxy()

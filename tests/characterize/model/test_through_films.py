@@ -22,7 +22,7 @@ from characterize.model import as_built, forward
 from characterize.model.forward import ForwardModel, FrameSetting
 from characterize.model.glass import AIR, FilmStack
 from characterize.model.parameters import NAMES, KnownValue, parameter_vector
-from metalens import design, profiles
+from metalens import design
 from metalens.cell import Cell, Film, Index
 from metalens.optics import Layers
 
@@ -39,7 +39,7 @@ def lens(filling=1.0):
         for name, side in (("front", FRONT), ("behind", BEHIND))
     }
     layers = Layers(**films, cover=Index(filling))
-    focus = profiles.Focus(WAVELENGTH, DISTANCE, 600.0, layers=layers)
+    focus = design.Focus(WAVELENGTH, DISTANCE, 600.0, layers=layers)
     cell = Cell(pitch_um=0.4, cover=Index(filling))
     phase = design.phase_of(None, focus, radius_um=20.0)
     return design.make(phase, focus, aperture_um=40.0, cell=cell, proxy=b.proxy())[0]

@@ -141,7 +141,7 @@ def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
     no study.
     """
     monkeypatch.setattr(
-        study_page, "answers_of", lambda lens: {"": SimpleNamespace(error=error)}
+        study_page, "rates_by_light", lambda lens: {"": SimpleNamespace(error=error)}
     )
     monkeypatch.setattr(study_page, "study_sections", lambda *about: [])
     assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
@@ -150,7 +150,7 @@ def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
     assert ("  FAILED: --study: how these pillars answer" in told) is bool(code)
     assert ("is known within 52% alone" in told) is bool(code)
     assert (
-        json.loads((tmp_path / "mask" / "layout.json").read_text())["answers_error"]
+        json.loads((tmp_path / "mask" / "layout.json").read_text())["rates_error"]
         == error
     )
 

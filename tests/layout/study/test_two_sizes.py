@@ -259,7 +259,7 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
         lens,
         process,
         fields.split_write_fields(lens.diameters, process),
-        page.answers_of(lens),
+        page.rates_by_light(lens),
     )
     titles = [
         f"{what}, light along {light}"

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from metalens import lens, profiles
+from metalens import lens
 from metalens.cell.record import Cell, Index
 from metalens.core.errors import ConfigError, LensError
 from metalens.design import assign as design
-from metalens.design import phase_map
+from metalens.design import phase_map, profiles
 from metalens.design.assign import Limits
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.library.proxy import Proxy

@@ -9,9 +9,8 @@ from scipy.io import loadmat
 from metalens import cli, lens
 from metalens.cell import Cell
 from metalens.core.errors import LensError
-from metalens.design import phase_map
+from metalens.design import PhaseMap, phase_map
 from metalens.lens import DiameterMap, Lens, export
-from metalens.profiles import PhaseMap
 from metalens.proxy import Proxy
 
 # phase 3.5 + 3.5 (d - 0.2) / 0.1: a little above a turn over the domain

@@ -20,9 +20,8 @@ from metalens.cell import Cell, Index
 from metalens.commands import view
 from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
-from metalens.design import make
+from metalens.design import Focus, make
 from metalens.library.record import PillarLibrary, Sweep
-from metalens.profiles import Focus
 from metalens.proxy import Proxy
 from metalens.view import (
     ClassMapPanel,
