@@ -29,8 +29,8 @@ KINDS: tuple[tuple[str, dict[str, float], str], ...] = (
     ("phase", PHASES, "phase phi arg_t s21_phase arg_s21 phase_t"),
     ("power", {}, "transmission transmittance t power"),
     ("amplitude", {}, "amplitude abs_t t_abs abs_s21 s21_abs s21"),
-    ("real", {}, "re_t t_re t_real real_t re_s21 s21_re s21_real"),
-    ("imaginary", {}, "im_t t_im t_imag imag_t im_s21 s21_im s21_imag"),
+    ("real", {}, "re_t t_re t_real real_t re_s21 s21_re s21_real real_s21"),
+    ("imaginary", {}, "im_t t_im t_imag imag_t im_s21 s21_im s21_imag imag_s21"),
     ("error", {}, "t_error error sigma"),
 )
 NAMES = {name: kind[:2] for kind in KINDS for name in kind[2].split()}
@@ -53,10 +53,12 @@ def from_table(
     Args:
         table: CSV, TSV, NPZ or MAT file, or a mapping {column: (n,) array}; a row for
             each entry. Names carry units: ``diameter_nm``, ``Wavelength (um)``,
-            ``phase (deg)``, ``angle_deg``. Needed: a size (``diameter``, ``radius``)
+            ``phase (deg)``, ``S21 (dB)``. Needed: a size (``diameter``, ``radius``)
             and either ``phase`` with ``transmission`` (power) or ``amplitude``, or
-            ``t_re`` with ``t_im`` (S21 likewise), or complex ``t`` of a mapping.
-            ``t_error`` is the error bar of t.
+            ``t_re`` with ``t_im``, or complex ``t``; S21 likewise. ``t_error`` is the
+            error bar of t. Arrays of several axes (a sweep over size and wavelength)
+            come with one (n,) array for each axis, all of different length. The header
+            of a text file may be its last comment, as COMSOL writes it.
         cell: the unit cell of which the table is.
         columns: names in place of the header of a file.
         wavelength_um: of a table without a wavelength column.
@@ -170,29 +172,35 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
             with np.load(path, allow_pickle=False) as content:
-                return {name: np.ravel(content[name]) for name in content.files}
+                return {name: content[name] for name in content.files}
         if path.suffix.lower() == ".mat":
             from scipy.io import loadmat
 
             content = loadmat(path)
-            return {
-                k: np.ravel(v) for k, v in content.items() if not k.startswith("__")
-            }
+            return {k: v for k, v in content.items() if not k.startswith("__")}
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError, NotImplementedError) as error:
         raise DomainError(
             f"{path}: not read ({error}); give CSV, TSV, NPZ or MAT of version 5"
         ) from None
-    lines = [ln for ln in text.splitlines() if ln.strip() and ln[0] not in "#%"]
+    filled = [line for line in text.splitlines() if line.strip()]
+    lines = [line for line in filled if line[0] not in "#%"]
     if not lines:
         raise DomainError(f"{path}: empty; need a header and a row for each entry")
     separator = next((mark for mark in "\t;," if mark in lines[0]), None)
-    names = list(columns) or [n.strip(' "') for n in lines.pop(0).split(separator)]
+    names = list(columns)
+    if not names:
+        has_header = re.search(r"[a-df-hj-z]", lines[0], re.IGNORECASE)
+        comments = filled[: filled.index(lines[0])]
+        header = lines.pop(0) if has_header or not comments else comments[-1]
+        # a unit in brackets belongs to the name before it
+        names = re.split(separator or r"\s+(?![(\[])", header.strip(" #%"))
     if separator in (";", "\t"):  # commas are decimal
         lines = [line.replace(",", ".") for line in lines]
+    lines = [re.sub(r"(?<=[\d.])i\b", "j", line) for line in lines]
     try:
         body = np.loadtxt(
-            lines, delimiter=separator, ndmin=2, comments=None, quotechar='"'
+            lines, complex, delimiter=separator, ndmin=2, comments=None, quotechar='"'
         )
     except ValueError as error:
         raise DomainError(
@@ -200,7 +208,8 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
         ) from None
     if body.shape[1] != len(names):
         raise DomainError(f"{path}: rows do not match the {len(names)} columns {names}")
-    return dict(zip(names, body.T, strict=True))
+    values = [column if column.imag.any() else column.real for column in body.T]
+    return dict(zip((name.strip(' "') for name in names), values, strict=True))
 
 
 def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, Array]:
@@ -215,15 +224,23 @@ def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, Array]:
             values that are not finite.
     """
     quantities: dict[str, Array] = {}
-    for name, content in raw_columns.items():
+    arrays = {k: np.squeeze(np.asarray(v)) for k, v in raw_columns.items()}
+    shape = max((array.shape for array in arrays.values()), key=len, default=())
+    for name, array in arrays.items():
         plain = _plain_name(str(name))
         stem, _, unit = plain.rpartition("_")
         if plain in NAMES:
             stem, unit = plain, ""
         quantity, units = NAMES.get(stem, ("", {}))
-        values = np.ravel(np.asarray(content))
-        if quantity == "power" and np.iscomplexobj(values):
+        if len(shape) > 1 and array.ndim == 1 and shape.count(len(array)) == 1:
+            axis = shape.index(len(array))
+            array = array.reshape([-1, *[1] * (len(shape) - 1 - axis)])
+        values = np.ravel(np.broadcast_to(array, shape) if len(shape) > 1 else array)
+        if quantity in ("power", "amplitude") and np.iscomplexobj(values):
             quantity = "complex"
+        if unit == "db" and quantity in ("power", "amplitude"):
+            values = 10 ** (values / (10 if quantity == "power" else 20))
+            unit = ""
         if not quantity or (unit and not units):
             known = ", ".join(names.split()[0] for *_, names in KINDS)
             raise DomainError(
@@ -252,6 +269,9 @@ def _plain_name(name: str) -> str:
     """
     plain = name.strip().lower().replace("μ", "u").replace("µ", "u").replace("°", "deg")
     plain = re.sub(r"\|t\|(\^2|²)", "transmission", plain).replace("|t|", "abs_t")
+    plain = re.sub(
+        r"\(1\)|\b[a-z]\w*\.(?=s\d)", "", plain
+    )  # units and physics of COMSOL
     return re.sub(r"[^\w]+", "_", plain).strip("_")
 
 

@@ -44,6 +44,11 @@ FORMS = {
         "|t|": np.sqrt(POWER),
     },
     "S-parameter": {"width_nm": SIZE_NM, "S21_re": T.real, "S21_im": T.imag},
+    "decibels of CST": {
+        "Diameter [nm]": SIZE_NM,
+        "S21 [dB]": 10 * np.log10(POWER),
+        "arg(S21) [deg]": np.degrees(PHASE_RAD),
+    },
     "complex": {"d_nm": SIZE_NM, "t": T},
 }
 
@@ -53,6 +58,30 @@ def test_one_response_in_every_form_is_one_library(form):
     order = np.random.default_rng(5).permutation(len(SIZE_NM))
     shuffled = {name: values[order] for name, values in FORMS[form].items()}
     _close(library.from_table(shuffled, CELL, wavelength_um=0.94))
+
+
+def test_a_text_export_of_comsol_is_read(tmp_path):
+    lines = [
+        "% Model:    cell.mph",
+        "% Version:  COMSOL 6.1",
+        "% r (nm)   ewfd.S21 (1)",
+    ]
+    lines += [
+        f"{size / 2:<22.10g}{t.real:.12f}{t.imag:+.12f}i"
+        for size, t in zip(SIZE_NM, T.conj(), strict=True)  # exp(+iwt)
+    ]
+    (tmp_path / "table.txt").write_text("\n".join(lines))
+    made = library.from_table(tmp_path / "table.txt", CELL, wavelength_um=0.94)
+    np.testing.assert_allclose(made.t[0, 0, 0], T, atol=1e-11)
+
+
+def test_an_array_over_sizes_and_wavelengths_has_one_column_for_each_axis():
+    lights = np.array([0.9, 0.94, 1.0])
+    grid = T[:, None] * np.exp(0.1j * np.arange(3))
+    table = {"diameter_nm": SIZE_NM, "wavelength_um": lights[None], "t": grid}
+    made = library.from_table(table, CELL)
+    assert made.wavelength_um == pytest.approx(lights)
+    np.testing.assert_allclose(made.t[0, 0], grid.T, atol=1e-12)
 
 
 def test_frequencies_and_angles_span_a_grid():
