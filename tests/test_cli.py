@@ -2,8 +2,6 @@
 main job end to end.
 """
 
-import importlib
-import inspect
 import json
 import os
 import textwrap
@@ -36,43 +34,6 @@ def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
     assert done.stderr.splitlines()[-1].startswith(
         f"metalens: error: {words[-1]}: part the numbers of a list by blanks"
     )
-
-
-def work(module):
-    """Source of the module that does the work of a verb."""
-    return inspect.getsource(
-        importlib.import_module(getattr(module, "WORK", module.__name__))
-    )
-
-
-def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
-    """Those with --resume, those that keep a journal beside their output; psf and fit
-    say that they do not.
-    """
-    said = " ".join(run("--help").stdout.split())
-    modules = {
-        verb: importlib.import_module(where) for verb, (where, _) in cli.VERBS.items()
-    }
-    parts = modules["evaluate"].PARTS
-    assert [
-        name
-        for name, (where, _) in parts.items()
-        if "grow=True" in work(importlib.import_module(where))
-    ] == ["paper"]
-    with_option = {
-        v
-        for v, m in modules.items()
-        if "resume" in getattr(getattr(m, "Options", None), "__annotations__", ())
-    }
-    assert with_option == {"codesign", "retrain", "demo"}
-    journals = {verb for verb, module in modules.items() if '".resume"' in work(module)}
-    assert journals == {"library", "study"}
-    assert "library, study and evaluate paper go on with the same command" in said
-    assert "codesign, retrain and demo with --resume; all others begin anew" in said
-    for verb in ("fit", "psf"):
-        assert (
-            "An interruption leaves what stood at the output" in modules[verb].__doc__
-        )
 
 
 def test_no_command_and_unknown_command_are_bad_input():

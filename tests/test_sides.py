@@ -14,12 +14,7 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from characterize import next_mask
-from characterize.model import (
-    as_built,
-    parameter_vector,
-    pillar_slopes,
-    process_state_of,
-)
+from characterize.model import as_built, parameter_vector, pillar_slopes
 from codesign.evaluate.error_budget import BudgetInputs, ErrorBudget, scatter_rad
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
@@ -195,23 +190,6 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
         with pytest.raises(ConfigError, match=name):
             LensErrors(**{name: 0.1})
     assert LensErrors(width_nm=3.0).deviations[-5:] == (3.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response):
-    """As pillar by pillar, by a table over the diameter and another of what edges do
-    beyond it.
-    """
-    known = parameter_vector({"bias_nm": 8.0, "bias_x_nm": -5.0, "width_nm": 3.0})
-    ready = MadeLens(lens, OpticsConfig(), response=response)
-    side = ready._block
-    t = as_built.as_built_transmission(lens, response, known) * ready._carrier
-    rows, columns = (n // side * side for n in t.shape)
-    built = (lens.diameters.diameter_um > 0)[:rows, :columns]
-    blocks = rows // side, side, columns // side, side
-    sums, counts = (v.reshape(blocks).sum((1, 3)) for v in (t[:rows, :columns], built))
-    cells = ready._gathered(process_state_of(known))[: len(sums), : len(sums[0])]
-    # half a step of the table, 5e-6 um, at 45 rad/um
-    assert np.abs(cells - sums / np.maximum(counts, 1))[counts > 0].max() < 3e-4
 
 
 def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(

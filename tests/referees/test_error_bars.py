@@ -13,7 +13,6 @@ from characterize.inference.leastsquares import SolverSettings
 from characterize.inference.multistart import SearchTask
 from characterize.inference.prepare import data_of
 from characterize.model import (
-    PARAMETERS,
     PLACE,
     ForwardModel,
     FrameSetting,
@@ -58,76 +57,6 @@ def seen_by_differences(session, scale):
         slope = scale * (ends[0] - ends[1]) / (2 * step)
         found[name] = float((slope**2 / variance).sum())
     return found
-
-
-@pytest.mark.slow
-def test_scores_of_the_referee_s_noise_scatter_as_the_fit_believes():
-    """Photons, read noise, 12 bits, dark of 8 and flat of 24 frames, cleaned as
-    captures are: chi-square of 23 degrees.
-
-    With S the slopes over the noise, n the noise, V the scatter of S n with the errors
-    of dark and flat in common,
-    nᵀSᵀ V⁻¹ S n; over 60 sessions its mean scatters by sqrt(2 x 23 / 60) = 0.9. The
-    gain errs by 2.5 % in each.
-    """
-    lens, session = hidden.lens(), hidden.session(21)
-    seen = bench.shoot(lens, session)
-    n, side = len(session.depths_um), session.pixels
-    setting = FrameSetting(
-        np.array(session.depths_um),
-        np.zeros((n, 2)),
-        np.ones(n),
-        session.pixel_um,
-        side,
-        side,
-    )
-    start = parameter_vector(session.values)
-    model = ForwardModel(lens, setting, log_response_slopes(lens))
-    bare = model.images(
-        parameter_vector(session.values | dict.fromkeys(hidden.PLANE, 0.0))
-    )[0]
-    light = seen.electrons - bench._background(session)
-    start[PLACE["log_gain"]] = np.log((light * bare).sum() / (bare**2).sum())
-    names = [p.name for p in PARAMETERS if p.free]
-    image, by = model.images(start, names)
-    assert np.abs(image - seen.electrons).max() < 2e-3 * image.max()
-    rng, found = np.random.default_rng(7), []
-    for _ in range(60):
-        response = 1 + 0.007 * rng.standard_normal(image.shape[1:])
-        fixed = 97 + 2.0 * rng.standard_normal(image.shape[1:])
-        parts = (
-            seen.electrons * response,
-            np.zeros((8, side, side)),
-            np.full((24, side, side), 6800.0) * response,
-        )
-        frames, dark, flat = (bench._read(part, session, rng, fixed) for part in parts)
-        shots = to_electrons(
-            dataclasses.replace(seen.capture, frames=frames, dark=dark, flat=flat)
-        )
-        data = data_of(shots, (slice(None), slice(None)))
-        counted = shots.gain.gain_e / session.gain_e
-        root = data.usable / np.sqrt(data.variance(counted * image))
-        slope = counted * by * root
-        score = np.tensordot(
-            slope, (data.electrons - counted * seen.electrons) * root, 3
-        )
-        shared = data.shared(counted * image) * root
-        floor, lit = ((slope * one).sum(1).reshape(len(names), -1) for one in shared)
-        alone = (slope * shared[0]).reshape(len(names), -1)
-        scatter = (
-            np.tensordot(slope, slope, ([1, 2, 3],) * 2)
-            + floor @ floor.T
-            + lit @ lit.T
-            - alone @ alone.T
-        )
-        found.append(float(score @ np.linalg.solve(scatter, score)))
-    assert np.mean(found) == pytest.approx(len(names), abs=3.5)  # four of its sigma
-    assert (
-        0.7 < np.std(found) / np.sqrt(2 * len(names)) < 1.35
-    )  # four of that of a standard deviation, 9 %
-    assert (
-        max(found) < 59
-    )  # one in 2000 of such sessions beyond 51, one in 20000 beyond 59
 
 
 def test_the_fit_knows_how_much_its_frames_tell():

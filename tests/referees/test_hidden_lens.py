@@ -76,27 +76,6 @@ def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
     assert abs(field) ** 2 == pytest.approx(found[at], rel=1e-10)
 
 
-def test_saddles_widen_one_way_and_thin_the_other_and_light_fades_as_stated():
-    """At three places without symmetry, against the lens without: rounding."""
-    session = hidden.session(4, values={})
-    faults = {"saddle_nm": 7.0, "oblique_nm": 11.0, "light_y": 0.3, "light_r": -0.4}
-    lens, rng = hidden.lens(12.0, 40.0, 200.0), np.random.default_rng
-    (x, y, d, light, _), (_, _, plain, one, _) = (
-        bench._pillars(lens, bench.with_faults(session, **some), rng(0))
-        for some in (faults, {})
-    )
-    radius = np.hypot(x, y)[plain > 0].max()
-    for place in ((20, 31), (33, 20), (9, 12)):
-        u, v = x[place] / radius, y[place] / radius
-        assert d[place] - plain[place] == pytest.approx(
-            7e-3 * (u * u - v * v) + 11e-3 * 2 * u * v, abs=1e-12
-        )
-        irradiance = abs(light[place] / one[place]) ** 2
-        assert irradiance == pytest.approx(
-            np.exp(0.3 * v - 0.4 * (u * u + v * v)), rel=1e-12
-        )
-
-
 def test_a_cause_that_nobody_states_is_the_only_one_left_open():
     """By names that the fit knows: each kind in turn, every other one stated."""
     every = {name for names in hidden.UNSTATED.values() for name in names} | set(
@@ -108,21 +87,6 @@ def test_a_cause_that_nobody_states_is_the_only_one_left_open():
     for kind, faults, absent in kinds:
         assert every - set(absent) == set(hidden.UNSTATED[kind])
         bench.with_faults(hidden.session(1), **faults)
-
-
-def test_a_plate_of_glass_bends_by_snell():
-    """Fermat: the path through the plate is the least over all places where the ray
-    could enter it.
-    """
-    glass = bench.Faults(glass_um=100.0)
-    rho, z = 37.3, 411.0
-    enter = np.linspace(
-        0, rho, 200001
-    )  # on the plate's far side, the plate lying on the lens
-    want = (np.hypot(enter, z - 100.0) + 1.51 * np.hypot(rho - enter, 100.0)).min()
-    assert bench._source_path(glass, np.array(rho), np.array(0.0), z) == pytest.approx(
-        want, abs=1e-7
-    )
 
 
 def test_one_frame_cannot_fix_twenty_parameters():

@@ -2,7 +2,6 @@
 where it only reads so.
 """
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -123,42 +122,6 @@ def test_dark_and_flat_are_known_by_the_size_of_the_frames(tmp_path):
     assert [
         words.split()[0] for words in found.corrections if "(y, x, n)" in words
     ] == ["s.h5", "flat.h5"]
-
-
-def test_a_raw_mosaic_lies_otherwise_too(tmp_path):
-    """25 x 19 pixels hold 13 x 10 red ones; the dark is as large as the frames on disk,
-    not as those used.
-    """
-    about = ABOUT + 'bits = 12\nchannel = "red"\nmosaic = "RGGB"\naxes = "yxn"\n'
-    frames = FRAMES[:, :25]
-    folder(tmp_path, "s.h5", np.moveaxis(frames, 0, 2), rows("s.h5", 5), about)
-    stack(tmp_path / "dark.h5", np.moveaxis(frames // 50, 0, 2))
-    found = capture.load(tmp_path)
-    assert np.array_equal(found.frames, frames[:, ::2, ::2])
-    assert np.array_equal(found.dark, frames[:, ::2, ::2] // 50)
-
-
-def test_other_axes_are_refused(tmp_path):
-    with pytest.raises(CaptureError, match=r"axes = 'nxy'; need \"nyx\""):
-        capture.load(
-            folder(tmp_path, "s.h5", FRAMES, rows("s.h5", 5), ABOUT + 'axes = "nxy"\n')
-        )
-
-
-def test_pages_that_were_written_one_by_one_are_frames_however_narrow(tmp_path):
-    """As OpenCV writes them; listed by another number they are not taken the other way
-    round.
-    """
-    narrow = np.moveaxis(FRAMES, 0, 2)  # 26 frames of 19 x 5
-    cv2.imwritemulti(
-        str(tmp_path / "s.tif"), list(narrow), [cv2.IMWRITE_TIFF_COMPRESSION, 1]
-    )
-    found = capture.load(tmp_path / "s.tif")
-    assert np.array_equal(found.frames, narrow)
-    assert len(found.corrections) == 1  # of bits, not of axes
-    (tmp_path / "stage.csv").write_text(rows("s.tif", 5))
-    with pytest.raises(CaptureError, match="holds 26 pages and stands in 5 rows"):
-        capture.load(tmp_path)
 
 
 @pytest.mark.parametrize(

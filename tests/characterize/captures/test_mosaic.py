@@ -1,7 +1,6 @@
 """Raw colour mosaics taken apart, and values of TIFF files that are not light."""
 
 import dataclasses
-import math
 import sys
 from pathlib import Path
 
@@ -133,21 +132,3 @@ def _nearest(some, every):
     return min(
         np.abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1)
     )
-
-
-def test_the_shares_of_a_mosaic_are_a_cause_of_their_own():
-    """Pixels of 2 x 2 that see 1, 0.4, 0.4 and 0.2 of the light, less the gain: these
-    three waves of it, no more.
-    """
-    from characterize.inference.systematic_effects import _of_mosaic
-
-    light = np.random.default_rng(8).uniform(3, 9, (2, 5, 6))
-    shares = np.tile(np.array([[1.0, 0.4], [0.4, 0.2]]), (3, 3))[:5]
-    missed = light * (shares - shares[:2, :2].mean())
-    waves = _of_mosaic(light).reshape(3, -1)
-    left = (
-        missed.ravel()
-        - waves.T @ np.linalg.lstsq(waves.T, missed.ravel(), rcond=None)[0]
-    )
-    assert np.abs(left).max() < 1e-12 * light.max()
-    assert math.isclose(float(np.abs(waves).max()), float(light.max()))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from characterize.captures import Capture, SensorNoise, quantization_score, to_electrons
+from characterize.captures import Capture, quantization_score, to_electrons
 from characterize.captures.calibration import photon_transfer
 from characterize.captures.rounding import DarkStatistics
-from characterize.inference import estimate, leastsquares, multistart, prepare
+from characterize.inference import leastsquares, prepare
 from characterize.inference.leastsquares import FitImages
 
 
@@ -149,59 +149,6 @@ def test_fit_of_rounded_counts_ends_where_their_likelihood_is_greatest():
     )  # 338 pixels: 0.08, and their scores are no normal numbers
 
 
-def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
-    rng = np.random.default_rng(2)
-    image = rng.uniform(2, 40, (2, 5, 4))
-    full = rng.random(image.shape) < 0.3
-    data = FitImages(
-        17.0 * np.rint(image / 17.0),
-        ~full,
-        full,
-        np.full(image.shape, 34.0),
-        rng.uniform(0.9, 1.1, image.shape),
-        0.0,
-        0.2,
-        0.0,
-        17.0,
-    )
-    made = prepare.correct_quantization(data, image)
-    assert np.array_equal(made.electrons[full], data.electrons[full])
-    assert np.array_equal(made.variance_e2[full], data.variance_e2[full])
-    assert made.shared(image)[0] == pytest.approx(data.shared(image)[0])
-    assert made.count_e == 0.0
-
-
-def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_is_stated():
-    """0.43 counts of light on steps of 1700 electrons, without read noise: 0.016 counts
-    by themselves.
-    """
-    step, light, noise = 1700.0, 0.43, 0.05
-    electrons = step * np.array([[[0.0, 1.0]]])
-    image = np.full_like(electrons, light * step)
-    full = np.ones(electrons.shape, bool)
-    data = FitImages(
-        electrons,
-        full,
-        ~full,
-        np.full_like(electrons, step**2 / 12),
-        np.ones(electrons.shape),
-        count_e=step,
-    )
-    made = prepare.correct_quantization(data, image)
-    counts, chance = chances(light, noise)
-    up, down = (chances(light + sign * 1e-5, noise)[1] for sign in (1, -1))
-    some = chance > 1e-14
-    score = (up - down)[some] / 2e-5 / chance[some]
-    information = float(chance[some] @ score**2)
-    want = [light + float(score[counts[some] == k][0]) / information for k in (0, 1)]
-    assert made.electrons.ravel() / step == pytest.approx(
-        want, rel=1e-4
-    )  # the difference: (1e-5 / 0.05)² x 7²
-    assert made.variance(image).ravel() == pytest.approx(
-        step**2 / information, rel=1e-4
-    )
-
-
 def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count():
     rng = np.random.default_rng(21)
     gain, read, level = 31.0, 4.0, 9.3
@@ -238,47 +185,3 @@ def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count
     assert (
         abs(zero - level) < 0.15 < level - dark.mean()
     )  # 1.6 sigma of noise that is taken for 0.17, not 0.13
-
-
-@pytest.mark.parametrize(
-    ("read", "count_e", "exact"),
-    [(4.3, 29.0, True), (9.1, 29.0, False), (4.3, 0.0, False)],
-)
-def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(
-    monkeypatch, read, count_e, exact
-):
-    """A level of 0.27 counts alone, read as 0 with a chance of Phi((1/2 - m) / s).
-
-    Greatest where the share of counts above a half is as read: m = 1/2 + s
-    Phi^-1(share), with s at the level found."""
-    rng = np.random.default_rng(4)
-    electrons = seen(rng, np.full((1, 40, 50), 0.27 * 29.0), 29.0, 4.3)
-    full = np.ones(electrons.shape, bool)
-    floor = np.full(electrons.shape, 4.3**2 + 29.0**2 / 12)
-    counts = FitImages(
-        electrons, full, ~full, floor, np.ones(electrons.shape), count_e=count_e
-    )
-
-    def model(value, jacobian):
-        return np.full(electrons.shape, value[0]), np.ones(
-            (1, *electrons.shape)
-        ) if jacobian else None
-
-    monkeypatch.setattr(
-        multistart,
-        "refine_fit",
-        lambda task, value: leastsquares.fit_levenberg_marquardt(
-            model, task.data, value
-        ),
-    )
-    task = multistart.SearchTask(None, counts, np.zeros(1), {}, None)
-    first = leastsquares.fit_levenberg_marquardt(model, counts, np.array([3.0]))
-    made, ends = estimate._unrounded(task, [first], SensorNoise(29.0, 0.3, read))
-    assert (made is not task) == exact
-    if exact:
-        noise = np.sqrt(4.3**2 + ends[0].value[0])
-        level = 29.0 / 2 + noise * stats.norm.ppf((electrons > 0).mean())
-        assert ends[0].value[0] == pytest.approx(
-            level, abs=0.1 * np.sqrt(ends[0].covariance[0, 0])
-        )
-        assert abs(first.value[0] - 0.27 * 29.0) > 9 * np.sqrt(first.covariance[0, 0])

@@ -72,20 +72,6 @@ def test_other_names_and_units_of_a_description_are_taken(tmp_path):
     assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.12}
 
 
-def test_a_name_in_the_right_unit_goes_before_another(tmp_path):
-    (tmp_path / "capture.json").write_text(
-        json.dumps({"pixel_um": 0.2, "pixel_size_um": 0.3, "voxel_um": [0.4, 5, 0.6]})
-    )
-    assert stage.read_about(tmp_path) == {
-        "step_um": 0.4,
-        "pixel_um": 0.2,
-        "pixel_size_um": 0.3,
-    }
-    (tmp_path / "capture.json").write_text(json.dumps({"bits": True}))
-    with pytest.raises(CaptureError, match="bits = True"):
-        stage.read_about(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -119,17 +105,6 @@ def test_rows_are_named_as_an_editor_counts_them(tmp_path):
     (tmp_path / "stage.csv").write_text("file,depth_um\na.tif,1\n,2\n")
     with pytest.raises(CaptureError, match="row 3: no 'file'"):
         stage.read_stage(tmp_path)
-
-
-def test_frames_of_which_only_names_are_known():
-    rows = stage.StageRows.unknown(("a", "b", "c"))
-    assert rows.page == (None, None, None)
-    assert rows.angle_rad.tolist() == [[0, 0]] * 3
-    assert (
-        np.isnan(rows.position_um).tolist()
-        == np.isnan(rows.exposure_s).tolist()
-        == [True] * 3
-    )
 
 
 def pixels(planes, about=""):
@@ -203,49 +178,6 @@ def test_what_no_camera_has_is_refused_and_misspelt_names_are_told(
         stage.read_about(tmp_path)
 
 
-def test_notes_of_the_user_and_whole_bits_are_kept(tmp_path):
-    (tmp_path / "capture.toml").write_text(
-        'bits = 14.0\noffset = -3.5\noperator = "E. Q."\ncamera = "XB-7"\n'
-    )
-    found = stage.read_about(tmp_path)
-    assert found == {"bits": 14, "offset": -3.5, "operator": "E. Q.", "camera": "XB-7"}
-    assert isinstance(found["bits"], int)
-
-
-def test_what_may_be_0_and_tilts_to_either_side_are_taken(tmp_path):
-    (tmp_path / "capture.toml").write_text(
-        "read_noise_e = 0\nglass_um = 0.0\nglass_tilt_x_deg = -89.0\nbits = 32\n"
-    )
-    assert stage.read_about(tmp_path) == {
-        "read_noise_e": 0,
-        "glass_um": 0.0,
-        "glass_tilt_x_deg": -89.0,
-        "bits": 32,
-    }
-    for line in (
-        "glass_tilt_x_deg = -90.5",
-        "glass_tilt_y_deg = 90",
-        "wavelength_um = 0",
-    ):
-        (tmp_path / "capture.toml").write_text(line + "\n")
-        with pytest.raises(CaptureError, match=line):
-            stage.read_about(tmp_path)
-
-
-def test_images_that_the_table_does_not_name_are_told_and_dark_ones_refused(tmp_path):
-    rows = stage.StageRows.unknown(("sub/b.tif", "c.tif"))
-    every = [tmp_path / f"{name}.tif" for name in "abcdefgh"]
-    (told,) = stage.left_out(every, rows)
-    assert told.startswith("6 images that ")
-    assert told.endswith("left out: a.tif, d.tif, e.tif, f.tif, g.tif")
-    assert stage.left_out(every[1:3], rows) == ()
-    with pytest.raises(
-        CaptureError, match=r"'darks_2.tif' is not named .* one stack dark.tif"
-    ):
-        stage.left_out([tmp_path / "darks_2.tif"], rows)
-    assert stage.left_out([tmp_path / "darkroom.tif"], rows)
-
-
 @pytest.mark.parametrize("time", ["0", "-0.02"])
 def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
     (tmp_path / "stage.csv").write_text(
@@ -255,12 +187,3 @@ def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
         CaptureError, match=r"stage\.csv, row 3: exposure_s is -?0.*above 0"
     ):
         stage.read_stage(tmp_path)
-
-
-def test_entries_that_nothing_reads_are_named():
-    """Where the sensor's window lay is not read: the axis is sought in the frames."""
-    (said,) = stage.unread_keys_text(
-        {"pixel_um": 3.0, "roi_x_px": 12, "window": "fixed", "operator": "K"}
-    )
-    assert said.endswith(": roi_x_px, operator")
-    assert not stage.unread_keys_text({"wavelength_um": 0.53, "gain_e": 2.3})

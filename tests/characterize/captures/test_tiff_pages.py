@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from characterize.captures import capture, tiff_pages
-from characterize.captures.colour import ColourChannels
 from metalens.core.errors import CaptureError
 
-cv2 = pytest.importorskip("cv2")
 image = pytest.importorskip("PIL.Image")
 tifffile = pytest.importorskip("tifffile")
 FRAMES = np.arange(3 * 6 * 5, dtype=np.uint16).reshape(3, 6, 5)
@@ -27,20 +25,6 @@ def written(tmp_path, frames=FRAMES, **about):
 
 def test_plain_frames_are_read_as_they_are(tmp_path):
     assert np.array_equal(tiff_pages.read_tiff(written(tmp_path)), FRAMES)
-
-
-def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(
-    tmp_path,
-):
-    stack = written(tmp_path)
-    tifffile.imwrite(
-        tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None
-    )
-    names, frames, _ = capture._all_frames(
-        [stack, tmp_path / "b.tif"], tmp_path, ColourChannels(), None
-    )
-    assert names == ("a.tif[0]", "a.tif[1]", "a.tif[2]", "b.tif")
-    assert np.array_equal(frames, np.stack([*FRAMES, FRAMES[1]]))
 
 
 @pytest.mark.parametrize(
@@ -67,25 +51,6 @@ def test_frames_that_are_compressed_with_loss_or_by_a_stranger_are_refused_by_na
         file.pages[2].tags[259].overwrite(code)
     with pytest.raises(CaptureError, match=f"frame 2 is {words}"):
         tiff_pages.read_tiff(path)
-
-
-def test_frames_together_may_claim_no_more_than_is_held(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiff_pages, "_MOST_BYTES", FRAMES.nbytes)
-    assert len(tiff_pages.read_tiff(written(tmp_path))) == 3
-    monkeypatch.setattr(tiff_pages, "_MOST_BYTES", FRAMES.nbytes - 1)
-    with pytest.raises(CaptureError, match=r"frame 2 claims \(6, 5\) values"):
-        tiff_pages.read_tiff(written(tmp_path))
-
-
-def test_planes_are_images_or_the_colours_of_one(tmp_path):
-    path = written(tmp_path, FRAMES[None], planarconfig="separate")
-    assert np.array_equal(tiff_pages.read_tiff(path), FRAMES)
-    assert np.array_equal(
-        tiff_pages.read_tiff(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None]
-    )
-    assert np.array_equal(
-        tiff_pages.read_tiff(written(tmp_path), coloured=True), FRAMES
-    )
 
 
 @pytest.mark.parametrize(
@@ -152,27 +117,6 @@ def test_pages_of_unlike_types_are_refused(tmp_path):
         tiff_pages.read_tiff(tmp_path / "a.tif")
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("imagecodecs") is not None, reason="reads packed values"
-)
-def test_packed_values_are_refused_by_their_width(tmp_path):
-    """Two values of 12 bits in three bytes."""
-    packed = np.zeros((6, 9), np.uint8).tobytes()
-    about = {
-        "shape": (6, 6),
-        "dtype": "uint16",
-        "bitspersample": 12,
-        "rowsperstrip": 6,
-        "metadata": None,
-    }
-    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        file.write(iter([packed]), photometric="minisblack", **about)
-    with pytest.raises(
-        CaptureError, match="values of frame 0 are 12 bits wide, packed"
-    ):
-        tiff_pages.read_tiff(tmp_path / "a.tif")
-
-
 @pytest.mark.parametrize(
     "about",
     [{"byteorder": ">"}, {"bigtiff": True}, {"compression": "zlib", "predictor": True}],
@@ -210,38 +154,3 @@ def test_frames_that_other_programs_packed_are_read_as_the_counts_they_are(
     found = tiff_pages.read_tiff(tmp_path / "a.tif")
     assert found.dtype == frames.dtype
     assert np.array_equal(found, frames)
-
-
-def test_packed_colours_come_red_first(tmp_path):
-    colours = np.random.default_rng(5).integers(0, 256, (1, 9, 11, 3)).astype(np.uint8)
-    image.fromarray(colours[0]).save(tmp_path / "a.tif", compression="tiff_lzw")
-    assert np.array_equal(tiff_pages.read_tiff(tmp_path / "a.tif"), colours)
-
-
-def test_a_plain_frame_behind_a_packed_one_stays_itself(tmp_path):
-    frames = [image.fromarray(frame) for frame in FRAMES[:2]]
-    writer = pytest.importorskip("PIL.TiffImagePlugin").AppendingTiffWriter
-    with writer(str(tmp_path / "a.tif"), new=True) as file:
-        for frame, packing in zip(frames, ("tiff_lzw", None), strict=True):
-            frame.save(file, format="TIFF", compression=packing)
-            file.newFrame()
-    assert np.array_equal(tiff_pages.read_tiff(tmp_path / "a.tif"), FRAMES[:2])
-
-
-@pytest.mark.skipif(
-    importlib.util.find_spec("imagecodecs") is not None, reason="reads what is stored"
-)
-@pytest.mark.parametrize("way_up", [2, 6])
-def test_packed_frames_that_opencv_would_set_upright_are_refused(tmp_path, way_up):
-    """Mirrored, or turned on its side: plain ones come as they are stored."""
-    path = tmp_path / "a.tif"
-    image.fromarray(FRAMES[0]).save(path, tiffinfo={274: way_up})
-    assert np.array_equal(tiff_pages.read_tiff(path)[0], FRAMES[0])
-    image.fromarray(FRAMES[0]).save(
-        path, compression="tiff_lzw", tiffinfo={274: way_up}
-    )
-    with pytest.raises(
-        CaptureError,
-        match=r"compressed \(LZW\) and damaged, turned or of a kind .* plain or deflated",
-    ):
-        tiff_pages.read_tiff(path)

@@ -47,26 +47,6 @@ def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit,
     assert found.notes == (step, f"{pixel} of the file")
 
 
-@pytest.mark.parametrize(
-    ("about", "steps"),
-    [
-        ({"unit": "um"}, []),
-        ({"unit": "um", "spacing": 0.0}, []),
-        ({"spacing": 2.5}, [0, 2.5, 5, 7.5]),
-    ],
-)
-def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(
-    tmp_path, about, steps
-):
-    tifffile.imwrite(
-        tmp_path / "a.tif", FRAMES, imagej=True, metadata={"axes": "ZYX"} | about
-    )
-    found = tiff_tags.read_tags(tmp_path / "a.tif")
-    assert found.position_um.tolist() == steps
-    assert math.isnan(found.pixel_um)
-    assert len(found.notes) == bool(steps)
-
-
 def test_two_channels_are_refused(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.tif",
@@ -109,32 +89,6 @@ def test_ome_without_positions_gives_steps_of_the_height_of_a_voxel(tmp_path, un
     assert found.notes[0] == f"stage step of {2.5 * um:.4g} um from the OME tags"
 
 
-def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
-    """The unit first, in single quotes, a micro sign as an entity or a Greek letter:
-    all mean 0.37 and 2.5 um.
-    """
-    about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeZ": 2.5}
-    about |= {"PhysicalSizeXUnit": "um", "PhysicalSizeZUnit": "um"}
-    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about)
-    written = tifffile.tiffcomment(tmp_path / "a.ome.tif")
-    turned = written
-    for axis, nm in (("X", 370), ("Z", 2500)):
-        name, um = f"PhysicalSize{axis}", nm / 1000
-        turned = turned.replace(
-            f'{name}="{um}" {name}Unit="um"', f'{name}Unit="nm" {name}="{nm}"'
-        )
-    spelt = (
-        written.replace('"um"', f'"{unit}"')
-        for unit in ("&#181;m", "\u00b5m", "&#x3bc;m")
-    )
-    for words in (turned, written.replace('"', "'"), *spelt):
-        assert words != written
-        tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
-        found = tiff_tags.read_tags(tmp_path / "a.ome.tif")
-        assert found.pixel_um == pytest.approx(0.37, rel=1e-12)
-        assert found.position_um == pytest.approx(2.5 * np.arange(4), rel=1e-12)
-
-
 def test_ome_tags_that_are_no_xml_are_told(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.ome.tif",
@@ -171,26 +125,6 @@ def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(
         assert tiff_tags.read_tags(tmp_path / "a.tif").position_um == pytest.approx(
             0.3 * np.array(steps), rel=1e-12
         )
-
-
-def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tmp_path):
-    tifffile.imwrite(
-        tmp_path / "a.ome.tif",
-        FRAMES.reshape(2, 2, 6, 5),
-        ome=True,
-        metadata={"axes": "ZCYX"},
-    )
-    with pytest.raises(CaptureError, match="2 channels in one file"):
-        tiff_tags.read_tags(tmp_path / "a.ome.tif")
-    colours = np.repeat(FRAMES[..., None], 3, -1)
-    tifffile.imwrite(
-        tmp_path / "b.ome.tif",
-        colours,
-        ome=True,
-        photometric="rgb",
-        metadata={"axes": "ZYXS"},
-    )
-    assert len(tiff_tags.read_tags(tmp_path / "b.ome.tif").position_um) == 0
 
 
 def test_a_plain_file_tells_nothing(tmp_path):

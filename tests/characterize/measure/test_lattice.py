@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from characterize.measure import lattice as lattices
 from characterize.measure import overlay, sem
 from metalens.cell import Lattice
 from metalens.core.errors import CaptureError
@@ -210,78 +209,3 @@ def test_a_picture_across_the_mask_is_refused():
         overlay.overlay_design(
             found, DiameterMap(np.full((44, 60), 0.18), PITCH * 1e-3)
         )
-
-
-@pytest.mark.parametrize("level", [4000.0, 1e-9])
-@pytest.mark.parametrize("wave", [(0.0613, 0.1187), (0.117, -0.0342)])
-def test_a_wave_is_refined_to_a_thousandth_of_a_fringe(wave, level):
-    """Under a Hann window, from a quarter of a fringe away, whatever the unit of the
-    picture. Steps end at 1e-3 of 0.3
-    fringes; the wave's own mirror image moves the peak by less."""
-    y, x = np.arange(90), np.arange(120)
-    hann = np.outer(
-        np.sin(np.pi * (y + 0.5) / 90) ** 2, np.sin(np.pi * (x + 0.5) / 120) ** 2
-    )
-    seen = level * hann * np.cos(2 * np.pi * (wave[0] * y[:, None] + wave[1] * x) + 0.7)
-    found = lattices._refined(
-        seen, np.array([wave[0] + 0.25 / 120, wave[1] - 0.2 / 120])
-    )
-    assert found * 120 == pytest.approx(np.array(wave) * 120, abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("stretch", "fits"),
-    [(1.045, True), (1.055, False), (1 / 1.045, True), (1 / 1.055, False)],
-)
-def test_a_picture_whose_sides_differ_by_a_twentieth_from_the_design_is_not_laid_on_it(
-    stretch, fits
-):
-    """Of a rectangle of 0.31 x 0.434 um; the scale of the picture is free."""
-    seen = lattices.ImageLattice(
-        np.zeros(2),
-        np.array([0.0, 71.0 * stretch]),
-        np.array([1.4 * 71.0 / stretch, 0.0]),
-    )
-    design = DiameterMap(
-        np.full((9, 9), 0.18), PITCH * 1e-3, lattice=Lattice("rectangular", 1.4)
-    )
-    if fits:
-        assert overlay._steps(seen, design).tolist() == [[1, 0], [0, 1]]
-    else:
-        with pytest.raises(
-            CaptureError, match="do not lie in the picture as on the mask"
-        ):
-            overlay._steps(seen, design)
-
-
-def test_a_longer_side_is_sought_up_to_two_and_a_half_pitches_and_no_wave_beyond():
-    """A row in three that is brighter is no lattice of its own."""
-    rows, columns = np.indices((330, 370))
-    for ratio in (2.4, 1.4):
-        wave = np.cos(2 * np.pi * columns / 20.0) + np.cos(
-            2 * np.pi * rows / (20.0 * ratio)
-        )
-        wave = wave + (0.0 if ratio == 2.4 else 3.0) * np.cos(2 * np.pi * rows / 60.0)
-        made = lattices.find_lattice(wave, 20.0)
-        assert np.abs(made.a) == pytest.approx([0.0, 20.0], abs=0.05)
-        assert np.abs(made.b) == pytest.approx([20.0 * ratio, 0.0], abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("longer", "found"), [(2.4, True), (2.7, True), (2.85, False), (4.0, False)]
-)
-def test_the_longer_side_of_a_cell_is_two_and_a_half_pitches_at_most(longer, found):
-    """A tenth of a stated pitch is left to doubt about it: 2.5 over 0.9 is 2.78."""
-    row, column = np.mgrid[:400, :300]
-    seen = np.cos(2 * np.pi * column / 12.0 + 0.3) + 0.8 * np.cos(
-        2 * np.pi * row / (12.0 * longer) - 1.1
-    )
-    if not found:
-        with pytest.raises(CaptureError, match=r"no lattice of pitch 12\.00 pixels"):
-            lattices.find_lattice(seen, 12.0)
-        return
-    made = lattices.find_lattice(seen, 12.0)
-    assert (
-        np.abs(made.a - [0.0, 12.0]).max() < 0.05
-    )  # peaks of waves of 25 and of 13 turns, a hundredth of one
-    assert np.abs(made.b - [12.0 * longer, 0.0]).max() < 0.3

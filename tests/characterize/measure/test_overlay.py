@@ -10,26 +10,6 @@ from characterize.measure import overlay
 RNG = np.random.default_rng(5)
 
 
-def test_scatter_is_that_of_a_line_at_every_shift():
-    drawn = RNG.uniform(100, 300, (9, 11))
-    mask = (RNG.uniform(size=(4, 6)) > 0.2).astype(float)
-    patch = mask * (drawn[3:7, 2:8] * 1.07 - 12.0 + RNG.normal(0, 2.0, mask.shape))
-    found = overlay._scatter(patch, mask, drawn)
-    assert found.shape == (6, 6)
-    keep = mask > 0
-    for row, column in ((3, 2), (0, 5), (4, 1)):
-        here = drawn[row : row + 4, column : column + 6][keep]
-        made = patch[keep]
-        slope = np.clip(np.cov(here, made, ddof=0)[0, 1] / here.var(), 2 / 3, 4 / 3)
-        assert found[row, column] == pytest.approx(
-            np.var(made - slope * here), rel=1e-6
-        )
-    assert np.unravel_index(found.argmin(), found.shape) == (3, 2)
-    drawn[4, 4] = 0.0  # a site without a pillar under a measured one
-    keep[1, 2] = True
-    assert np.isinf(overlay._scatter(patch, keep.astype(float), drawn)[3, 2])
-
-
 def test_knots_of_a_bias_table_carry_mean_and_standard_error():
     designed = np.repeat([110.0, 170.0, 260.0], [7, 7, 6])
     error = RNG.normal(0, 3.0, 20) + designed * 0.02

@@ -5,7 +5,7 @@ a blur of this file's own.
 import numpy as np
 import pytest
 
-from characterize.measure import radial, sem
+from characterize.measure import sem
 
 COUNT, STRIPS = 5, 16
 
@@ -99,46 +99,3 @@ def test_errors_of_small_discs_hold_their_noise(diameter, blur):
     assert (
         0.7 < score.std() < 1.3
     )  # 9 % from chance, and errors of which a picture's discs share one of its blur
-
-
-@pytest.mark.parametrize(("radius", "variance"), [(4.5, 4.0), (6.0, 1.7), (3.5, 0.8)])
-def test_a_disc_that_is_read_is_found_from_its_reading(radius, variance):
-    """The profile by a sum over the disc's area, smoothed by a sum: back come its blur
-    and radius.
-    """
-    reach, smooth = np.arange(0, 14, 0.125), 1.0
-    step = 0.04
-    v, u = np.meshgrid(
-        np.arange(-radius, radius, step) + step / 2,
-        np.arange(-radius, radius, step) + step / 2,
-    )
-    inside = np.hypot(u, v) < radius
-    seen = [
-        np.exp(-((r - u[inside]) ** 2 + v[inside] ** 2) / (2 * variance)).sum()
-        for r in reach
-    ]
-    seen = np.array(seen) * step**2 / (2 * np.pi * variance)
-    weights = np.exp(-0.5 * ((reach[:, None] - reach) / smooth) ** 2)
-    weights[:, 0] += np.exp(
-        -0.5 * ((reach[:, None] + 0.125 * np.arange(1, 64)) / smooth) ** 2
-    ).sum(1)  # as level as at 0
-    weights[:, -1] += np.exp(
-        -0.5 * ((reach[:, None] - 14 - 0.125 * np.arange(64)) / smooth) ** 2
-    ).sum(1)
-    rays = np.repeat((weights @ seen / weights.sum(1))[:, None], radial.RAYS, 1)
-    blur = radial.blur_variance(reach, rays, smooth)
-    assert blur == pytest.approx(
-        variance, rel=0.02
-    )  # eight turns, each leaving a third
-    inner, outer, rim = radial.rim_and_gap_levels(reach, rays)
-    half = radial.edge_crossings(reach, rays, (inner + outer) / 2, rim)[0]
-    assert radial.deblur_radius(reach, half, variance, smooth)[0] == pytest.approx(
-        radius, abs=0.01
-    )  # steps of the sum
-    rim_only = rays - 0.7 * np.exp(-((reach / (0.4 * radius)) ** 2))[:, None]
-    assert np.isnan(radial.blur_variance(reach, rim_only, smooth))  # a dark top
-
-
-def test_a_wide_disc_is_left_to_the_plain_rule():
-    assert radial.is_wide_disc(16.0, 2.0**2, 1.0)
-    assert not radial.is_wide_disc(11.0, 2.0**2, 1.0)

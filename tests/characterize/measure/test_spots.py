@@ -138,16 +138,3 @@ def test_noise_is_no_light_of_its_own():
     assert np.mean(share) == pytest.approx(
         (1 - math.exp(-9 / 2 / wide**2)) / 1.7, rel=0.01
     )
-
-
-@pytest.mark.parametrize("radius", [0.3, 0.5, 1.1, 2.6])
-def test_a_circle_takes_its_part_of_every_pixel(radius):
-    """Even light of 1 a pixel holds the area of the circle, in the middle of a pixel or
-    not; 0.3 % of chords.
-    """
-    even = np.ones((9, 11))
-    for x0, y0 in ((0.0, 0.0), (0.41, -0.17)):
-        inside = metrics._within(
-            even, np.arange(11) - 5 - x0, np.arange(9) - 4 - y0, radius
-        )
-        assert inside == pytest.approx(math.pi * radius**2, rel=0.02)

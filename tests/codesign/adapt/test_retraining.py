@@ -167,34 +167,6 @@ def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(fo
     )
 
 
-def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
-    folder, found, monkeypatch
-):
-    """Of the made lens first: its images are those that the network was trained for."""
-    asked = []
-
-    def above(settings, image):
-        asked.append(image)
-        return f"image {len(asked)}"
-
-    monkeypatch.setattr(image_formation, "image_tolerance_problem", above)
-    source = finished.load_finished_run(folder)
-    going = retraining.make_trainer(source, SHORT, (found.nominal,))
-    told = retraining.retraining_outcome(
-        source, SHORT, found, {"nominal": going, "retrained": going, "known": going}
-    )
-    cases = (told.designed, told.nominal, told.before, told.after, told.known)
-    numbers = [int(case.above.split()[1]) for case in cases]
-    assert numbers == sorted(
-        numbers
-    )  # cases are judged in their order, each after its batch statistics
-    assert len(set(numbers)) == 5
-    assert told.above == told.after.above
-    assert (
-        replace(told, after=replace(told.after, above="")).above == told.designed.above
-    )
-
-
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
     source = finished.load_finished_run(folder)
     whole = retraining.make_job(source, SHORT, found, "retrained")

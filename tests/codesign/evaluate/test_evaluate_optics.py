@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.commands.evaluate_optics import tuned_like
 from codesign.evaluate import optics as evaluate
 from codesign.evaluate.optics import MeasurementSettings, SensitivityScenes
 from codesign.eye import dataset
 from codesign.train import bootstrap_ratio
 from metalens import design
-from metalens.cell.record import Cell, Film, Index
-from metalens.design.free_form import baselines
+from metalens.cell.record import Cell, Index
 from metalens.design.profiles import DoubleHelix, Focus
 from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
@@ -139,26 +137,6 @@ def test_bootstrap_interval_covers_the_true_ratio():
 def test_nothing_to_evaluate_is_refused():
     with pytest.raises(ValueError, match="at least one"):
         evaluate.scene_energies([], dataset.states_at(torch.arange(1), 0))
-
-
-def test_simple_lenses_stand_in_the_surroundings_of_the_lens_that_they_are_compared_with(
-    monkeypatch,
-):
-    monkeypatch.setattr(baselines, "ZONES", (1,))  # of the double helix
-    layers = Layers(
-        front=(Film(Index(1.5), 60.0),),
-        behind=(Film(Index(1.4), 90.0),),
-        stop=Stop(40.0, 60.0),
-    )
-    focus = Focus(0.85, 300.0, 2000.0, layers)
-    phase = design.phase_of(None, focus, radius_um=45.0)
-    made, _ = design.make(phase, focus, aperture_um=90.0, cell=CELL, proxy=IDEAL)
-    setting = MeasurementSettings(
-        depths_mm=(1.6, 2.6), count=3, angles_deg=(0.0,), binnings=(1,), window_um=40.0
-    )
-    simple = tuned_like(made, setting)
-    assert [one.layers for _, one in simple] == [made.layers, made.layers]
-    assert made.layers.stop == layers.stop
 
 
 def _summed(lens, angle_rad, depth_um, place_um, hole_um=math.inf):

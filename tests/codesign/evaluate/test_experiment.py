@@ -15,11 +15,11 @@ from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentTrials
 from codesign.eye import population as eye
 from codesign.eye.population import CameraRig
-from codesign.gaze import people_file, personal, regressor, shared
+from codesign.gaze import people_file, personal, shared
 from codesign.gaze.readings import NetworkReadings
 from codesign.settings import ExperimentConfig
 from metalens.cli import main
-from metalens.core.errors import ConfigError, TrainingError
+from metalens.core.errors import ConfigError
 from tests.codesign import made_lens as m
 from tests.referees.seen_pupil import pupil_of
 
@@ -97,37 +97,6 @@ def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
         )  # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
     other, _ = experiment.states_of(SMALL, 2, scenes)
     assert float(other.trait("size")[0]) != float(states.trait("size")[0])
-
-
-def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-1, 1, (70, 5))
-
-    def target(v):
-        return np.stack(
-            [np.tanh(v[:, 0] + 0.5 * v[:, 2]), v[:, 1] * (1 + 0.3 * v[:, 4])], 1
-        )
-
-    made = regressor.fit_regressor(x, target(x), penalty=1e-5)
-    new = rng.uniform(-0.8, 0.8, (200, 5))
-    assert (
-        np.abs(made(new) - target(new)).mean() < 0.02
-    )  # of a range of 2: two tanh terms and a product
-    inside = rng.standard_normal((6, 3))
-    outside = rng.standard_normal((4, 2))
-    slope = regressor._jacobian(inside, outside, x)
-    for k, (array, place) in enumerate(((inside, (2, 1)), (outside, (3, 0)))):
-        up, down = array.copy(), array.copy()
-        up[place] += 1e-6
-        down[place] -= 1e-6
-        pair = [(a, outside) if k == 0 else (inside, a) for a in (up, down)]
-        difference = (
-            regressor._forward(*pair[0], x) - regressor._forward(*pair[1], x)
-        ).ravel() / 2e-6
-        column = np.ravel_multi_index(place, array.shape) + (inside.size if k else 0)
-        assert np.abs(slope[:, column] - difference).max() < 1e-8
-    with pytest.raises(TrainingError, match="2 points"):
-        regressor.fit_regressor(x[:2], target(x[:2]))
 
 
 def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_much():

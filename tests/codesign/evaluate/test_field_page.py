@@ -2,7 +2,6 @@
 in tables, what is refused.
 """
 
-import json
 import math
 
 import numpy as np
@@ -58,29 +57,6 @@ def test_every_number_stands_under_its_name_with_its_unit():
         "S at 74 / mm",
     )
     assert list(curves.rows[1]) == ["", "9", "0.410", "0.530", "0.220", "0.340"]
-
-
-def test_numbers_that_are_not_there_are_null_in_the_file():
-    found = json.loads(
-        json.dumps(field_page.field_values(typed(depth_um=math.inf)), allow_nan=False)
-    )
-    assert found["distortion"] == [-0.01234, None]
-    assert found["close_um"][1] == [None, None]
-    assert found["depth_um"] is None
-    assert found["mtf"][1][0] == [0.41, 0.22]
-    assert found["left_out"] == ["the chief ray of (9, 0) degrees is lost"]
-
-
-def test_pictures_of_lenses_with_and_without_chief_rays():
-    both = {"a": typed(), "b": typed(mtf=typed().mtf / 2)}
-    for image in (field_page.plot_over_field(both), field_page.mtf_picture(both)):
-        assert image[:4] == b"\x89PNG"
-    assert field_page.mtf_picture(both) != field_page.mtf_picture(
-        {"a": typed(), "b": typed()}
-    )
-    assert field_page.plot_over_field(both) != field_page.plot_over_field(
-        {"a": typed(), "b": typed(distortion=np.array([0.3, 0.2]))}
-    )
 
 
 def test_what_is_left_out_is_of_the_first_lens_and_the_other_angles():

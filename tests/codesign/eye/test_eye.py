@@ -189,18 +189,3 @@ def test_motion_ranges_hold():
     )
     assert (drawn.slip_um.abs().amax(0) <= torch.tensor([1.0, 2.0, 3.0])).all()
     assert 0.8 <= float(drawn.scale.min()) < float(drawn.scale.max()) <= 1.2
-
-
-def test_a_parameter_that_is_left_out_or_filled_twice_is_refused():
-    """Parameters stand at the indices that the picture reads, whatever their order
-    here.
-    """
-    filled = {place: torch.full((3, 1), float(place)) for place in range(model.COUNT)}
-    row = eye._row(dict(reversed(filled.items())))
-    assert row[1].tolist() == list(range(model.COUNT))
-    with pytest.raises(SceneError, match="left out"):
-        eye._row({place: part for place, part in filled.items() if place != 41})
-    with pytest.raises(SceneError, match="filled twice"):
-        eye._row(filled | {model.CENTRE: torch.ones(3, 2)})
-    with pytest.raises(SceneError, match="picture reads"):
-        eye._row(filled | {model.COUNT: torch.ones(3)})

@@ -78,25 +78,6 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
                 assert likelihood(k, tried[0], tried[1], tried[2][0]) < best + 1e-6
 
 
-def test_it_begins_from_one_line_for_all_and_the_spread_given():
-    """Before any round: least squares over everybody, its residual's variance, the
-    first variances for both answers.
-    """
-    rng = np.random.default_rng(9)
-    design = np.stack([np.ones(11), rng.normal(0, 1, 11)], 1)
-    answers = rng.normal([3.0, -40.0], [0.4, 2.5], (11, 2))
-    found = shared.fit_mixed_model(
-        design, answers, np.arange(11) % 3, first=np.array([4.0, 0.25]), rounds=0
-    )
-    line = np.linalg.solve(design.T @ design, design.T @ answers)
-    assert found.mean == pytest.approx(line, rel=1e-9)
-    assert found.variance == pytest.approx(np.array([[4.0, 4.0], [0.25, 0.25]]))
-    left = answers - design @ line
-    assert found.noise == pytest.approx(
-        (left**2).sum(0) / 11, rel=1e-9
-    )  # the line holds a constant: its mean is 0
-
-
 def test_people_who_do_not_differ_keep_a_variance_above_zero():
     """Answers on one line, without noise: every variance falls to 1e-9 deg² and its
     covariance, and nothing is nan.
@@ -114,37 +95,6 @@ def test_people_who_do_not_differ_keep_a_variance_above_zero():
         assert (part >= 1e-9).all()
         assert (part < 1e-5).all()
     assert found.own(design[:3], design[:3] @ line) == pytest.approx(line, abs=1e-9)
-
-
-def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatch):
-    """Offsets of people are given 5 degrees to begin with, every other term 1; a
-    reading spread by 0.02 counts as one
-    spread by 4, and one that never changes as nothing."""
-    rng = np.random.default_rng(10)
-    axis = rng.normal(3, 4, (80, 2))
-    pupil = rng.normal(-1, 0.02, (80, 2))
-    slip = rng.normal(0.5, 1.5, (80, 3))
-    slip[:, 1] = 0.25
-    asked = []
-    monkeypatch.setattr(
-        shared,
-        "fit_mixed_model",
-        lambda *given, first: (
-            asked.append((*given, first)) or shared.MixedModel(*given)
-        ),
-    )
-    read = NetworkReadings(pupil, slip, axis)
-    people = shared.learn_population(read, axis + 7.0, np.arange(80) % 4)
-    ((design, answers, person, first),) = asked
-    assert first.tolist() == [25.0] + [1.0] * 35
-    assert answers == pytest.approx(np.full((80, 2), 7.0))
-    assert person.tolist() == [0, 1, 2, 3] * 20
-    values = [*axis.T, *pupil.T, *slip.T]
-    unit = [(v - v.mean()) / v.std() if v.std() > 1e-6 else 0 * v for v in values]
-    products = [unit[i] * unit[j] for i in range(7) for j in range(i, 7)]
-    want = np.stack([np.ones(80), *unit, *products], 1)
-    assert design == pytest.approx(want, abs=1e-9)
-    assert people.terms(read[:5]) == pytest.approx(want[:5], abs=1e-9)
 
 
 def _read(rng, people, each, common):

@@ -86,32 +86,6 @@ def test_slip_is_counted_in_units_of_its_scale():
     )
 
 
-def test_task_adds_mask_and_twice_the_slip():
-    from codesign.network.supernet import Prediction
-
-    generator = torch.Generator().manual_seed(3)
-    logits = torch.randn(2, 8, 8, generator=generator)
-    slip = torch.randn(2, 3, generator=generator)
-    mask = _mask().float()
-    truth = torch.tensor([[0.3, -0.9, 2.0]] * 2)
-    scale = torch.tensor([0.4, 0.7, 3.0])
-    kinds = {"mask_logits": logits, "slip": slip}
-    names = (
-        Prediction.__dataclass_fields__
-        if hasattr(Prediction, "__dataclass_fields__")
-        else Prediction._fields
-    )
-    found = Prediction(**{n: kinds.get(n, torch.zeros(2, 2)) for n in names})
-    fine = torch.nn.functional.interpolate(
-        logits[:, None], scale_factor=2, mode="bilinear", align_corners=False
-    )[:, 0]
-    bce = torch.nn.functional.binary_cross_entropy_with_logits(fine, mask)
-    want = losses.dice_loss(fine, mask) + bce + 2 * losses.slip_loss(slip, truth, scale)
-    assert float(
-        losses.task_loss(found, mask, truth, scale, slip_weight=2.0)
-    ) == pytest.approx(float(want), rel=1e-6)
-
-
 def test_dice_of_a_half_covered_mask_in_closed_form():
     logits = torch.full((1, 4, 6), 0.0, dtype=torch.float64)  # one half everywhere
     mask = torch.zeros(1, 4, 6, dtype=torch.float64)

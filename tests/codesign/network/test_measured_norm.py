@@ -22,10 +22,3 @@ def test_measured_statistics_are_means_over_batches_and_variances_without_bias()
     variance = np.mean([one.var((0, 2, 3), ddof=1) for one in batches], axis=0)
     assert norm.mean[:3].numpy() == pytest.approx(mean, rel=1e-5)
     assert norm.variance[:3].numpy() == pytest.approx(variance, rel=1e-5)
-
-
-def test_a_batch_of_one_value_a_channel_has_no_variance():
-    norm = SlicedNorm(2)
-    norm._measure(torch.tensor([[[[3.5]], [[-1.25]]]]))
-    assert norm.mean.tolist() == [3.5, -1.25]
-    assert norm.variance.tolist() == [0.0, 0.0]

@@ -14,7 +14,7 @@ from codesign.optics import stack as optics
 from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.image.pupil import coordinates, psf
+from metalens.image.pupil import psf
 from metalens.psf import psf_stack
 
 SMALL = OpticsConfig(
@@ -111,17 +111,6 @@ def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     # where little light falls;
     # and the rim in 64 nodes against 500 pillars
     assert float(error) < 0.03
-
-
-def test_polynomials_are_orthonormal_over_the_aperture():
-    terms, mix = optics._polynomials(SMALL.pupil, 12)
-    x, y = coordinates(SMALL.pupil)
-    inside = torch.hypot(x, y) <= 100.0
-    products = (
-        torch.einsum("nk,mk->nm", terms[:, inside], terms[:, inside]) / inside.sum()
-    )
-    assert torch.allclose(products, torch.eye(12, dtype=torch.float64), atol=1e-10)
-    assert mix.shape == (12, 12)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 10.0])

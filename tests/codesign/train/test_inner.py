@@ -10,7 +10,6 @@ import torch
 
 from codesign.batches import FrameBatch
 from codesign.network.architecture import SearchSpace, smallest_architecture
-from codesign.optics.lens_errors import LensErrors
 from codesign.optics.stack import OpticsConfig
 from codesign.train import trainer as training
 from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
@@ -223,16 +222,6 @@ def test_only_bad_gradients_end_the_run_with_the_cause():
         list(trainer.run())
 
 
-def test_lens_errors_are_drawn_anew_each_step_and_belong_to_the_step():
-    optics = replace(
-        OPTICS, spread=LensErrors(focus_um=5.0, tilt_waves=0.1, astigmatism_waves=0.1)
-    )
-    trainer = _trainer(optics=optics)
-    first = trainer._lens_error(0)
-    assert first == trainer._lens_error(0)
-    assert first != trainer._lens_error(1)
-
-
 def test_the_optics_loss_falls_along_its_own_gradient():
     from codesign.optics import stack as lens
     from codesign.train import separability
@@ -321,31 +310,6 @@ def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
     )  # with what is left of the momentum before
 
 
-def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
-    """Of a scalar in float64, whose count has its shape and another dtype; a kernel's
-    moments take its order.
-    """
-    pitch = torch.tensor(2.5, dtype=torch.float64, requires_grad=True)
-    kernel = (
-        torch.rand(4, 3, 2, 2)
-        .contiguous(memory_format=torch.channels_last)
-        .requires_grad_()
-    )
-    optimiser = torch.optim.AdamW([pitch, kernel])
-    (pitch**2 + kernel.square().sum()).backward()
-    optimiser.step()
-    before = optimiser.state[pitch]["step"].clone()
-    moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel][
-        "exp_avg"
-    ].contiguous()
-    training.align_moments(optimiser)
-    step = optimiser.state[pitch]["step"]
-    after = optimiser.state[kernel]["exp_avg"]
-    assert (step.dtype, float(step)) == (before.dtype, 1.0)
-    assert after.stride() == kernel.stride()
-    assert torch.equal(after, moment)
-
-
 def test_only_the_weights_of_the_network_decay():
     """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would
     shrink.
@@ -355,27 +319,3 @@ def test_only_the_weights_of_the_network_decay():
         for name, made in _trainer().optimisers.items()
     }
     assert decay == {"weights": 0.01, "reading": 0.01, "optics": 0.0, "pitch": 0.0}
-
-
-def test_what_has_no_rate_now_keeps_its_value_and_its_moments():
-    """A group that rests is not stepped by nothing: its optimiser knows of no gradient."""
-    trainer = _trainer()
-    for optimiser in trainer.optimisers.values():
-        for parameter in (
-            p for group in optimiser.param_groups for p in group["params"]
-        ):
-            parameter.grad = torch.full_like(parameter, 0.3)
-    moves, *rest = trainer.optimisers
-    assert rest
-    before = {
-        name: [p.detach().clone() for p in trainer.groups[name][1]]
-        for name in trainer.groups
-    }
-    trainer._apply(dict.fromkeys(trainer.groups, 0.0) | {moves: 1e-3}, finite=True)
-    for name in trainer.optimisers:
-        alike = [
-            torch.equal(p, old)
-            for p, old in zip(trainer.groups[name][1], before[name], strict=True)
-        ]
-        assert all(alike) if name in rest else not any(alike)
-        assert bool(trainer.optimisers[name].state) == (name == moves)

@@ -207,46 +207,6 @@ def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
         )
 
 
-def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_budget(
-    settings,
-):
-    """From the pitch that the refusal names it begins; asked for finer pixels, it is
-    held where the budget ends.
-    """
-
-    def of(pitch_um):
-        optics = replace(settings.optics, sample_um=4.5)
-        scenes = replace(settings.scenes, pixels=192, pool=0)
-        budgets = replace(settings.run, budgets_mmacs=(1.6,), pitch_um=pitch_um)
-        return replace(settings, optics=optics, scenes=scenes, run=budgets)
-
-    with pytest.raises(
-        TrainingError,
-        match=r"at run.pitch_um = 9: raise run.budgets_mmacs, or begin with",
-    ) as no:
-        run.start_run(of(9.0))
-    named = float(str(no.value).split(" = ")[-1].split(" ")[0])
-    with pytest.raises(TrainingError, match="below the smallest network"):
-        run.start_run(of(named - 0.02))
-    run.start_run(of(named))
-    going = run.start_run(of(named + 2.0))
-    made = going.trainer.model
-    assert named - 0.01 < made.finest_um <= named
-    made.log_pitch.data.fill_(
-        math.log(made.finest_um / 2)
-    )  # where no network keeps the budget
-    going.trainer.optimisers.clear()
-    going.trainer._apply({"pitch": 0.1}, finite=True)
-    assert going.trainer.pitch_held_um == made.finest_um
-    least = smallest_architecture(settings.space)
-    assert (
-        going.macs(least) <= 1.6e6 < going.counted(least, 0.98 * made.finest_um)
-    )  # two rows of pixels more
-    assert "beyond the budget of 1.6 MMACs" in command_codesign._of_pitch(
-        going, made.finest_um
-    )
-
-
 def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     """A pitch that does not divide the image and a resolution that does not divide the
     pixels, by torch's counter.

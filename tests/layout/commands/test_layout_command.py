@@ -5,20 +5,17 @@ it ends.
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import layout
-from layout.commands import make, page
+from layout.commands import make
 from layout.drc.klayout import write_lyp, write_lyrdb
 from layout.drc.lattice import check_plan
 from layout.formats import dxf
-from layout.pec.psf import point_exposure
-from layout.process.process import DesignRules, ExposureSettings
+from layout.process.process import DesignRules
 from layout.shapes import polygon
-from layout.study import page as study_page
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.core.errors import ProcessError
@@ -131,55 +128,6 @@ def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(
     assert run(tmp_path / "behind.h5", "-o", tmp_path / "mask", "--study") == 2
     assert "study the same lens designed without layers.stop" in capsys.readouterr().err
     assert not (tmp_path / "mask").exists()
-
-
-@pytest.mark.parametrize(("error", "code"), [(0.49, 0), (0.52, 1)])
-def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
-    lens_file, tmp_path, monkeypatch, capsys, error, code
-):
-    """The mask is what was asked for, and says that it passes; the study beside it is
-    no study.
-    """
-    monkeypatch.setattr(
-        study_page, "rates_by_light", lambda lens: {"": SimpleNamespace(error=error)}
-    )
-    monkeypatch.setattr(study_page, "study_sections", lambda *about: [])
-    assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
-    told = capsys.readouterr().out
-    assert "The mask passes its own checks." in told
-    assert ("  FAILED: --study: how these pillars answer" in told) is bool(code)
-    assert ("is known within 52% alone" in told) is bool(code)
-    assert (
-        json.loads((tmp_path / "mask" / "layout.json").read_text())["rates_error"]
-        == error
-    )
-
-
-def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(
-    tmp_path,
-):
-    """The table has a slow tail that no few Gaussians follow."""
-    radius = np.geomspace(0.01, 30.0, 40)
-    rows = np.c_[
-        radius, np.exp(-((radius / 0.02) ** 2)) / 4e-4 + 3e-3 / (radius + 0.3) ** 3
-    ]
-    np.savetxt(
-        tmp_path / "point.csv",
-        rows,
-        delimiter=",",
-        header="radius_um,density",
-        comments="",
-    )
-    measured = ExposureSettings(csv=tmp_path / "point.csv")
-    point = point_exposure(measured)
-    assert 1e-3 < point.fit_error < 0.05
-    told = page._fit_text(measured, point)
-    assert f"the table point.csv, as {len(point.weights)} Gaussians" in told
-    assert f"by up to {100 * point.fit_error:.2g} % of the whole" in told
-    assert (
-        page._fit_text(ExposureSettings(alpha_um=0.01, beta_um=40.0, eta=0.7), point)
-        == ""
-    )
 
 
 def test_a_corrected_mask_is_certified_and_hands_on_its_lens(

@@ -27,26 +27,6 @@ def cursor(data):
     ("value", "data"),
     [
         (0, "00"),
-        (127, "7f"),
-        (128, "80 01"),
-        (300, "ac 02"),
-        (16383, "ff 7f"),
-        (16384, "80 80 01"),
-        (2097151, "ff ff 7f"),
-    ],
-)
-def test_unsigned_integers_take_seven_bits_a_byte_least_first(value, data):
-    assert oasis.unsigned_integer(value) == bytes.fromhex(data)
-    assert cursor(data).unsigned() == value
-    out = np.zeros(12, np.uint8)
-    end = oasis_write._put_unsigned(out, 1, value)
-    assert out[1:end].tobytes() == bytes.fromhex(data)
-
-
-@pytest.mark.parametrize(
-    ("value", "data"),
-    [
-        (0, "00"),
         (1, "02"),
         (-1, "03"),
         (63, "7e"),
@@ -147,38 +127,6 @@ def test_point_lists_of_all_types(data, corners):
 def places(data, last=None, limit=1000):
     found = cursor(data).repetition(last, limit)
     return list(zip(found.x.tolist(), found.y.tolist(), strict=True))
-
-
-@pytest.mark.parametrize(
-    ("data", "copies"),
-    [
-        ("01 01 00 0a 14", [(10 * i, 20 * j) for j in range(2) for i in range(3)]),
-        ("02 02 0b", [(11 * i, 0) for i in range(4)]),
-        ("03 01 0d", [(0, 13 * j) for j in range(3)]),
-        ("04 01 05 07", [(0, 0), (5, 0), (12, 0)]),
-        ("05 01 0a 05 07", [(0, 0), (50, 0), (120, 0)]),
-        ("06 01 05 07", [(0, 0), (0, 5), (0, 12)]),
-        ("07 01 03 05 07", [(0, 0), (0, 15), (0, 36)]),
-        (
-            "08 00 01 1d 16 34",
-            [(7 * i - 3 * j, 11 * i) for j in range(3) for i in range(2)],
-        ),
-        ("09 02 1f 16", [(-7 * i, 11 * i) for i in range(4)]),
-        ("0a 01 1d 16 34", [(0, 0), (7, 11), (4, 11)]),
-        ("0b 01 0a 1d 16 34", [(0, 0), (70, 110), (40, 110)]),
-    ],
-)
-def test_repetitions_of_all_types(data, copies):
-    assert places(data) == copies
-
-
-def test_a_repetition_of_type_0_is_the_one_before():
-    last = cursor("03 01 0d").repetition(None, 9)
-    assert cursor("00").repetition(last, 9) is last
-    with pytest.raises(
-        MaskFileError, match="repeats an earlier one, and there is none"
-    ):
-        places("00")
 
 
 @pytest.mark.parametrize(

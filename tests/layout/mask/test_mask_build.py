@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import layout
-from layout.mask import cells, die, font, marks
+from layout.mask import cells, die, font
 from layout.mask.plan import PillarArray
 from layout.pec import psf
 from layout.process.process import (
@@ -279,19 +279,6 @@ def test_a_die_without_room_is_refused_with_what_it_needs():
         layout.plan(
             disc_map(101), dataclasses.replace(PLAIN, die=DieSettings(margin_um=60))
         )
-
-
-def test_the_orientation_mark_is_like_none_of_its_images():
-    mark = marks._letter_f(0, 0, 10)
-    db = pytest.importorskip("klayout.db")
-    shape = db.Region(db.Polygon([db.Point(*map(int, p)) for p in mark]))
-    for turn in range(1, 8):
-        other = shape.transformed(db.Trans(turn % 4, turn >= 4, 0, 0))
-        moved = other.moved(
-            shape.bbox().left - other.bbox().left,
-            shape.bbox().bottom - other.bbox().bottom,
-        )
-        assert not (moved ^ shape).is_empty()
 
 
 def test_letters_are_upright_and_unknown_ones_are_refused():

@@ -4,7 +4,6 @@ what is refused by name.
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -415,51 +414,6 @@ def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(
         check_plan(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok
         is False
     )  # walls of 160 to 240 nm
-
-
-def test_all_edges_of_a_shape_move_by_the_bias_of_its_size():
-    """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of
-    both; no ratio of 240.
-    """
-    process = SimpleNamespace(
-        bias=SimpleNamespace(made_nm=lambda drawn, alone: drawn - 12.0),
-        rules=PROCESS.rules,
-    )
-    corners = (
-        shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process, 0.0)
-        .parts[0]
-        .vertices(32)
-    )
-    assert np.ptp(corners, axis=0) * 1e3 == pytest.approx(
-        [240.0, 0.55 * 228 + 12], abs=1e-9
-    )
-
-
-def test_turns_are_counted_over_half_a_turn_where_that_brings_the_shape_back():
-    """Every half degree: 360 of a rectangle, 720 of what a half turn changes, one where
-    nothing is turned.
-    """
-    process = dataclasses.replace(
-        PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=0.5)
-    )
-    d = lens().diameters
-    lone = SimpleNamespace(
-        pitch_um=0.4, outline=lambda size: SimpleNamespace(repeats=lambda by: by > 6)
-    )
-    assert shaped._turns(Cell(0.4, shape=Rectangle(0.55)), d, process) == 360
-    assert shaped._turns(lone, d, process) == 720
-    assert shaped._turns(lone, lens(turned=False).diameters, process) == 1
-
-
-def test_a_turn_goes_to_the_nearest_step_and_half_a_turn_to_none():
-    degrees = np.array([[0.3, 179.7, 0.6, 90.4, -0.7]])
-    sizes = DiameterMap(np.full((1, 5), 0.24), 0.4, angle_rad=np.radians(degrees))
-    process = dataclasses.replace(
-        PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=1.0)
-    )
-    ((_, key),) = shaped._keys(sizes, process, 180)
-    assert (key % 180).tolist() == [[0, 0, 1, 90, 179]]
-    assert (key // 180).tolist() == [[240] * 5]
 
 
 @pytest.mark.parametrize("unit_nm", [1.0, 0.5])

@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.special import jv
 
 from layout.study import focus
 from layout.study.focus import FocusWindow
@@ -64,76 +63,6 @@ def test_the_reduced_sum_is_the_plain_sum_at_all_depths_and_for_a_collimated_bea
     assert (
         abs(fast - exact).max() < 3e-6 * abs(exact).max()
     )  # float32 sums of 1e4 terms
-
-
-def needed(turns):
-    """Fewest nodes beyond which Chebyshev coefficients of exp(i turns x) are below 1e-4
-    and 1e-6 of it.
-    """
-    order = np.arange(1, 400)
-    return [
-        int(order[abs(jv(order, turns)) > bound].max()) + 1 for bound in (1e-4, 1e-6)
-    ]
-
-
-@pytest.mark.parametrize(("x_um", "y_um"), [(60.0, 9.0), (-9.0, 60.0)])
-def test_nodes_without_margin_are_those_that_a_wide_window_needs(x_um, y_um):
-    """One depth: what is left is the way to the window's edge less that to its middle.
-    Its turns in closed form.
-    """
-    lens = random_lens()
-    where = FocusWindow(
-        np.linspace(0.1, x_um, 3),
-        np.linspace(-0.2, y_um, 4),
-        150.0,
-        0.85,
-        np.array([900.0]),
-    )
-    ready = focus.prepare_focus(lens, where, margin=0)
-    for nodes, edge, reach in (
-        (ready.nodes_x_um, 24.0, abs(x_um)),
-        (ready.nodes_y_um, 17.8, abs(y_um)),
-    ):
-        x = np.linspace(-edge, edge, 4001)
-        slope = abs(
-            (x - reach) / np.hypot(x - reach, 150.0) - x / np.hypot(x, 150.0)
-        ).max()
-        fewest, most = needed(2 * np.pi / 0.85 * edge * slope)
-        assert fewest <= len(nodes) <= most
-
-
-def test_nodes_without_margin_are_those_that_the_farthest_depth_needs():
-    """On the axis: from 30 um and from far away, each less the way from the mean
-    inverse depth, 1 / 60 um.
-    """
-    lens = random_lens()
-    where = FocusWindow(
-        np.array([-1e-6, 1e-6]),
-        np.array([-1e-6, 1e-6]),
-        150.0,
-        0.85,
-        np.array([30.0, np.inf]),
-    )
-    ready = focus.prepare_focus(lens, where, margin=0)
-    for nodes, edge in ((ready.nodes_x_um, 24.0), (ready.nodes_y_um, 17.8)):
-        fewest, most = needed(2 * np.pi / 0.85 * edge * edge / np.hypot(edge, 60.0))
-        assert fewest <= len(nodes) <= most
-
-
-def test_blocks_add_up_to_the_whole():
-    lens = random_lens()
-    ready = focus.prepare_focus(lens, window_of(lens, [900.0]))
-    t = amplitude(lens)[None]
-    whole = ready.project(t)
-    parts = [
-        ((slice(0, 40), slice(0, 121))),
-        (slice(40, 90), slice(0, 50)),
-        (slice(40, 90), slice(50, 121)),
-    ]
-    total = sum(
-        ready.project(t[:, rows, columns], rows, columns) for rows, columns in parts
-    )
-    assert abs(total - whole).max() < 1e-5 * abs(whole).max()
 
 
 def test_shifted_pillars_send_their_light_from_where_they_are():

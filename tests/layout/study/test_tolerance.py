@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.mask import fields
-from layout.process.process import EtchProfile, Process, WriteField
+from layout.process.process import Process, WriteField
 from layout.study import focus, stitching, tolerance
 from layout.study import page as study_page
 from layout.study.sensitivity import compute_sensitivities
@@ -18,7 +18,6 @@ from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Rectangle, Square
 from metalens.core.errors import ProcessError
-from metalens.core.report import Figure, Table
 from metalens.fabrication import (
     ResponseError,
     ResponseRates,
@@ -271,37 +270,6 @@ def _drawn(study, most, *given, **more):
     return study(*given, **more | {"draws": most})
 
 
-def test_the_report_sections_say_what_was_found(monkeypatch):
-    for module, name, most in (
-        (tolerance, "analyse_tolerance", 10),
-        (stitching, "simulate_stitching", 20),
-    ):
-        monkeypatch.setattr(
-            module, name, functools.partial(_drawn, getattr(module, name), most)
-        )
-    lens = hyperbolic(31)
-    process = Process(write_field=WriteField(size_um=6.0))
-    made = study_page.study_sections(
-        lens, process, fields.split_write_fields(lens.diameters, process), {"": SENS}
-    )
-    assert [section.title for section in made] == ["Stitching", "Tolerance"]
-    tables = [
-        item for section in made for item in section.items if isinstance(item, Table)
-    ]
-    assert [row[0] for row in tables[1].rows] == list(Spread().stated)
-    assert all(
-        np.isfinite(value)
-        for table in tables
-        for row in table.rows
-        for value in row
-        if isinstance(value, float)
-    )
-    pictures = [
-        item for section in made for item in section.items if isinstance(item, Figure)
-    ]
-    assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
-
-
 def test_a_turned_lens_has_its_study(monkeypatch):
     for module, name, most in (
         (tolerance, "analyse_tolerance", 10),
@@ -318,33 +286,6 @@ def test_a_turned_lens_has_its_study(monkeypatch):
     assert [section.title for section in made] == ["Stitching", "Tolerance"]
     assert "what keeps its hand has no focus" in made[1].text
     assert "walls" not in made[1].text
-
-
-@pytest.mark.parametrize(
-    ("made_deg", "designed_deg", "told"),
-    [(0.6, 0, True), (0.4, 0, False), (2, 1.7, False)],
-)
-def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
-    made_deg, designed_deg, told, monkeypatch
-):
-    """The spread of a wall is 0.5 deg."""
-    monkeypatch.setattr(
-        tolerance,
-        "analyse_tolerance",
-        functools.partial(_drawn, tolerance.analyse_tolerance, 10),
-    )
-    lens = hyperbolic(31)
-    process = Process(
-        etch=EtchProfile(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)
-    )
-    lens = dataclasses.replace(
-        lens,
-        cell=dataclasses.replace(lens.cell, sidewall_rad=math.radians(designed_deg)),
-    )
-    text = study_page.tolerance_section(lens, process, SENS).text
-    assert ("the process makes 0.6 deg" in text) is told
-    assert ("sidewall_rad = 0.0105 in [cell]" in text) is told
-    assert "keeps its hand" not in text
 
 
 def test_fields_of_a_turned_lens_add_up_to_its_light():

@@ -4,11 +4,9 @@ derivatives by differences.
 
 import dataclasses
 import functools
-import math
 
 import numpy as np
 import pytest
-from scipy import interpolate
 
 from layout.mask import fields
 from layout.process.process import Process, WriteField
@@ -17,18 +15,7 @@ from layout.study.spread_model import reduce_spread, reduction_error
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.report import Table
-from metalens.fabrication import (
-    PairTable,
-    ResponseError,
-    ResponseRates,
-    Spread,
-    State,
-    draw_lenses,
-    names_of_kind,
-    pair_sensitivities,
-    solved_rates,
-)
-from metalens.fabrication import two_sizes as by_pairs
+from metalens.fabrication import ResponseRates, Spread, State, draw_lenses
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from tests.referees import plain_sum
 
@@ -37,7 +24,6 @@ LIGHTS = {
     "x": (19.0, 9.0, 0.93),
     "y": (8.0, 21.0, 0.97),
 }  # rad per um of width and of length, |t| of the thinnest
-CAUSES = names_of_kind(ResponseError)
 
 
 def formula(width_um, length_um, light):
@@ -165,56 +151,6 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
         ),
         abs=1e-3,
     )
-
-
-def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
-    """|t| = 0.9 - 3 (width - 0.1) - 0.3 (length - 0.12), two of its ends followed by
-    0.3 um in width.
-    """
-    x, y = np.meshgrid(X_UM, Y_UM, indexing="ij")
-    level = 0.9 - 3 * (x - 0.1) - 0.3 * (y - 0.12)
-    spline = [
-        interpolate.RectBivariateSpline(X_UM, Y_UM, level * part)
-        for part in (math.cos(0.7), math.sin(0.7))
-    ]
-    made = PairTable(X_UM, Y_UM, tuple(spline))
-    found = made.t(np.array([0.6, 0.32, 0.02]), np.array([0.2, 0.2, 0.2]))
-    assert found == pytest.approx(np.array([1e-3, 0.216, 1.0]) * np.exp(0.7j), rel=1e-9)
-
-
-def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
-    monkeypatch,
-):
-    lens, asked = two_sizes(), []
-
-    def solved(lens, width_um, length_um):
-        asked.append(np.stack([width_um, length_um], 1))
-        made = solved_rates.ResponseRates(
-            np.stack([width_um, length_um], 1),
-            rates(width_um, length_um),
-            0.03,
-            np.zeros(len(width_um)),
-        )
-        return {"x": made, "y": dataclasses.replace(made, rates=2 * made.rates)}
-
-    monkeypatch.setattr(by_pairs, "pair_rates", solved)
-    found = pair_sensitivities(lens, count=30)
-    every = told(lens)
-    assert asked[0].shape == (30, 2)
-    gaps = np.linalg.norm(asked[0][:, None] - asked[0], axis=-1) + np.eye(30)
-    covered = np.linalg.norm(asked[0][:, None] - every.sizes_um, axis=-1).min(0)
-    assert (
-        covered.max() <= gaps.min()
-    )  # no pair is farther from a solved one than those are from each other
-    want = rates(*every.sizes_um.T)
-    off = np.linalg.norm(
-        found["x"].at(*every.sizes_um.T)[:3] - want, axis=1
-    ) / np.linalg.norm(want, axis=1)
-    assert 0.03 + off.max() < found["x"].error < 0.2
-    assert found["y"].rates == pytest.approx(2 * found["x"].rates)
-    assert pair_sensitivities(lens, count=10_000)["x"].at(*every.sizes_um.T)[
-        :3
-    ] == pytest.approx(want)
 
 
 def test_fields_of_pairs_add_up_to_their_light():

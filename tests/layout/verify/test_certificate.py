@@ -190,44 +190,6 @@ def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
     )
 
 
-def test_samples_lie_on_the_outline_of_the_union_away_from_corners():
-    boxes = [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
-    corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
-    found = polygon_edges.sample_edges(
-        ExposedPolygons(corners, np.ones(2), np.array([3, 3])), 0.1
-    )
-    x, y = found.at_um.T
-    inner = (np.abs(x - 3.0) < 1e-9) & (y < 0.8)
-    assert not inner.any()  # the shared side is no edge
-    bottom = np.abs(y) < 1e-9
-    assert (found.normal[bottom] == (0.0, -1.0)).all()
-    assert x[bottom].min() > 0.2
-    assert x[bottom].max() < 3.5
-    assert len(x[bottom]) == 3  # 3.7 um less four ranges, a sample each um
-    assert {(round(a), round(b)) for a, b in found.normal} == {
-        (0, -1),
-        (1, 0),
-        (0, 1),
-        (-1, 0),
-    }
-
-
-def test_the_raster_of_a_large_polygon_carries_its_mass():
-    shape = np.array(
-        [[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]]
-    )
-    x, y, mass = polygon_edges.equivalent_spots(
-        ExposedPolygons([shape], np.array([1.7]), np.array([3])), 0.5
-    )
-    assert mass.sum() == pytest.approx(1.7 * 23.0, rel=1e-12)
-    assert (mass * x).sum() / mass.sum() == pytest.approx(
-        (18 * 4.5 + 5 * 0.5) / 23, rel=0.02
-    )
-    assert (mass * y).sum() / mass.sum() == pytest.approx(
-        (18 * 1.0 + 5 * 4.5) / 23, rel=0.02
-    )
-
-
 def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
     process = Process(
         exposure=ExposureSettings(**BEAM),

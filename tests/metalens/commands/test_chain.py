@@ -1,9 +1,7 @@
 """The chain from one file: which stages it asks for, and its settings laid out."""
 
 import json
-import os
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -152,27 +150,6 @@ def test_tables_and_maps_that_settings_name_are_laid_out_with_them(tmp_path):
     assert (target / "cell.toml").read_text() == cell
 
 
-def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path):
-    (tmp_path / "up.csv").write_text("x")
-    with pytest.raises(ConfigError, match=r"'\.\./up\.csv' lies above"):
-        laid_out(tmp_path, **{"c.toml": 'n = "../up.csv"\n'})
-    for name, text in (("a", "x"), ("b", "y")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "s.toml").write_text('n = "table.csv"\n')
-        (tmp_path / name / "table.csv").write_text(text)
-    (tmp_path / "p.toml").write_text("")
-    files = ChainFiles(Path("a/s.toml"), Path("b/s.toml"), Path("p.toml"))
-    with pytest.raises(
-        ConfigError, match=r"s\.toml: 'table\.csv' is not the file of that name"
-    ):
-        chain.lay_out_inputs(files, tmp_path, aperture_mm=None)
-    (tmp_path / "b" / "table.csv").write_text("x")
-    assert (
-        chain.lay_out_inputs(files, tmp_path, aperture_mm=None).contents["table.csv"]
-        == b"x"
-    )
-
-
 def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
     for name, content in (("c", b'n = "\xff"\n'), ("d", b""), ("p", b"")):
         (tmp_path / f"{name}.toml").write_bytes(content)
@@ -232,16 +209,6 @@ def test_settings_that_differ_are_refused_at_every_resume(tmp_path, monkeypatch)
     assert seen[3] == "psf"
 
 
-def test_nothing_is_written_but_beside_the_output(tmp_path, monkeypatch):
-    """Settings that were compared in the folder for temporary files stayed there when
-    the chain was killed.
-    """
-    begun(tmp_path, monkeypatch)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
-    assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
 def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     """Curves would be solved for one, the rest of the chain be done with the other."""
     (tmp_path / "table.csv").write_text("1,2\n")
@@ -262,27 +229,6 @@ def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     (tmp_path / "table.csv").write_text("1,2\n")
     assert demo.run(again) == 0
     assert seen[3] == "psf"
-
-
-def test_an_interrupt_on_the_way_back_from_the_folder_leaves_no_scratch(
-    tmp_path, monkeypatch
-):
-    """The chain's folder stays the current one then, and what was claimed by a relative
-    path was looked for in it.
-    """
-    change = os.chdir
-
-    def interrupted(path):
-        if os.fspath(path) == str(tmp_path):
-            raise KeyboardInterrupt
-        change(path)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(demo, "run_verb", lambda words: 0)
-    monkeypatch.setattr(os, "chdir", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        demo.run(demo.Options(Path("out"), quiet=True))
-    assert [path.name for path in tmp_path.iterdir()] == ["out.unfinished"]
 
 
 def test_nothing_of_other_settings_stays_where_no_stage_was_finished(
@@ -325,12 +271,3 @@ def test_nothing_of_other_settings_stays_where_no_stage_was_finished(
         demo.OUTCOMES,
         transaction.NAME,
     }
-
-
-def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch):
-    seen = begun(tmp_path, monkeypatch)
-    path = tmp_path / "out.unfinished" / demo.OUTCOMES
-    first, second = path.read_text().splitlines()
-    path.write_text(f"{first[: len(first) // 2]}\n{second}\n")
-    assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
-    assert seen[3:5] == ["library", "psf"]

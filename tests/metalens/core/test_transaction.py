@@ -283,33 +283,6 @@ def test_scratch_files_of_the_dead_are_cleared_by_the_next_save(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [".g.h5.part", "f.h5"]
 
 
-CLEARED_HALF = """
-    import os, shutil, sys
-    sys.path.insert(0, sys.argv[1])
-    from test_transaction import save
-    from pathlib import Path
-    save(Path("out.h5"), 3)
-
-    def killed(scratch, ignore_errors):
-        os.rmdir(Path(scratch) / "new")
-        os._exit(9)
-
-    shutil.rmtree = killed
-    save(Path("out.h5"), 4)
-"""
-
-
-def test_killed_while_it_clears_up_is_no_obstacle(tmp_path):
-    """What was put in place stays; the next run clears the rest."""
-    words = [sys.executable, "-c", textwrap.dedent(CLEARED_HALF), Path(__file__).parent]
-    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 9
-    assert len(os.listdir(tmp_path)) == 4  # lock and scratch
-    assert store.load(tmp_path / "out.h5").attributes["value"] == 4
-    save(tmp_path / "out.h5", 5)
-    assert sorted(os.listdir(tmp_path)) == ["out.h5", "out.png"]
-    assert store.load(tmp_path / "out.h5").attributes["value"] == 5
-
-
 LOOP = """
     import sys
     sys.path.insert(0, sys.argv[1])

@@ -222,19 +222,6 @@ def test_one_pillar_is_a_lens(proxy):
     assert quality.pillars == 1
 
 
-def test_blocks_of_rows_do_not_show(proxy, monkeypatch):
-    whole, one = _make(proxy)
-    monkeypatch.setattr("metalens.design.sites._BLOCK_SITES", 500)
-    parts, other = _make(proxy)
-    # single precision of 0.3 um: where a block ends, lanes of a loop round otherwise
-    np.testing.assert_allclose(
-        whole.diameters.diameter_um, parts.diameters.diameter_um, rtol=0, atol=6e-8
-    )
-    assert one.wavefront_efficiency == pytest.approx(
-        other.wavefront_efficiency, rel=1e-12
-    )
-
-
 def test_field_is_limited_by_coma_as_in_third_order_theory():
     assert design.field_angle(FOCUS, 100.0) > design.field_angle(FOCUS, 500.0)
     # Coma of a flat hyperbolic lens at its own focus: W131 = R³ theta / (2 d²) (Aieta

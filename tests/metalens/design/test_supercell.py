@@ -259,39 +259,6 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     assert (np.abs(found.factor[0]) < np.abs(found.factor[1]) - 0.05)[:2].all()
 
 
-def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
-    steep, monkeypatch
-):
-    def kept(lens, *, counts):
-        return supercell.estimate_neighbour_coupling(
-            lens, counts=counts, harmonics=2
-        )  # a third of the time
-
-    monkeypatch.setattr("metalens.design.own_cell.estimate_neighbour_coupling", kept)
-    rows = design.solve_coupling_rows(steep)
-    found = design.neighbour_coupling_loss(dataclasses.replace(steep, neighbours=rows))
-    edge = steep.diameters.radius_um + steep.diameters.pitch_um / 2
-    r = edge * np.sqrt((np.arange(4000) + 0.5) / 4000)
-    shares = [
-        one.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000))
-        for one in (rows, rows.coarser, *rows.others)
-    ]
-    assert found.share == pytest.approx(shares[0], rel=1e-3)
-    apart = np.abs(np.array(shares) - shares[0])
-    assert found.error == pytest.approx(
-        apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2
-    )
-    assert found.error < 0.4
-    rough = design.estimate_neighbour_coupling_loss(steep)
-    assert (
-        abs(rough.share - found.share) < rough.error
-    )  # what is said without a solve covers it
-    flat = design.estimate_neighbour_coupling_loss(
-        dataclasses.replace(steep, sensor_distance_um=75.0)
-    )
-    assert flat.share > 0.98
-
-
 @pytest.mark.parametrize(("count", "diagonal"), [(5, False), (8, True)])
 def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     steep, count, diagonal

@@ -45,25 +45,6 @@ def test_what_is_drawn_gives_what_was_designed(slopes, start, isolated, alone):
     assert np.abs(made - DESIGN).max() < 1e-9  # contraction by 0.49 a round, 60 rounds
 
 
-def test_isolation_is_zero_in_a_full_lattice_and_one_alone():
-    full = np.ones((41, 41), bool)
-    alone = np.zeros((41, 41), bool)
-    alone[20, 20] = True
-    assert abs(isolation_map(full, (0.4, 0.4), 1.0)[20, 20]) < 1e-5
-    assert isolation_map(alone, (0.4, 0.4), 1.0)[20, 20] == pytest.approx(1, abs=1e-6)
-
-
-def test_isolation_at_a_straight_edge_counts_the_missing_half():
-    half = np.zeros((101, 101), bool)
-    half[:, 50:] = True
-    # the sites on the edge row keep themselves, their column and one half: (S - C) / 2
-    # of S - 1 are missing,
-    # with C the sum over the column and S = C^2 over the plane
-    line = np.exp(-((np.arange(-8, 9) * 0.4) ** 2)).sum()
-    want = (line**2 - line) / 2 / (line**2 - 1)
-    assert isolation_map(half, (0.4, 0.4), 1.0)[50, 50] == pytest.approx(want, rel=1e-5)
-
-
 def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
     rng = np.random.default_rng(3)
     present = rng.random((150, 170)) < 0.97

@@ -3,7 +3,6 @@ lenses, t under a change.
 """
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,30 +84,6 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
     assert made.has_wavefront_error()
 
 
-def test_answers_travel_in_micrometres_radians_and_one():
-    sides = {
-        "width_nm": 5.0,
-        "length_nm": -3.0,
-        "turn_deg": 0.4,
-        "pedestal_nm": 2.0,
-        "cap_nm": -6.0,
-    }
-    made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9, **sides})
-    want = [
-        -7e-3,
-        0.013,
-        math.radians(0.9),
-        5e-3,
-        -3e-3,
-        math.radians(0.4),
-        2e-3,
-        -6e-3,
-    ]
-    assert made.response_amounts() == pytest.approx(want, rel=1e-12)
-    assert not State.of().amounts.any()
-    assert len(State.of().amounts) == len(PERTURBATIONS)
-
-
 def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
     """b(V) = 1 - exp(-V²), V the normalised frequency: n_eff² = around² + b (n² -
     around²).
@@ -169,21 +144,6 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
     assert rows["width_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert rows["length_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert not rows["turn_deg"].any()
-
-
-def test_changed_cells_have_so_much_more_of_the_cause():
-    cell = Cell(0.4, 0.6, Index(3.1, 0.02), sidewall_rad=0.03)
-    rows = {
-        row.name: perturbations.changed_pillar(
-            cell, 0.2, acts.numbers(cell, 0.2), 0.011, 0.85
-        )[0]
-        for row, acts in perturbations.response_errors()
-    }
-    assert rows["height_nm"].height_um == pytest.approx(0.611)
-    assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx(
-        (3.111, 0.02)
-    )
-    assert rows["sidewall_deg"].sidewall_rad == pytest.approx(0.041)
 
 
 @pytest.mark.parametrize(
@@ -333,22 +293,6 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     )
 
 
-def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
-    """The proxy of |T| = 0.9 - D falls to nothing at 0.9 um; the solver has 0.31 there,
-    at every height.
-    """
-    at = np.array([0.2, 0.5, 0.95, 1.1])
-    powers = np.zeros((3, 2, 4), complex)
-    powers[:, 0] = 0.31 * np.exp(5j * at)
-    powers[0, 1] = 0.7j * powers[0, 0]
-    slopes = Sensitivity(
-        np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=SolvedResponse(0.85, at, powers)
-    )
-    amounts = answering(0.02)
-    got = response.perturbed_transmission(Line(), slopes, at, 0.85, amounts)
-    assert got == pytest.approx(powers[0, 0] * (1 + 0.014j), rel=1e-9)
-
-
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
     """phase = k n_eff h; the thinnest: Rayleigh's cylinders across the field, of a fill
     of 5 %.
@@ -366,27 +310,6 @@ def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylin
     assert (made.k, made.index, made.around, made.height_um) == pytest.approx(
         (k, 3.1, 1.2, 0.6)
     )
-
-
-def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
-    diameter = np.zeros((4, 5))
-    diameter[1:3, 1:4] = [[0.12, 0.2, 0.27], [0.15, 0.22, 0.31]]
-    lens = SimpleNamespace(
-        diameters=SimpleNamespace(diameter_um=diameter),
-        proxy=Line(),
-        cell=Cell(0.4, 0.6, Index(3.1)),
-        wavelength_um=0.85,
-    )
-    made = response.proxy_sensitivity(lens)
-    assert (made.low_um, made.high_um, made.error) == (
-        0.12,
-        0.3,
-        0.5,
-    )  # of the lens, within the proxy's
-    d = np.linspace(0.12, 0.3, 61)
-    guide = response.effective_indices(lens.cell, lens.proxy, 0.85, d)
-    for n, (_, row) in enumerate(perturbations.of_kind(ResponseError)):
-        assert made.at(d)[n] == pytest.approx(row.acts.quick(guide), rel=1e-3, abs=1e-6)
 
 
 def test_the_table_says_what_the_documents_say():

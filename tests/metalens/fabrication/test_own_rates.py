@@ -3,7 +3,6 @@ truncation, and their error bar.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from metalens.fabrication import (
     inapplicable_names,
     names_of_kind,
     own_rates,
-    response,
     solved_rates,
 )
 from metalens.lens import DiameterMap, Lens
@@ -84,55 +82,6 @@ SEEN = {
         lambda j: (j[0, 0] - j[1, 1] - 1j * (j[0, 1] + j[1, 0])) / 2,
     ),
 }
-
-
-@pytest.mark.parametrize("edged", [True, False])
-def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged):
-    """Slopes of a few Chebyshev polynomials of the size at the nodes of the ninth: up
-    to the fifth degree they come
-    back, what the seventh has is the error, root mean square over the nodes, where sums
-    of products of the polynomials
-    are 9 or 9/2 or nothing. A row a millionth as large as the largest errs by more and
-    does not count."""
-    rows = {
-        0: {0: 2.0 - 0.3j, 3: 0.7j, 5: -0.2},
-        1: {0: 0.4, 1: 1.1 + 0.2j, 7: 0.09},
-        2: {0: 1e-8, 7: 3e-8},
-    }
-    edge = {2: 0.8 - 0.1j, 4: 0.3} if edged else {}
-    low, high = 0.1, 0.3  # of the proxy
-
-    def table(terms, size_um):
-        unit = (size_um - (low + high) / 2) / ((high - low) / 2)
-        return sum(
-            (c * np.cos(n * np.arccos(np.clip(unit, -1, 1))) for n, c in terms.items()),
-            0j * unit,
-        )
-
-    def solved(lens, size_um):
-        rates = np.array([table(rows.get(i, {}), size_um) for i in range(len(ROWS))])
-        return solved_rates.ResponseRates(
-            size_um[:, None], rates, 0.013, table(edge, size_um)
-        )
-
-    monkeypatch.setattr(response, "own_rates", solved)
-    found = response.proxy_sensitivity(lens())
-    power = [
-        sum(abs(c) ** 2 * (1 if n == 0 else 0.5) for n, c in rows[i].items())
-        for i in range(3)
-    ]
-    assert found.error == pytest.approx(
-        0.013 + 0.09 * math.sqrt(0.5) / math.sqrt(power[1]), rel=1e-9
-    )
-    at = np.array([0.117, 0.18, 0.26])
-    for i in range(3):
-        kept = {n: c for n, c in rows[i].items() if n <= 5}
-        assert found.at(at)[i] == pytest.approx(table(kept, at), rel=1e-9)
-    if edged:
-        assert found.edges.shape == (1, 6)
-        assert found.by_edges(at) == pytest.approx(table(edge, at), rel=1e-9)
-    else:
-        assert found.by_edges(at) is None
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import torch
 from metalens import fisher
 from metalens.core.errors import SceneError
 from metalens.image import pupil as pupils
-from metalens.image.information import pixel_information
 from metalens.image.pupil import Pupil
 from metalens.psf import whole_pixels
 
@@ -197,19 +196,6 @@ def test_pixels_inside_a_window_are_counted_as_by_hand(samples, sample_um, pitch
     assert whole_pixels(samples, sample_um, pitch_um) == fit
 
 
-def test_no_row_or_column_of_pixels_is_lost():
-    """Light that changes in the last row of pixels only is information; 48 samples of
-    0.3 um are 16 pixels of 0.9.
-    """
-    near = torch.ones(1, 48, 48, dtype=torch.float64)
-    far = near.clone()
-    far[:, -3:, -3:] += 0.25  # the last pixel: 9 samples of 0.25 each
-    found = pixel_information(
-        near, far, step_um=100.0, sample_um=0.3, pixel_um=0.9, normalisation="none"
-    )
-    assert float(found[0]) == pytest.approx((9 * 0.25 / 0.1) ** 2, rel=1e-9)
-
-
 def test_relative_orthogonality_of_unlike_informations():
     """F12² / (F11 F22), twice: 2 · 2.25 / 12; and the sum of the logarithms."""
     f = torch.tensor([[3.0, 1.5], [1.5, 4.0]], dtype=torch.float64)
@@ -277,39 +263,3 @@ def test_texture_information_is_that_of_differences_of_the_power():
         logs = torch.log(torch.fft.fft2(psf).abs() ** 2 * whole + 0.3)
         want = 0.5 * (((logs[1:] - logs[:-1]) / 0.17) ** 2).sum((1, 2))
         assert torch.allclose(found, want, rtol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("samples", "sample_um", "pixel_um"),
-    [(48, 0.3, 0.9), (50, 0.3, 0.9), (35, 0.1, 0.7)],
-)
-def test_no_pixel_is_lost_to_rounding_of_the_count(samples, sample_um, pixel_um):
-    """Flat light, twice as bright at the second depth: the plain difference counts
-    whole pixels, each its area.
-    """
-    whole = (samples * round(sample_um * 10)) // round(pixel_um * 10)
-    near = torch.ones(samples, samples, dtype=torch.float64)
-    setting = dict(
-        step_um=300.0, sample_um=sample_um, pixel_um=pixel_um, normalisation="none"
-    )
-    light = (pixel_um / sample_um) ** 2
-    got = fisher.pixel_information(near, 2 * near, **setting)
-    assert float(got) == pytest.approx((whole * light / 0.3) ** 2, rel=1e-9)
-
-
-def test_information_is_formed_on_the_device_of_the_image():
-    """A device without numbers stands for any that is not the processor: nothing may be
-    brought from there.
-    """
-    near = torch.empty(2, 30, 24, device="meta")
-    far = torch.empty(2, 30, 24, device="meta")
-    setting = dict(step_um=5.0, sample_um=1.0, pixel_um=3.0)
-    found = [
-        fisher.axial_information(near, far, **setting),
-        fisher.encircled_energy(near, 1.0, radius_um=5.0),
-        fisher.information(near, far),
-        fisher.texture_information(
-            near, step_um=5.0, spectrum=torch.empty(30, 13, device="meta"), noise=0.1
-        ),
-    ]
-    assert {one.device.type for one in found} == {"meta"}

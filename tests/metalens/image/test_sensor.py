@@ -57,24 +57,6 @@ def test_pitch_gradient_is_continuous_where_edges_meet():
     assert gradient(3.3) == pytest.approx(float(slope), rel=1e-8)
 
 
-def test_pitch_gradient_where_a_pixel_edge_lies_on_a_sample_edge():
-    """At a pitch of 4 samples all pixel edges lie on sample edges: the slope there is
-    that from either side.
-    """
-    p = torch.tensor(4.0, dtype=torch.float64, requires_grad=True)
-    got = torch.autograd.grad(
-        (integrate_pixels(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p
-    )[0]
-    step = 1e-5
-    high, low = (
-        (integrate_pixels(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum()
-        for s in (step, -step)
-    )
-    assert float(got) == pytest.approx(
-        float(high - low) / (2 * step), rel=1e-6
-    )  # second derivative jumps: 1e-9
-
-
 def test_pixel_larger_than_the_image_holds_all_its_light():
     pixels = integrate_pixels(IMAGE, 1.0, pitch_um=60.0)
     assert pixels.shape == (1, 1)
@@ -216,19 +198,6 @@ ODD = Sensor(
     read_noise_e=5.3,
 )
 AREA = (4.1 / 2.9) ** 2
-
-
-@pytest.mark.parametrize("ambient_ratio", [0.7, 4.0])
-def test_low_snr_mode_at_a_pitch_of_its_own(ambient_ratio):
-    """The equation that it solves: signal / sqrt(signal (1 + ratio) + read²) in a pixel
-    of kappa base pixels.
-    """
-    dim = sensors.low_snr(ODD, 0.37, snr_db=11.0, ambient_ratio=ambient_ratio)
-    signal = dim.exposure_e * 0.37 * AREA
-    assert dim.ambient_e * AREA == pytest.approx(ambient_ratio * signal)
-    assert signal / math.sqrt(signal * (1 + ambient_ratio) + 5.3**2) == pytest.approx(
-        10 ** (11 / 20), rel=1e-12
-    )
 
 
 def test_noise_of_a_pixel_has_photon_read_and_rounding_parts():

@@ -10,11 +10,9 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from metalens.cell import Cell, Index
-from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import DomainError
 from metalens.image import compiled
 from metalens.lens import DiameterMap, Lens, response
-from metalens.lens.record import TwoSizeTable
 from metalens.library import Proxy
 
 DRAW = np.random.default_rng(17)
@@ -71,54 +69,6 @@ def test_phase_and_transmission_are_the_series_wrapped(dtype, most):
     assert np.abs(level - series(LEVEL, d))[lit].max() < most
     assert not phase[~lit].any()
     assert not level[~lit].any()
-
-
-def test_turned_pillars_add_twice_their_turn():
-    sizes = np.array([[0.12, 0.0, 0.27], [0.2, 0.21, 0.14]])
-    turn = np.array([[0.3, 0.2, -1.4], [1.1, 0.0, 0.6]])
-    cell = Cell(0.4, 0.7, Index(3.6), "SiO2", shape=Rectangle(0.5))
-    made = Lens(
-        DiameterMap(sizes, 0.4, angle_rad=turn),
-        cell,
-        PROXY,
-        0.85,
-        300.0,
-        math.inf,
-        "map",
-        hand="left",
-    )
-    phase, level = np.empty(sizes.shape), np.empty(sizes.shape)
-    response.fill_response(made, (WAVE, TILT), phase, level)
-    want = np.where(sizes > 0, np.exp(1j * (series(SERIES, sizes) - 2 * turn)), 1)
-    assert np.exp(1j * phase) == pytest.approx(want, abs=1e-13)
-
-
-def test_pillars_of_two_sizes_have_the_entries_of_their_table():
-    draw = np.random.default_rng(4)
-    x = np.array([0.12, 0.16, 0.2])
-    y = np.array([0.11, 0.19])
-    t = (
-        0.9
-        * np.exp(1j * draw.uniform(-3, 3, (1, 3, 2, 2)))
-        * draw.uniform(0.5, 1, (1, 3, 2, 2))
-    )
-    row = draw.integers(0, 3, (4, 5))
-    column = draw.integers(0, 2, (4, 5))
-    sizes, lengths = x[row], y[column]
-    sizes[2, 1] = lengths[2, 1] = 0
-    table = TwoSizeTable(np.array([WAVE]), x, y, t, (210.0, 900.0))
-    made = lens(4, 5)
-    made = replace(
-        made,
-        diameters=DiameterMap(sizes, 0.4, length_um=lengths),
-        proxy=table.proxy,
-        pairs=table,
-    )
-    phase, level = np.empty((4, 5)), np.empty((4, 5))
-    response.fill_response(made, (WAVE, 0.0), phase, level)
-    want = np.where(sizes > 0, t[0, row, column, 0], 0)
-    assert level * np.exp(1j * phase) == pytest.approx(want, abs=1e-12)
-    assert np.abs(phase).max() <= np.pi
 
 
 def test_what_a_proxy_does_not_know_is_refused_by_name():

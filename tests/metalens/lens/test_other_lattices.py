@@ -75,15 +75,6 @@ def turned(hand="left"):
     )
 
 
-@pytest.mark.parametrize(("hand", "sign"), [("right", 2), ("left", -2)])
-def test_the_phase_of_a_turned_pillar_is_twice_its_turn(hand, sign):
-    made = turned(hand)
-    there = made.diameters.diameter_um > 0
-    want = PROXY.phase_rad(0.21, 0.94) + sign * made.diameters.angle_rad
-    assert np.allclose(made.phase_rad()[there], want[there])
-    assert not made.phase_rad()[~there].any()
-
-
 def test_turned_pillars_need_a_hand_and_others_have_none():
     with pytest.raises(LensError, match="hand"):
         turned("")

@@ -2,16 +2,15 @@
 
 import dataclasses
 import json
-import math
 
 import numpy as np
 import pytest
 
 from metalens import cli
-from metalens.cell import Cell, Film, Index, Layer
+from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Cross
 from metalens.core import executor
-from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
+from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import CommandConsole
 from metalens.library import plots, workers
 from metalens.library import study as cell_study
@@ -83,24 +82,6 @@ def test_pitches_above_cutoff_are_refused_and_named():
         )
 
 
-@pytest.mark.parametrize(
-    ("cell", "says"),
-    [
-        (Cell(0.3, pillar="a_Si"), "unknown material 'a_Si'"),
-        (Cell(0.3, under=(Film("Si-infrared", 0.1),)), "Si-infrared at 0.85 um"),
-        (Cell(0.3, substrate=Index(1.5, 0.1)), "substrate absorbs"),
-    ],
-)
-def test_what_cannot_be_solved_is_refused_before_any_cell_is(cell, says, monkeypatch):
-    monkeypatch.setattr(
-        executor,
-        "run_parallel",
-        lambda work, tasks: pytest.fail("cells were solved first"),
-    )
-    with pytest.raises(MetalensError, match=says):
-        cell_study.run_study(dataclasses.replace(SMALL, cell=cell))
-
-
 def test_heights_of_layered_pillars_are_made_of_their_own_material():
     """Pedestal and residual mask stay 60 and 40 nm; what they fill leaves no pillar."""
     layers = (
@@ -118,24 +99,6 @@ def test_heights_of_layered_pillars_are_made_of_their_own_material():
         CellError, match=r"0\.1 um of it of other films: need a larger height"
     ):
         study.at(0.33, 0.09)
-
-
-def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
-    """The foot is 28 nm wider than the diameter: with a printable gap of 20 nm
-    neighbours overlapped, and the study
-    ended with a refusal."""
-    cell = Cell(0.3, pillar=Index(3.6), sidewall_rad=0.04)
-    leaning = CellStudy(
-        pitches_um=(0.3,),
-        heights_um=(0.7,),
-        min_diameter_um=0.2,
-        min_gap_um=0.02,
-        cell=cell,
-    )
-    want = (0.2, 0.98 * 0.3 - 0.7 * math.tan(0.04))
-    assert cell_study._span(leaning, leaning.at(0.3, 0.7)) == pytest.approx(
-        want, rel=1e-12
-    )
 
 
 def test_the_page_says_what_is_printable_of_any_shape():
@@ -233,39 +196,3 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     ]
     table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.55,0\n")
     assert [done(study), done(study)] == [True, False]
-
-
-def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_mix(
-    tmp_path, monkeypatch
-):
-    """Workers read it anew for every task; what was solved for the new one is not kept
-    as one of the old.
-    """
-    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
-    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
-    study = CellStudy(pillar=str(table))
-
-    def told(work, tasks):
-        for i, _ in enumerate(tasks):
-            yield i, [SOLVED]
-            table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
-
-    monkeypatch.setattr(executor, "run_parallel", told)
-    with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
-        workers.SweepJournal(path, study).run(
-            ["curve", "other"], CommandConsole(quiet=True), "cells"
-        )
-    assert len(path.read_text().splitlines()) == 2  # its title and the first
-
-
-def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
-    path = tmp_path / "out.resume"
-    title = workers.SweepJournal(path, SMALL) and path.read_text()
-    path.write_text(title + '["task", [[[0.1], [], [0.2], true, ""]]]\n')
-    assert workers.SweepJournal(path, SMALL)._known == {}
-    path.write_text("pages of a thesis\n")
-    with pytest.raises(
-        StoreError, match=r"out\.resume is in the way.*no journal of metalens"
-    ):
-        workers.SweepJournal(path, SMALL)
-    assert path.read_text() == "pages of a thesis\n"

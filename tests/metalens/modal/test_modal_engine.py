@@ -13,16 +13,8 @@ from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import CellError
 from metalens.modal.case import case_of
-from metalens.modal.engine import geometric_mean, solve_on_mesh
-from metalens.modal.mesh import (
-    X0,
-    X1,
-    MeshPlan,
-    assemble_disc,
-    build_mesh,
-    gradient_matrix,
-)
-from metalens.modal.shapes import polynomial_interval, rim_interval, square_basis
+from metalens.modal.engine import solve_on_mesh
+from metalens.modal.mesh import MeshPlan, assemble_disc
 from metalens.modal.solver import LEVELS
 from metalens.modal.spaces import homogeneous_modes
 
@@ -47,54 +39,6 @@ def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):
 
 # --- elements
 # -------------------------------------------------------------------------------------------------
-
-
-def test_slopes_are_orthonormal_and_integrate_to_the_values():
-    for line in (
-        polynomial_interval(5, 12),
-        rim_interval(4, 28, (0.7, 1.3), False),
-        rim_interval(4, 28, (0.7, 1.3), True),
-    ):
-        gram = (line.slope * line.weight) @ line.slope.T
-        assert np.abs(gram - np.eye(line.degree)).max() < 1e-11
-        # partial integration: bubbles vanish at both ends, so their mean times 1 is
-        # minus <s, slope>
-        mean = line.value[2:] @ line.weight
-        assert np.abs(mean + line.slope[1:] @ (line.weight * line.point)).max() < 1e-12
-
-
-def test_rim_rule_integrates_fractional_powers():
-    line = rim_interval(3, 28, (0.7,), False)
-    for power in (-0.6, -0.3, 0.7, 1.4, 2.0):
-        assert abs((line.weight * line.point**power).sum() - 1 / (power + 1)) < 1e-12
-
-
-def test_curl_of_gradient_vanishes():
-    basis = square_basis(rim_interval(3, 20, (0.7,), True), polynomial_interval(4, 9))
-    assert np.abs(basis.curl @ basis.gradient).max() == 0
-
-
-@pytest.mark.parametrize("rho", [0.025, 0.5, 0.975])
-def test_areas_of_disc_and_cell(rho):
-    whole, disc = assemble_disc(rho, PLAN)
-    # constants are the sum of the vertex functions: those that the gradient sends to
-    # zero together
-    _, _, right = np.linalg.svd(gradient_matrix(PLAN))
-    one = right[-1] / right[-1][np.argmax(np.abs(right[-1]))]
-    assert abs(one @ whole.scalar @ one - 1) < 1e-10
-    assert abs(one @ disc.scalar @ one / (math.pi * rho**2 / 4) - 1) < 1e-10
-
-
-def test_every_edge_is_shared_with_one_direction():
-    mesh = build_mesh(PLAN)
-    keys = {
-        pair
-        for element in mesh.elements
-        for pair in zip(element.vector.ravel(), element.vector.ravel(), strict=True)
-    }
-    assert len(keys) == len(mesh.vector_wall)
-    walls = (mesh.vector_wall & (X0 | X1)) != 0
-    assert 0 < walls.sum() < len(walls) / 2
 
 
 @pytest.mark.parametrize("half_phase", [None, 0.3, 1.2])
@@ -222,20 +166,6 @@ def test_polarisations_are_equal_at_normal_incidence():
         for a in (0.0, 1.0)
     }
     assert len(answers) == 1
-
-
-def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
-    rng = np.random.default_rng(2)
-    a = np.linalg.qr(rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2)))[0]
-    u = a @ a.T
-    v = a @ np.diag(np.exp(1j * np.array([0.02, -0.05]))) @ a.T
-    mean = geometric_mean(u, v)
-    assert np.abs(mean.conj().T @ mean - np.eye(2)).max() < 1e-14
-    assert (
-        np.abs(mean - a @ np.diag(np.exp(0.5j * np.array([0.02, -0.05]))) @ a.T).max()
-        < 1e-14
-    )
-    assert np.abs(mean - mean.T).max() < 1e-14
 
 
 # --- hard cases

@@ -71,40 +71,6 @@ def test_a_grating_has_the_factor_of_its_slope_and_azimuth_on_each_field(azimuth
     assert level.numpy() == pytest.approx(0.8 * abs(mean), rel=1e-9)
 
 
-def test_slopes_of_a_lens_are_those_of_its_paths_and_shares_of_rows_make_no_difference(
-    monkeypatch,
-):
-    """Inside the rim to 1e-3 of the largest slope (curvature over five pillars); at it,
-    from one side, to 2 %.
-    """
-    phase, level, sines = lens()
-    light = torch.polar(torch.tensor(level), torch.tensor(phase))
-    slopes = neighbour_coupling.phase_slopes(light, PITCH)
-    for got, want in zip(slopes, sines, strict=True):
-        error = np.abs(got.numpy() * WAVE / (2 * np.pi) - want)
-        inner = (
-            neighbour_coupling._around(
-                torch.tensor(level[:, 1:] * level[:, :-1]).to(light), along=-1
-            ).real.numpy()
-            == 20
-        )
-        assert error[inner].max() < 1e-3 * 0.51
-        assert error[level > 0].max() < 0.02 * 0.51
-    whole = neighbour_coupling.mean_coupling(light, ROWS, PITCH)
-    monkeypatch.setattr(neighbour_coupling, "ROWS", 7)
-    assert (
-        float(
-            (neighbour_coupling.mean_coupling(light, ROWS, PITCH) - whole).abs().max()
-        )
-        < 1e-13
-    )  # of 1: a few roundings of other lanes
-    far = torch.tensor(
-        np.hypot(*np.indices((100, 100)) - 2.0) > 130
-    )  # where no pair stands: as it was
-    assert far.any()
-    assert (whole[far] == 1).all()
-
-
 def about(**more):
     window = dict(
         window_um=9.0,
@@ -233,49 +199,6 @@ def test_two_wavelengths_of_flux_are_those_of_each_alone():
         assert both.intensity[k] * both.energy_um2[k] == pytest.approx(
             light, abs=1e-4 * light.max()
         )
-
-
-def test_factors_made_once_serve_as_the_rows_do():
-    """Several directions share maps, and so the factors on both fields; one scalar has
-    no use for two.
-    """
-    phase, level, _ = lens(distance=14.0, count=40)
-    given = about(
-        depths_um=[200.0],
-        sensor_distance_um=14.0,
-        window_um=6.0,
-        samples=12,
-        polarisation="flux",
-    )
-    fields = neighbour_coupling.apply_jones_coupling(
-        torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH
-    )
-    got, want = (
-        psf.psf_stack(phase, level, **given, neighbours=of) for of in (fields, ROWS)
-    )
-    assert got.intensity == pytest.approx(want.intensity, abs=1e-12)  # of sum 1
-    with pytest.raises(
-        PropagationError, match="factors on both fields, but one scalar"
-    ):
-        psf.psf_stack(
-            phase, level, **given | dict(polarisation="scalar"), neighbours=fields
-        )
-
-
-def test_the_factor_is_one_formula_for_numpy_and_torch():
-    sine = np.array([0.0, 0.2, 0.55, 0.9])
-    aside = np.array([0.3, 0.0, 1.0, 0.5])
-    for field in (0, 1):
-        got = ROWS.of_field(field, torch.tensor(sine), torch.tensor(aside))
-        assert got.numpy() == pytest.approx(
-            ROWS.of_field(field, sine, aside), rel=1e-14
-        )
-        assert got.numpy() == pytest.approx(
-            ROWS.at(sine, np.arcsin(np.sqrt(aside)) / 2)[field], rel=1e-12
-        )
-    both = (ROWS.of_field(0, sine, aside) + ROWS.of_field(1, sine, aside)) / 2
-    assert ROWS.of_both(sine, aside) == pytest.approx(both, rel=1e-14)
-    assert np.abs(ROWS.of_field(0, sine, aside) - both).max() > 0.03
 
 
 def test_a_polarisation_that_maps_cannot_tell_is_refused():

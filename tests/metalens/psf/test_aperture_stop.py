@@ -18,8 +18,8 @@ from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window
 from metalens.image.points import psfs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
-from metalens.optics import Layers, Stop, media
-from metalens.psf import SourceExtent, View, blur_um, from_lens, psf_stack
+from metalens.optics import Layers, Stop
+from metalens.psf import SourceExtent, View, from_lens, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
 K = 2 * math.pi / WAVE
@@ -381,34 +381,6 @@ def test_depths_behind_a_stop_are_each_as_alone() -> None:
         assert all_.energy_um2[1, i] == pytest.approx(one.energy_um2[0], rel=1e-10)
 
 
-def test_rays_cross_the_stop_where_snell_has_them() -> None:
-    """A ray is followed forwards: from the source to a place of the stop, and on
-    through glass to the pillars.
-    """
-    layers = Layers(
-        front=(Film(Index(1.3), 50.0), Film(Index(1.7), 120.0)), stop=Stop(300.0, 150.0)
-    )
-    depth, p = 2000.0, np.array([0.11, 0.31])
-    # from the stop: 120 um of 1.7 and 30 um of 1.3; from the source 20 um of 1.3 and
-    # air before
-    glass = sum(t * p / np.sqrt(n * n - p * p) for n, t in ((1.7, 120.0), (1.3, 30.0)))
-    before = (
-        glass
-        + 20.0 * p / np.sqrt(1.3**2 - p * p)
-        + (depth - 170.0) * p / np.sqrt(1 - p * p)
-    )
-    tangents = (0.2, 0.0)
-    sine = 0.2 / math.hypot(1, 0.2)
-    source = -float(media.lateral_reach(layers.before(depth, WAVE), sine))
-    x, u = source + before, source + before - glass
-    hole = replace(
-        layers, stop=Stop(float(u[1]), 150.0)
-    )  # its edge where the second ray crosses
-    share = hole.stop_share(tangents, depth, WAVE, (x, np.zeros(2)), 1e-3)
-    assert share[0] == 1.0
-    assert share[1] == pytest.approx(0.5, abs=1e-3)  # 1e-6 um of 1e-3
-
-
 def test_shadow_is_fresnels_edge_bent_by_its_radius() -> None:
     """By Fresnel integrals of scipy, at narrow places: edges in the plane of the light
     and across it.
@@ -442,25 +414,6 @@ def test_shadow_is_fresnels_edge_bent_by_its_radius() -> None:
         np.testing.assert_allclose(
             got, want, atol=2e-5
         )  # of the table, 1e-7 over the width in w, 8e-4
-
-
-def test_shadow_near_the_pillars_is_a_hole_there_and_far_waves_are_shared_out() -> None:
-    """Places wider than the ripples have their mean: 1 within, none behind; thickness
-    to 0 is a smaller aperture.
-    """
-    x = np.linspace(-70.0, 70.0, 57)
-    for thick in (1e-3, 1e-6):
-        layers = Layers(front=(Film(Index(GLASS), thick),), stop=Stop(STOP, thick))
-        got = layers.shadow((0.3, 0.0), 2000.0, WAVE, (x, np.zeros(57)), 0.5)
-        hole = replace(layers, stop=Stop(STOP)).shadow(
-            (0.3, 0.0), 2000.0, WAVE, (x, np.zeros(57)), 0.5
-        )
-        assert np.abs(got - hole).max() < 0.1 * math.sqrt(
-            thick
-        )  # of an edge √(λ t / n) wide, of 0.5 um
-    assert np.ones((2, 3)) == pytest.approx(
-        Layers().shadow((0.0, 0.0), 1e3, WAVE, (np.zeros(3), np.zeros((2, 1))), 1.0)
-    )
 
 
 @pytest.mark.parametrize("middle", [(0.0, 0.0), (-37.0, 11.0)])
@@ -512,69 +465,6 @@ def test_image_engine_and_every_pillar_see_the_same_stop(
         assert stack.energy_um2[0] == pytest.approx(
             math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03
         )
-
-
-def test_the_error_of_a_stack_is_that_of_its_worst_shadow() -> None:
-    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray; zones by the
-    blur over the way of the ray.
-    """
-    layers, (tx, ty) = Layers(stop=Stop(19.0, 90.0)), (math.tan(0.2), math.tan(-0.1))
-    about = {
-        "pitch_um": PITCH,
-        "wavelength_um": WAVE,
-        "sensor_distance_um": SENSOR,
-        "layers": layers,
-        **WINDOW,
-    }
-    angles, depths = [[0.0, 0.0], [0.2, -0.1]], [220.0, 1500.0]
-    phase, level = (whole[90:190, 80:200] for whole in (PHASE, LEVEL))
-    stack = psf_stack(phase, level, depths_um=depths, angle_rad=angles, **about)
-    assert stack.budget is not None
-    places = (np.arange(120) - 59.5) * PITCH, (np.arange(100)[:, None] - 49.5) * PITCH
-    shades = [
-        layers.shadow((math.tan(x), math.tan(y)), z, WAVE, places, PITCH)
-        for x, y in angles
-        for z in depths
-    ]
-    through = [(np.abs(shade * level) ** 2).sum() * PITCH**2 for shade in shades]
-    held = stack.energy_um2 / np.reshape(through, (2, 2))
-    assert 1 - held.min() == pytest.approx(stack.budget.outside, rel=1e-5)
-    blurs, found = blur_um(stack.intensity, stack.step_um, held), {}
-    for i, slope in enumerate((0.0, math.hypot(tx, ty))):
-        for j, z in enumerate(depths):
-            number = 19.0**2 / math.hypot(1, slope) ** 3 / (WAVE * 90 * (z - 90) / z)
-            zones = (
-                19.0
-                * blurs[i, j]
-                / (SENSOR * math.hypot(1, slope))
-                / WAVE
-                / held[i, j] ** 0.25
-            )
-            found[i, j] = (0.005 + 0.055 * zones) / number
-    assert stack.budget.stop == pytest.approx(max(found.values()), rel=1e-6)
-    assert len({round(value, 6) for value in found.values()}) == 4
-
-
-def test_light_that_the_stop_sends_beside_the_lens_is_lost() -> None:
-    """At 45 degrees of 80 um glass light lands 80 tan(asin(sin 45° / 1.45)) = 44.7 um
-    aside, half beyond the rim.
-    """
-    angle = (math.radians(45.0), 0.0)
-    about = {
-        "pitch_um": PITCH,
-        "wavelength_um": WAVE,
-        "sensor_distance_um": SENSOR,
-        **WINDOW,
-    }
-    seen = psf_stack(
-        0 * PHASE, LEVEL, layers=LAYERS, angle_rad=angle, depths_um=[math.inf], **about
-    )
-    aside = THICK * math.tan(math.asin(math.sin(angle[0]) / GLASS))
-    share = float(((np.hypot(X - aside, Y) <= STOP) & (LEVEL > 0)).sum() * PITCH**2)
-    assert seen.budget is not None
-    whole = seen.energy_um2[0] / (1 - seen.budget.outside)
-    # an edge of 7 um, of which the rim cuts another share on either side
-    assert whole == pytest.approx(share, rel=1.5e-2)
 
 
 def test_stops_that_cannot_be_are_refused_by_name() -> None:

@@ -3,7 +3,6 @@ waves, light left outside.
 """
 
 import dataclasses
-import itertools
 import math
 from types import SimpleNamespace
 
@@ -15,7 +14,6 @@ from metalens import propagate, psf
 from metalens.core.errors import PropagationError
 from metalens.optics import Layers
 from metalens.psf import lens_psfs, spectrum
-from metalens.psf.cells import nyquist_um
 from tests.referees import vectorial
 
 WAVELENGTH, PITCH = 0.85, 0.3
@@ -73,17 +71,6 @@ def test_a_coarse_window_gives_the_light_on_its_cells():
         ).max()
         < 1e-3 * fine.max()
     )
-
-
-def test_a_window_within_nyquist_is_sampled_as_it_was():
-    case = propagate.make_case(
-        (150, 150), **{n: v for n, v in geometry(90.0).items() if n != "tolerance"}
-    )
-    sine = math.sin(math.atan(149 * PITCH / 2 / 90.0))
-    assert nyquist_um(case) == pytest.approx(WAVELENGTH / 4 / sine, rel=1e-9)
-    stack = psf.psf_stack(*lens(90.0), **geometry(90.0))
-    assert stack.budget.sampling == 0
-    assert "cells" not in stack.reason
 
 
 @pytest.mark.parametrize("distance", [60.0, 24.0])
@@ -303,25 +290,6 @@ def test_rows_of_a_spectrum_that_are_none_are_named(tmp_path, rows, named):
         spectrum.read_measured_spectrum([tmp_path / "led.csv"], within_um=(0.8, 0.9))
 
 
-def test_rows_of_a_spectrum_may_come_in_any_order_with_gaps_and_dark_between(tmp_path):
-    """Straight from 846 to 858 nm across the gap; dark at 842 and 844: the mean of
-    three pieces, by hand.
-    """
-    (tmp_path / "led.csv").write_text(
-        "858,1\n842,0\n838,2\n862,0\n846,3\n844,0\n834,0\n"
-    )
-    found = spectrum.read_measured_spectrum(
-        [tmp_path / "led.csv"], within_um=(0.8, 0.9)
-    )
-    areas = np.array([4.0, 4.0, 3.0, 24.0, 2.0])  # 834-838-842, 844-846-858-862
-    middles = np.array(
-        [836 + 2 / 3, 839 + 1 / 3, 845 + 1 / 3, 851.0, 859 + 1 / 3]
-    )  # centroids of triangles and a trapezium
-    assert found.share @ found.wavelengths_um * 1e3 == pytest.approx(
-        areas @ middles / areas.sum(), rel=1e-12
-    )  # exact
-
-
 def test_light_of_a_diode_beyond_the_library_is_told():
     """A line of 20 nm at 850 nm, known to 12 nm below and 17 nm above: two tails of a
     normal distribution.
@@ -377,17 +345,3 @@ def test_the_estimate_holds_in_single_precision_where_windows_are_dim_or_tiny(se
     assert np.linalg.norm(
         stack.numpy().intensity - want
     ) <= stack.error * np.linalg.norm(want)
-
-
-def test_a_tighter_tolerance_is_no_worse_in_single_precision():
-    maps = tuple(np.float32(m) for m in lens(90.0, bend=3.0))
-    about = geometry(90.0, window_um=6.0, offset_um=(9.0, -4.0))
-    del about["tolerance"]
-    want = propagate.exact(*(m.astype(float) for m in maps), **about)
-    errors = [
-        np.linalg.norm(propagate.windowed(*maps, tolerance=t, **about) - want)
-        for t in (1e-2, 1e-4, 1e-6, 1e-8)
-    ]
-    floor = 1e-7 * np.linalg.norm(want)  # of what is returned in single precision
-    assert all(after <= before + floor for before, after in itertools.pairwise(errors))
-    assert errors[-1] <= floor

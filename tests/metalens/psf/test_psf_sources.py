@@ -222,28 +222,3 @@ def test_what_no_source_or_window_can_be_is_refused_by_name():
     ):
         with pytest.raises(PropagationError, match="need one of both"):
             psf.SourceExtent("disc", **wrong)
-
-
-def test_depths_in_shares_are_the_same_psfs(monkeypatch):
-    """A share has a plan of its own, which meets the tolerance of 1e-4 on its own; the
-    estimates are of each share.
-    """
-    from metalens.psf import intensity
-
-    given = dict(
-        **GEOMETRY,
-        depths_um=np.linspace(700, 1500, 7),
-        angle_rad=0.1,
-        window_um=30.0,
-        samples=10,
-    )
-    whole = psf.psf_stack(*lens(), **given)
-    monkeypatch.setattr(intensity, "HELD_BYTES", 1.0)
-    parts = psf.psf_stack(*lens(), **given)
-    assert "7 shares" in parts.reason
-    assert "integrated" in parts.reason
-    assert parts.error < 1e-4
-    assert np.linalg.norm(parts.intensity - whole.intensity) < 2e-4 * np.linalg.norm(
-        whole.intensity
-    )
-    assert parts.energy_um2 == pytest.approx(whole.energy_um2, rel=2e-4)

@@ -8,7 +8,6 @@ a window beside it by a tenth.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
-from metalens.psf.lens_psfs import paths_um
 
 PHASE = np.array(
     [[0.0, 1.15 * math.pi], [-0.4, -1.9]]
@@ -104,32 +102,3 @@ def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
         assert error <= found.budget.spectrum
         errors.append(found.budget.spectrum)
     assert errors[1] > 2 * errors[0]
-
-
-@pytest.mark.parametrize("offset", [(3.0, 21.0), (-17.0, 5.0)])
-def test_paths_to_a_window_differ_as_those_from_the_nearest_and_the_farthest_pillar(
-    offset,
-):
-    """Collimated light on axis, through air and pillars of one wavelength: rims of the
-    lens on the line from its
-    middle, by spokes that miss it by up to 3 %."""
-    one = Proxy(
-        PHASE[:1], np.array([[0.85, 0.05]]), (0.08, 0.22), (0.85, 0.85), 0.0, 0.0
-    )
-    made = replace(lens(61, 55.0), proxy=one)
-    radius = made.diameters.radius_um
-    found = paths_um(
-        made,
-        View((math.inf,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset),
-        (0.0, 0.0),
-        None,
-    )[0]
-    middle = math.hypot(*offset)
-    near = max(middle - radius, 0.0)
-    want = math.hypot(middle + radius, 55.0) - math.hypot(near, 55.0)
-    assert found[found.shape[0] // 2, found.shape[1] // 2] == pytest.approx(
-        want, rel=0.03
-    )
-    down = np.ptp(found, axis=0).mean()
-    across = np.ptp(found, axis=1).mean()
-    assert bool(down > across) is (abs(offset[1]) > abs(offset[0]))

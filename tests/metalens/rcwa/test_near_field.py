@@ -10,7 +10,7 @@ import pytest
 
 from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Incidence, Index, Lattice
-from metalens.cell.shapes import Rectangle, Ring
+from metalens.cell.shapes import Ring
 from metalens.core.errors import CellError
 from metalens.rcwa import FieldGrid, near_field, near_fields
 
@@ -294,54 +294,6 @@ def test_fields_repeat_from_site_to_site_with_the_phase_of_the_light(lattice):
     assert np.abs(other.e - turn * one.e).max() < 1e-9
     assert np.abs(other.h - turn * one.h).max() < 1e-9
     assert np.array_equal(one.index, other.index)
-
-
-def test_a_cell_turned_by_a_quarter_has_the_field_turned():
-    """Other mirrors, other signs of the orders: (x, y) -> (-y, x), in light that keeps
-    one mirror and the other one.
-    """
-    x = np.array([-0.13, 0.02, 0.1])
-    y = np.array([0.04, 0.12])
-    z = [0.1, 0.3]
-    flat, upright = (
-        dataclasses.replace(ROUND, shape=Rectangle(0.55, turn))
-        for turn in (0.0, math.pi / 2)
-    )
-    for angle in (0.0, 0.35):
-        one = near_field(
-            flat,
-            0.24,
-            Incidence(WAVELENGTH, angle, "p", 0.0),
-            x_um=x,
-            y_um=y,
-            z_um=z,
-            harmonics=4,
-        )
-        light = Incidence(WAVELENGTH, angle, "p", math.pi / 2)
-        other = near_field(
-            upright, 0.24, light, x_um=-y[::-1], y_um=x, z_um=z, harmonics=4
-        )
-        for a, b in ((one.e, other.e), (one.h, other.h)):
-            back = b[:, :, :, ::-1].swapaxes(-1, -2)
-            assert np.abs(np.stack([back[1], -back[0], back[2]]) - a).max() < 1e-9
-
-
-def test_a_wall_in_steps_that_is_all_but_upright_is_the_upright_wall():
-    """A tilt of 1e-6: fields move by less than 1e-4, through twelve slabs in place of
-    one.
-    """
-    grid = {
-        "x_um": [0.03],
-        "y_um": [-0.06],
-        "z_um": [-0.1, 0.05, 0.22, 0.41, 0.7],
-        "harmonics": 4,
-    }
-    tilted = dataclasses.replace(ROUND, sidewall_rad=1e-6)
-    one, other = (
-        near_field(cell, SIZE, Incidence(WAVELENGTH), **grid)
-        for cell in (ROUND, tilted)
-    )
-    assert np.abs(one.e - other.e).max() < 1e-4
 
 
 @pytest.mark.parametrize("tilt", [0.12, -0.08])

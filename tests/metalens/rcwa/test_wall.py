@@ -10,16 +10,9 @@ import pytest
 from metalens import rcwa
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Rectangle
-from metalens.rcwa.sidewall import WallSection, gauss_collocation, panel_transfer
+from metalens.rcwa.sidewall import WallSection, panel_transfer
 
 TILTED = Cell(0.31, 0.63, Index(3.5), Index(1.47), Index(1.03), sidewall_rad=0.034)
-
-
-def test_gauss_integrals_are_those_of_polynomials():
-    c, b, a = gauss_collocation(4)
-    for power in range(4):
-        assert np.abs(a @ c**power - c ** (power + 1) / (power + 1)).max() < 1e-14
-    assert abs(b @ c**7 - 1 / 8) < 1e-14  # exact to degree 2 m - 1, and rounding
 
 
 def test_uniform_wall_is_an_exponential():

@@ -9,7 +9,6 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 from metalens.view import (
     ClassMapPanel,
@@ -18,7 +17,6 @@ from metalens.view import (
     PointPanel,
     SliderAxis,
     TablePanel,
-    at_brightest,
     page,
 )
 from tests.metalens.view.browser_page import BROWSER, printed, told
@@ -71,71 +69,6 @@ def test_an_image_has_the_colours_of_its_values(tmp_path):
     # 256 colours: half a step of the table is at most 8 * 60 / 512 levels, and half of
     # one for rounding
     assert np.abs(drawn - wanted)[away].max() <= 1.5
-
-
-def test_images_that_blink_share_a_scale(tmp_path):
-    values = np.random.default_rng(6).uniform(0, 1, (2, 2, 5, 5))
-    values[1] *= 2.7  # brighter than what is shown first
-    axes = [
-        SliderAxis("shown", ["captured", "fitted"], blink=True),
-        SliderAxis("frame", ["a", "b"]),
-    ]
-    drawn = _canvas(tmp_path, [ImagePanel("frames", values, axes, 0.5)], "canvas.image")
-    wanted = _colour(values[0, 0] / values[:, 0].max())
-    assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
-
-
-def test_sliders_stand_at_the_image_with_the_highest_peak(tmp_path):
-    values = np.random.default_rng(8).uniform(0, 1, (2, 3, 5, 5))
-    values[1, 2, 0, 4] = 3.0
-    axes = at_brightest(
-        [
-            SliderAxis("field angle", ["a", "b"]),
-            SliderAxis("depth", [1.0, 2.0, 3.0], "mm"),
-        ],
-        values,
-    )
-    assert [axis.first for axis in axes] == [1, 2]
-    drawn = _canvas(tmp_path, [ImagePanel("psf", values, axes, 0.5)], "canvas.image")
-    wanted = _colour(values[1, 2] / 3.0)
-    assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
-
-
-def test_a_map_far_away_is_the_mean_over_its_sites_and_shows_no_false_lenses(tmp_path):
-    n = 2048
-    at = np.arange(n) - (n - 1) / 2
-    # rings of three sites at the rim: a map of every n-th site would show coarse ones,
-    # false lenses among them
-    radius = np.hypot(at, at[:, None])
-    index = np.where(radius < 1000, 1 + np.floor(radius**2 / 85) % 64, 0).astype(
-        np.uint8
-    )
-    sizes = np.linspace(80.0, 207.0, 64)
-    drawn = _canvas(
-        tmp_path, [ClassMapPanel("mask", index, sizes, 0.3, "nm")], "canvas.map"
-    )
-    high, wide = drawn.shape[:2]
-    scale = min(wide, high) / n * 0.98
-    rows = np.arange(high // 2 - 60, high // 2 + 60)
-    columns = np.arange(wide // 2 + 60, wide // 2 + 220)
-    values = np.where(index > 0, sizes[np.maximum(index, 1).astype(int) - 1], 0)
-    assert 0.25 <= scale < 0.5
-    for _ in range(
-        2
-    ):  # to blocks of 4 sites, a pixel or more, by the weights 1 3 3 1 along both axes
-        for _ in range(2):
-            padded = np.pad(values, ((1, 2), (0, 0)))
-            values = (
-                0.125 * padded[:-3]
-                + 0.375 * padded[1:-2]
-                + 0.375 * padded[2:-1]
-                + 0.125 * padded[3:]
-            )[::2].T
-    y = ((rows + 0.5 - high / 2) / scale + n / 2) / 4 - 0.5
-    x = ((columns + 0.5 - wide / 2) / scale + n / 2) / 4 - 0.5
-    means = map_coordinates(values, np.meshgrid(y, x, indexing="ij"), order=1)
-    wanted = _colour((means - 80.0) / 127.0)
-    assert np.abs(drawn[np.ix_(rows, columns)] - wanted).max() <= 1.5
 
 
 def _everything():

@@ -15,13 +15,11 @@ import numpy as np
 import pytest
 
 from metalens import lens, psf
-from metalens import library as libraries
 from metalens.cell import Cell, Index
 from metalens.commands import view
 from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
 from metalens.design import Focus, make
-from metalens.library.record import PillarLibrary, Sweep
 from metalens.proxy import Proxy
 from metalens.view import (
     ClassMapPanel,
@@ -34,7 +32,6 @@ from metalens.view import (
     artefacts,
     page,
 )
-from metalens.view.panels import classes_of
 from tests.metalens.view.browser_page import BROWSER, told
 
 
@@ -94,61 +91,6 @@ def test_every_pillar_is_in_the_page(folder):
     )
 
 
-def test_bands_of_a_library_are_its_bars_and_what_they_turn_the_phase_by(tmp_path):
-    """The largest turn of t by a circle of the bar's radius around it; a quarter where
-    the bar holds 0.
-    """
-    d = np.linspace(0.08, 0.21, 20)
-    t = (np.linspace(0.9, 0.3, 20) * np.exp(55j * d))[None, None, None]
-    bar = np.linspace(0.02, 0.28, 20)[None, None, None] * np.ones(t.shape)
-    bar[..., 7] = 0.95
-    parts = (
-        np.zeros(1),
-        np.array([0.85]),
-        d,
-        t,
-        0.4 * t,
-        bar,
-        np.ones(t.shape),
-        np.array([[0, 0, 0.85, 0.12, 3e-3]]),
-    )
-    made = PillarLibrary(
-        Cell(0.30, pillar=Index(3.6)), Sweep(), ("x",), *parts, "modal", 20
-    )
-    libraries.save(tmp_path / "l.h5", made)
-    size, phase, error = artefacts.library_panels(tmp_path / "l.h5")
-    assert size.x == pytest.approx(1e3 * d)
-    assert size.lines["|r|"] == pytest.approx(0.4 * size.lines["|t|"])
-    assert size.errors["|t|"] == pytest.approx(bar)
-    assert error.lines["error bar"] == pytest.approx(bar)
-    assert np.ravel(size.bands) == pytest.approx([117.0, 123.0])
-    assert phase.lines["phase"] == pytest.approx(np.unwrap(np.angle(t)) / (2 * np.pi))
-    circle = np.exp(1j * np.linspace(0, 2 * np.pi, 3001))
-    turned = np.abs(np.angle(1 + bar[..., None] / np.abs(t)[..., None] * circle)).max(
-        -1
-    ) / (2 * np.pi)
-    turned[..., 7] = 0.25
-    assert phase.errors["phase"] == pytest.approx(turned, rel=1e-5)
-
-
-def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(
-    folder, monkeypatch
-):
-    """Two angles of three depths of 28 x 28 samples: half of them leave the first and
-    the last depth.
-    """
-    stack = psf.load(folder / "psf.h5")
-    monkeypatch.setattr(artefacts, "MOST_SAMPLES", stack.intensity.size // 2)
-    images, curves, _ = artefacts.psf_panels(folder / "psf.h5")
-    assert images.axes[-1].values == pytest.approx([0.7, 1.4])
-    assert images.values == pytest.approx(
-        stack.intensity[..., ::2, :, :] / stack.intensity[..., ::2, :, :].max()
-    )
-    assert curves.x == pytest.approx([0.7, 1.4])
-    energy = stack.energy_um2[..., ::2]
-    assert curves.lines["light in the window"] == pytest.approx(energy / energy.max())
-
-
 def test_psfs_keep_their_axes(folder):
     stack = psf.load(folder / "psf.h5")
     panel = _content(page.page_html("psf", artefacts.psf_panels(folder / "psf.h5")))[
@@ -177,22 +119,6 @@ def test_nothing_in_a_page_leads_out_of_it(folder):
     assert not outside
     assert _content(text)["title"] == "a & b </script><script>alert(1)</script>"
     assert "<script>alert" not in text
-
-
-def test_few_sizes_are_kept_as_they_are_and_many_in_equal_steps():
-    map_um = np.array([[0.0, 0.17, 0.11], [0.17, 0.13, 0.0]])
-    index, sizes = classes_of(map_um)
-    assert index.dtype == np.uint8
-    assert index.tolist() == [[0, 3, 1], [3, 2, 0]]
-    assert sizes.tolist() == [0.11, 0.13, 0.17]
-    many = np.random.default_rng(3).uniform(0.08, 0.21, (40, 50))
-    many[3, 7] = 0
-    index, sizes = classes_of(many, most=300)
-    assert index[3, 7] == 0
-    held = many > 0
-    assert (
-        np.abs(sizes[index[held] - 1] - many[held]).max() <= 0.5001 * 0.13 / 299
-    )  # half a step
 
 
 def test_figures_that_do_not_fit_are_refused():

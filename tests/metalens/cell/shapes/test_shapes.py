@@ -17,7 +17,6 @@ from metalens.cell.shapes import (
     RegularPolygon,
     Ring,
     Square,
-    straight,
 )
 from metalens.core import config
 from metalens.core.errors import CellError, ConfigError
@@ -149,20 +148,6 @@ def test_bias_that_eats_the_outline_is_refused():
         Circle().outline(0.1, grow_um=-0.1)
 
 
-def test_edges_cross_where_both_hold_the_same_point():
-    """Random edges anywhere: the point that lies on both lines, by solving for its
-    shares along them.
-    """
-    rng, met = np.random.default_rng(14), 0
-    for _ in range(300):
-        a, b, c, d = rng.uniform(-1, 1, (4, 2)) + rng.uniform(-3, 3, 2)
-        along, across = np.linalg.solve(np.stack([b - a, c - d], 1), c - a)
-        want = 0 <= along <= 1 and 0 <= across <= 1
-        assert straight._cross(a, b, c, d) == want
-        met += want
-    assert 40 < met < 260
-
-
 U = (
     (-0.5, -0.5),
     (0.5, -0.5),
@@ -212,12 +197,6 @@ def test_walls_bars_holes_and_hollows_are_as_wide_as_they_are(shape, width, spac
         assert cell.size_um(0.08, 0.07) == pytest.approx(
             0.3 * max(0.08 / width, 0.07 / space), rel=1e-3
         )
-
-
-def test_edges_of_one_line_do_not_cross_and_edges_that_lie_on_each_other_do():
-    assert Polygon(U).outline(0.3).area_um2 == pytest.approx(0.09 * (1 - 0.5 * 0.7))
-    with pytest.raises(CellError, match="cross"):
-        Polygon(((0, 0), (1, 0), (1, 1), (0.8, 0), (0.2, 0), (0, 1)))
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, Polygon(U, 0.3)], ids=lambda s: s.kind)
