@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -64,7 +65,9 @@ def _word(kind: Any) -> str:
         return " \\| ".join(f"`{value}`" for value in typing.get_args(kind))
     if origin in (typing.Union, types.UnionType):
         return " or ".join(
-            _word(one) for one in typing.get_args(kind) if one is not type(None)
+            _word(one)
+            for one in typing.get_args(kind)
+            if one is not type(None) and typing.get_origin(one) is not np.ndarray
         )
     if origin is tuple:
         inside = [a for a in typing.get_args(kind) if a is not Ellipsis]

@@ -63,18 +63,20 @@ def read_phase_map(shape: PhaseMap) -> PhaseSamples:
         LensError: missing or unreadable file, no pitch, not 2-D, an infinite value, or
             values that look like another unit than radians and none is stated.
     """
-    path = shape.file
-    if not path.is_file():
+    path = shape.file if isinstance(shape.file, Path) else Path("the array")
+    if path is shape.file and not path.is_file():
         raise LensError(
             f"{path}: {reading.missing_reason(path)}; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)"
         )
     ending = path.suffix.lower()
-    if ending == ".dat":
+    if path is not shape.file:
+        samples = _square(shape.file, path, shape)
+    elif ending == ".dat":
         samples = _zemax(path, shape)
     elif ending == ".npy":
         samples = _square(_npy(path, shape.variable), path, shape)
     elif ending in (".npz", ".mat"):
-        _require_pitch(path, shape.pitch_um)
+        _require_pitch(path, shape)
         arrays = read_npz(path) if ending == ".npz" else read_matlab(path)
         samples = _square(_named(path, arrays, shape.variable), path, shape)
     else:
@@ -84,18 +86,20 @@ def read_phase_map(shape: PhaseMap) -> PhaseSamples:
     return PhaseSamples(phase, samples.step_um, samples.centre_um)
 
 
-def _require_pitch(path: Path, pitch_um: float | None) -> None:
-    if pitch_um is None:
+def _require_pitch(path: Path, shape: PhaseMap) -> tuple[float, float]:
+    """Stated spacing along x and y, um."""
+    if shape.pitch_um is None:
         raise LensError(
             f"{path}: a {path.suffix.lower() or 'text'} file does not tell its spacing; give pitch_um"
         )
+    x, y = np.broadcast_to(shape.pitch_um, 2).tolist()
+    return x, y
 
 
 def _square(values: Any, path: Path, shape: PhaseMap) -> PhaseSamples:
     """Samples of a matrix with the stated spacing along x and y."""
-    _require_pitch(path, shape.pitch_um)
-    pitch_um = float(shape.pitch_um or 0)
-    return PhaseSamples(_checked(values, path, shape), (pitch_um, pitch_um))
+    steps = _require_pitch(path, shape)
+    return PhaseSamples(_checked(values, path, shape), steps)
 
 
 def _radians(samples: PhaseSamples, path: Path, shape: PhaseMap) -> Array:
@@ -275,14 +279,22 @@ def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
         shape: stated settings of the map.
 
     Raises:
-        LensError: complex, not 2-D, smaller than 2 by 2, infinite values, no finite
+        LensError: complex of several magnitudes, not 2-D, smaller than 2 by 2, infinite values, no finite
             value, or a value above the stated ``levels``.
     """
     phase = np.asarray(values)
     if phase.dtype.kind == "c":
-        raise LensError(
-            f"{path}: holds complex numbers, need real (y, x) radians: save the angle of them"
-        )
+        level = np.abs(phase[phase != 0])
+        if (
+            shape.unit
+            or shape.levels
+            or not level.max(initial=0) < 1.01 * level.min(initial=math.inf)
+        ):
+            raise LensError(
+                f"{path}: holds complex numbers, of which pillars make the phase alone; "
+                "need exp(i phase) of one magnitude, 0 where there is no data, no unit"
+            )
+        phase = np.where(phase == 0, np.nan, np.angle(phase))
     if phase.ndim != 2 or min(phase.shape) < 2 or phase.dtype.kind not in "fiu":
         raise LensError(
             f"{path}: holds {phase.dtype} of shape {phase.shape}, need real (y, x) of 2 by 2 or more"
@@ -403,7 +415,8 @@ def _is_triple(header: list[str], table: Array) -> bool:
     if header:
         return header[0][:1].lower() == "x" and header[1][:1].lower() == "y"
     x, y = np.unique(table[:, 0]), np.unique(table[:, 1])
-    return min(len(x), len(y)) > 1 and len(x) * len(y) == len(table)
+    # a round aperture fills pi / 4 of its square
+    return min(len(x), len(y)) > 1 and len(x) * len(y) <= 2 * len(table)
 
 
 def _length_scale(name: str) -> float:
@@ -445,7 +458,7 @@ def _gridded(
     phase[row, column] = table[:, 2]
     steps = float(np.ptp(x) / (len(x) - 1)), float(np.ptp(y) / (len(y) - 1))
     stated = shape.pitch_um
-    if stated is not None and max(abs(s / stated - 1) for s in steps) > EVEN_STEP:
+    if stated is not None and np.abs(np.divide(steps, stated) - 1).max() > EVEN_STEP:
         raise LensError(
             f"{path}: spacing of {steps[0]:g} x {steps[1]:g} um, but pitch_um = "
             f"{stated}; leave pitch_um out (x and y are um)"
@@ -538,7 +551,7 @@ def _zemax(path: Path, shape: PhaseMap) -> PhaseSamples:
     except ValueError as error:
         raise LensError(f"{path}: not a grid phase: {error}") from None
     stated = shape.pitch_um
-    if stated is not None and max(abs(s / stated - 1) for s in step) > SAME_STEP:
+    if stated is not None and np.abs(np.divide(step, stated) - 1).max() > SAME_STEP:
         raise LensError(
             f"{path}: spacing of {step[0]} x {step[1]} um, but pitch_um = {stated}; leave pitch_um out"
         )

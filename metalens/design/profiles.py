@@ -148,9 +148,10 @@ class PhaseMap:
     :mod:`metalens.design.phase_map`.
 
     file: its path (.npy, .npz, .mat, a Zemax grid phase .dat, else text: a matrix, or
-    rows of x, y and phase).
-    pitch_um: sampling of the map; a grid phase and rows of x, y and phase bring their
-    own. Interpolated through the phasor exp(i phase).
+    rows of x, y and phase); in Python also the array itself. Complex values stand for
+    exp(i phase), 0 for no data.
+    pitch_um: sampling of the map, or a pair along x and y; a grid phase and rows of x,
+    y and phase bring their own. Interpolated through the phasor exp(i phase).
     unit: of the phase: "rad", "deg" or "waves" (1 is 2 pi). Not stated: radians, unless
     the values look like another unit; then the map is refused.
     levels: number of levels of 2 pi, for maps of integers (256 for 8 bits).
@@ -159,8 +160,8 @@ class PhaseMap:
     conjugate: change the sign, for maps made with exp(+iwt).
     """
 
-    file: Path
-    pitch_um: float | None = None
+    file: Array | Path
+    pitch_um: float | tuple[float, float] | None = None
     add_focus: bool = False
     variable: str | None = None
     conjugate: bool = False
@@ -173,7 +174,7 @@ class PhaseMap:
                 f"levels = {self.levels}, unit = {self.unit} of the phase map: "
                 "need 2 levels or more, and no unit beside them"
             )
-        if self.pitch_um is not None and not self.pitch_um > 0:
+        if self.pitch_um is not None and not np.min(self.pitch_um) > 0:
             raise ConfigError(
                 f"pitch_um = {self.pitch_um} of the phase map: need a length above 0"
             )

@@ -133,7 +133,7 @@ def test_map_with_focus_from_csv(proxy, tmp_path):
     [
         (np.full((4, 4), np.nan), "row 0, column 0 is nan"),
         (np.zeros(5), r"shape \(5,\)"),
-        (np.zeros((4, 4), complex), "need real"),
+        (np.outer([1, 1, 1, 1j], [1, 2, 1, 1]), "phase alone"),
         (np.tile([0.0, np.pi], (40, 20)), "finer pitch"),
         (np.zeros((4, 4)), "less than the aperture"),
     ],

@@ -126,6 +126,37 @@ def test_points_without_data_matter_inside_the_aperture_alone(tmp_path):
         phase_map.interpolate_phase(samples, x - 5, x - 2, radius_um=60.0)
 
 
+@pytest.mark.parametrize("kind", ["rad", "complex"])
+def test_arrays_in_memory_have_a_step_for_each_axis(kind):
+    values = PHASE if kind == "rad" else 0.7 * np.exp(1j * PHASE)
+    samples = phase_map.read_phase_map(PhaseMap(values, (STEP, 3 * STEP)))
+    assert samples.step_um == (STEP, 3 * STEP)
+    turn = np.exp(1j * (samples.phase_rad - PHASE))
+    assert turn == pytest.approx(np.ones(PHASE.shape))
+    x, y = X[4:6], 3 * Y[9:11]
+    phase = phase_map.interpolate_phase(samples, x, y)
+    assert np.exp(1j * phase) == pytest.approx(np.exp(1j * PHASE[9:11, 4:6]))
+
+
+def test_magnitudes_that_pillars_do_not_make_are_refused():
+    with pytest.raises(LensError, match="phase alone"):
+        phase_map.read_phase_map(PhaseMap(np.exp(1j * PHASE) * (2 + X / 50), STEP))
+    hole = np.exp(1j * PHASE)
+    hole[3, 5] = 0
+    samples = phase_map.read_phase_map(PhaseMap(hole, STEP))
+    assert np.argwhere(np.isnan(samples.phase_rad)).tolist() == [[3, 5]]
+
+
+def test_rows_of_x_y_phase_may_fill_a_round_aperture_alone(tmp_path):
+    inside = np.hypot(X / X[-1], Y[:, None] / Y[-1]) <= 1.01
+    y, x = np.broadcast_arrays(Y[:, None], X)
+    np.savetxt(tmp_path / "m.txt", np.stack([x, y, PHASE], 2)[inside])
+    samples = phase_map.read_phase_map(PhaseMap(tmp_path / "m.txt"))
+    assert np.array_equal(np.isfinite(samples.phase_rad), inside)
+    assert samples.phase_rad[inside] == pytest.approx(PHASE[inside])
+    assert samples.step_um == pytest.approx((STEP, STEP))
+
+
 def test_conjugate_turns_the_sign(tmp_path):
     path = write(tmp_path, "npy")
     assert phase_map.read_phase_map(
