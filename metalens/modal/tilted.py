@@ -8,12 +8,7 @@ import numpy as np
 
 from metalens.cell import Cell, Incidence, Response
 from metalens.core.arrays import Array
-from metalens.rcwa import (
-    CellProblem,
-    choose_stage_count,
-    problem_of_light,
-    solve_problem,
-)
+from metalens.rcwa import CellProblem, problem_of_light, solve_problem
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4
@@ -43,7 +38,7 @@ def solve_tilted(
 
     Returns:
         Mean of four truncations. ``t_error`` is the sum of the largest difference from
-        it, half the misfit of (1), and the errors of modal solves and collocation.
+        it, half the misfit of (1), and the errors of modal solves and staircases.
 
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
@@ -56,14 +51,11 @@ def solve_tilted(
     anchors = [upright(plain, d, max(SHARE * tolerance, 2e-6)) for d in nodes.tolist()]
     modal_amplitudes = np.array([(anchor.t, anchor.r) for anchor in anchors])
     bare = [problem_of_light(plain, d, light) for d in nodes.tolist()]
-    stages, collocation_error = choose_stage_count(
-        lambda count: solve_problem(problem, REACHES[0], count).both, tolerance
-    )
     results, unexplained = [], []
     for reach in REACHES:
         shift, misfit = _fit_shift(bare, nodes, modal_amplitudes, reach)
         shifted = dataclasses.replace(problem, shift=shift)
-        truncation = solve_problem(shifted, reach, stages)
+        truncation = solve_problem(shifted, reach, SHARE / 2 * tolerance)
         results.append((*truncation.both[:, column, column], truncation.energy[column]))
         unexplained.append(misfit)
         if len(results) < COMPARED:
@@ -74,7 +66,7 @@ def solve_tilted(
             np.abs(last[:, :2] - (t, r)).max()
             + UNEXPLAINED * np.mean(unexplained[-COMPARED:])
             + max(anchor.t_error for anchor in anchors)
-            + collocation_error
+            + truncation.wall_error
         )
         if error <= tolerance:
             break
@@ -109,7 +101,7 @@ def _fit_shift(
         for problem, width in zip(bare, shift.tolist(), strict=True):
             moved = dataclasses.replace(problem, size_um=problem.size_um + width)
             column = problem.columns[0]
-            responses.append(solve_problem(moved, reach, 0).both[:, column, column])
+            responses.append(solve_problem(moved, reach).both[:, column, column])
         return np.array(responses)
 
     shift = np.zeros(len(nodes))

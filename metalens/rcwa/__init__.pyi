@@ -4,7 +4,6 @@ from .fields import near_field as near_field
 from .fields import near_fields as near_fields
 from .reference import OrderResponse as OrderResponse
 from .reference import solve_textbook_rcwa as solve_textbook_rcwa
-from .sidewall import choose_stage_count as choose_stage_count
 from .sidewall import staircase_layers as staircase_layers
 from .solver import SAFETY as SAFETY
 from .solver import CellProblem as CellProblem

@@ -2,7 +2,6 @@
 patterned layers, matched without growing exponentials.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -113,16 +112,8 @@ class TangentialFields:
     down: list[Array]
 
 
-Matcher = Callable[[Pair, Pair, Array], TangentialFields]
-
-
 def scatter_zero_order(
-    waves: PlaneWaves,
-    media: StackMedia,
-    layers: list[FourierModes],
-    zero: int,
-    *,
-    match: Matcher | None = None,
+    waves: PlaneWaves, media: StackMedia, layers: list[FourierModes], zero: int
 ) -> ScatteredAmplitudes:
     """Transmitted and reflected orders of a stack for the zero order from the
     substrate.
@@ -131,8 +122,6 @@ def scatter_zero_order(
         waves: of the basis. media: half-spaces, films and heights.
         layers: modes of the patterned layers, foot first; none: a stack of films.
         zero: place of the incident wave.
-        match: function that matches the fields in place of the layers, of the pairs
-            above and below and the source.
     """
     below = half_space(waves, media.substrate)
     above = half_space(waves, media.cover)
@@ -140,11 +129,7 @@ def scatter_zero_order(
     foot, decay_below = _through_films(waves, below, media.under)
     source = np.zeros(len(waves.kappa), complex)
     source[zero] = 2 * below[0][zero] * below[1][zero] * decay_below[zero]
-    fields = (
-        match(top, foot, source)
-        if match
-        else match_layers(layers, media.heights, top, foot, source)
-    )
+    fields = match_layers(layers, media.heights, top, foot, source)
     incident = power_flux(below)[zero]
     t = outgoing_amplitudes(top, fields.u_top, fields.w_top) * decay_above
     r = _reflected(waves, media, foot, decay_below, fields, zero)

@@ -3,7 +3,6 @@ truncations until the error estimate meets a tolerance.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,22 +27,14 @@ from metalens.rcwa.basis import (
     HALF_TURN,
     IDENTITY,
     Operation,
-    PlaneWaves,
-    ReducedOrders,
     TangentialWave,
     lattice_frame,
     plane_waves,
     reduced_orders,
     tangential_wave,
 )
-from metalens.rcwa.permittivity import PillarSection, pillar_section, section_operators
-from metalens.rcwa.sidewall import (
-    choose_stage_count,
-    match_walls,
-    sections_with_growth,
-    wall_sections,
-    width_slope,
-)
+from metalens.rcwa.permittivity import pillar_section, section_operators
+from metalens.rcwa.sidewall import sections_with_growth, staircase_layers, width_slope
 from metalens.rcwa.smatrix import StackMedia, scatter_zero_order, solve_eigenmodes
 
 _ROUNDING = 1e-13
@@ -52,13 +43,14 @@ _STRAIGHT = 1e-15  # cos or sin of an azimuth in a mirror plane, to rounding
 # narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
 _FIRST = 3  # harmonics of the first truncation where four are compared
 _LAST = {4: 15, 2: 11, 1: 9}  # by the number of symmetry operations: about a second
-_LAST_TILTED = {4: 10, 2: 7, 1: 6}  # collocation costs a hundred times as much
+_LAST_TILTED = {4: 10, 2: 7, 1: 6}  # some thirty layers in place of one
 _COMPARED, MOST_COMPARED = 4, 6
 _OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow width
 NARROWEST = 0.02  # of the pitch: widths and gaps below it no truncation resolves
 _TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
 SAFETY = 7.0
-_COARSE = 3  # harmonics that suffice to choose the collocation of a tilted wall
+WALL_SHARE = 0.1  # of the tolerance, for the staircases of a tilted wall
+STEPS = (4, 6, 8, 12, 16, 24)  # of the staircases from which a wall is extrapolated
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,10 +107,13 @@ class CellProblem:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TruncatedSolution:
-    """Solution at one truncation: both: (2, 2, 2) t and r; energy: (2,)."""
+    """Solution at one truncation: both: (2, 2, 2) t and r; energy: (2,); wall_error:
+    of both, by the staircases of a tilted wall.
+    """
 
     both: Array
     energy: Array
+    wall_error: float = 0.0
 
 
 def cell_problem(
@@ -364,7 +359,7 @@ def jones(
 
     Accuracy: ``t_error`` is 3 (from 13 harmonics on) to 7 times the largest change from
         the four truncations before the last (six where pillar or gap is narrow), and
-        what the collocation of a tilted wall leaves. Corners and high contrast converge
+        what the staircases of a tilted wall leave. Corners and high contrast converge
         slowly: 1e-2 is usual.
     """
     check_tolerance(tolerance)
@@ -380,7 +375,6 @@ def solve_truncation(
     harmonics: int,
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
-    stages: int = 6,
     normals_of: tuple[Cell, float] | None = None,
 ) -> JonesResponse:
     """Jones matrices at one truncation, without an error estimate.
@@ -388,9 +382,8 @@ def solve_truncation(
     Args:
         cell, size_um, wavelength_um, angle_rad, azimuth_rad: as for :func:`jones`.
         harmonics: of the truncation.
-        stages: Gauss points of each panel of a tilted wall.
-        normals_of: cell and size with as many sections, whose normal field is taken.
-            Between pillars that differ little it cancels the noise of the sampling; the
+        normals_of: upright cell and size with as many sections, whose normal field is
+            taken. Between pillars that differ little it cancels the noise of the sampling; the
             limit of many harmonics is the same.
     """
     problem = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
@@ -401,7 +394,7 @@ def solve_truncation(
             for layer in other.sections
         )
         problem = dataclasses.replace(problem, normals=normals)
-    truncation = solve_problem(problem, harmonics, stages if cell.sidewall_rad else 0)
+    truncation = solve_problem(problem, harmonics)
     return _response(problem, harmonics, truncation, math.inf, False, "one truncation")
 
 
@@ -419,14 +412,13 @@ class TruncationSequence:
 
 
 def truncation_sequence(
-    problem: CellProblem, harmonics: int | None, *, tilted: bool = False
+    problem: CellProblem, harmonics: int | None
 ) -> TruncationSequence:
     """Truncations of one cell and light.
 
     Args:
         problem: cell and light.
         harmonics: the largest truncation; None: one that takes about a second.
-        tilted: whether walls are collocated.
 
     Raises:
         CellError: less than one harmonic.
@@ -448,7 +440,7 @@ def truncation_sequence(
         *(compared_truncations(max(float(span), NARROWEST)) for span in spans),
     )
     last = (
-        _largest_truncation(problem.classes, tilted) if harmonics is None else harmonics
+        _largest_truncation(cell, problem.classes) if harmonics is None else harmonics
     )
     first = _FIRST + _COMPARED if harmonics is None else harmonics
     thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST)
@@ -483,7 +475,7 @@ def _refine(
     """Jones matrices of the first truncation that meets the tolerance, or the last.
 
     A homogeneous cell is solved as a stack of films. The error is that of the
-    collocation of tilted walls plus :func:`estimate_error`. While the orders do not
+    staircases of tilted walls plus :func:`estimate_error`. While the orders do not
     resolve the pillar, it is at least the pillar's whole effect.
 
     Args:
@@ -491,24 +483,17 @@ def _refine(
         tolerance: of t and r.
         harmonics: the largest truncation; None: one that takes about a second.
     """
-    tilted = bool(problem.cell.sidewall_rad)
-    sequence = truncation_sequence(problem, harmonics, tilted=tilted)
+    sequence = truncation_sequence(problem, harmonics)
     film = _film_response(problem)
     if _is_homogeneous(problem):
         k0 = 2 * math.pi / problem.light.wavelength_um
         rounding = _ROUNDING * (1 + k0 * problem.cell.height_um)
         return _response(problem, 0, film, rounding, True, "a homogeneous layer: exact")
-    stages, collocation_error = 0, 0.0
-    if tilted:
-        coarse = min(sequence.reaches[-1], _COARSE)
-        stages, collocation_error = choose_stage_count(
-            lambda count: solve_problem(problem, coarse, count).both, tolerance
-        )
     history: list[Array] = []
     for reach in sequence.reaches:
-        truncation = solve_problem(problem, reach, stages)
+        truncation = solve_problem(problem, reach, WALL_SHARE * tolerance)
         history.append(truncation.both)
-        error = collocation_error + sequence.factor * estimate_error(
+        error = truncation.wall_error + sequence.factor * estimate_error(
             history, reach, sequence.compared
         )
         if reach * problem.size_um < problem.cell.pitch_um:
@@ -565,18 +550,14 @@ def most_harmonics(
         cell, size_um: the pillar. angle_rad, azimuth_rad: direction of the light.
     """
     light = tangential_wave(1.0, angle_rad, azimuth_rad)
-    return _largest_truncation(
-        symmetry_classes(cell, size_um, light), bool(cell.sidewall_rad)
-    )
+    return _largest_truncation(cell, symmetry_classes(cell, size_um, light))
 
 
-def _largest_truncation(
-    classes: tuple[tuple[Operation, ...], ...], tilted: bool
-) -> int:
+def _largest_truncation(cell: Cell, classes: tuple[tuple[Operation, ...], ...]) -> int:
     """Harmonics of the largest automatic truncation, by the least number of symmetry
     operations of a class.
     """
-    table = _LAST_TILTED if tilted else _LAST
+    table = _LAST_TILTED if cell.sidewall_rad else _LAST
     return table[min(len(operations) for operations in classes)]
 
 
@@ -593,60 +574,81 @@ def _is_square(problem: CellProblem) -> bool:
     )
 
 
-def solve_problem(problem: CellProblem, reach: int, stages: int) -> TruncatedSolution:
+def solve_problem(
+    problem: CellProblem, reach: int, tolerance: float = 0.0
+) -> TruncatedSolution:
     """t and r of the problem's polarisations at one truncation.
 
-    Each symmetry class is solved by itself: modes of its layers (collocation for tilted
-    walls), then the scattering of every incident polarisation that it holds.
+    A tilted wall is a staircase. Its error is a series in 1 / steps^2, from which
+    Richardson's extrapolation takes one term for each further number of steps. The last
+    change is the error.
 
     Args:
         problem: cell and light. reach: harmonics.
-        stages: Gauss points of a tilted wall, 0 for an upright one.
+        tolerance: of the wall; 0: all of ``STEPS``.
+    """
+    row: list[Array] = []  # extrapolated amplitudes, of rising order
+    for i, steps in enumerate(STEPS if problem.cell.sidewall_rad else (1,)):
+        previous, row = row, [_solve_staircase(problem, reach, steps)]
+        for k, coarser in enumerate(previous):
+            ratio = (steps / STEPS[i - 1 - k]) ** 2
+            row.append(row[-1] + (row[-1] - coarser) / (ratio - 1))
+        error = float(np.abs(row[-1] - previous[-1])[:2].max()) if previous else 0.0
+        if previous and error <= tolerance:
+            break
+    return TruncatedSolution(row[-1][:2], row[-1][2].diagonal().real, error)
+
+
+def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
+    """(3, 2, 2) t, r and the energies on a diagonal, of a pillar whose tilted sections
+    are cut into ``steps`` upright ones, at ``reach`` harmonics.
+
+    Each symmetry class is solved by itself: modes of its layers, then the scattering of
+    every incident polarisation that it holds.
     """
     cell, size_um, light = problem.cell, problem.size_um, problem.light
-    both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
+    amplitudes = np.zeros((3, 2, 2), complex)
     square = problem.columns == (0, 1) and _is_square(problem)
     columns = (0,) if square else problem.columns
+    layers = staircase_layers(cell, steps)
+    sections = [
+        pillar_section(
+            cell,
+            layer,
+            size_um,
+            light.wavelength_um,
+            grow_um=problem.shift(size_um + layer.grow_um) if problem.shift else 0.0,
+        )
+        for layer in layers
+    ]
+    normals = problem.normals or [section.outlines for section in sections]
+    k0 = 2 * math.pi / light.wavelength_um
+    heights = tuple(k0 * layer.height_um for layer in layers)
+    media = dataclasses.replace(problem.media, heights=heights)
+    symmetric = cell.outline(size_um).keeps(-1, -1)
     for operations in problem.classes:
         space = reduced_orders(reach, lattice_frame(cell, operations))
         waves = plane_waves(space, cell, light)
         if not set(columns) & set(waves.zero):
             continue
-
-        def operators(
-            section: PillarSection,
-            number: int,
-            space: ReducedOrders = space,
-            waves: PlaneWaves = waves,
-        ) -> tuple[Array, Array]:
-            normals = problem.normals[number] if problem.normals else None
-            return section_operators(space, waves, section, cell, normals=normals)
-
-        walls = wall_sections(
-            cell, size_um, light.wavelength_um, operators, problem.shift
-        )
-        media, layers, match = problem.media, [], None
-        if stages:
-            match = functools.partial(match_walls, walls, stages=stages)
-        else:
-            symmetric = cell.outline(size_um).keeps(-1, -1)
-            layers = [
-                solve_eigenmodes(*wall.sample(0.5), symmetric=symmetric)
-                for wall in walls
-            ]
-            heights = tuple(wall.reduced_height for wall in walls)
-            media = dataclasses.replace(media, heights=heights)
+        modes = [
+            solve_eigenmodes(
+                *section_operators(space, waves, section, cell, normals=outlines),
+                symmetric=symmetric,
+            )
+            for section, outlines in zip(sections, normals, strict=True)
+        ]
         for column, (incident, sign) in waves.zero.items():
             if column not in columns:
                 continue
-            scattered = scatter_zero_order(waves, media, layers, incident, match=match)
-            energy[column] = scattered.energy
+            scattered = scatter_zero_order(waves, media, modes, incident)
+            amplitudes[2, column, column] = scattered.energy
             for row, (leaving, row_sign) in waves.zero.items():
-                both[0, row, column] = sign * row_sign * scattered.t[leaving]
-                both[1, row, column] = sign * row_sign * scattered.r[leaving]
+                pair = scattered.t[leaving], scattered.r[leaving]
+                amplitudes[:2, row, column] = sign * row_sign * np.array(pair)
     if square:
-        both[:, 1, 1], energy[1] = both[:, 0, 0], energy[0]
-    return TruncatedSolution(both, energy)
+        amplitudes[:, 1, 1] = amplitudes[:, 0, 0]
+    return amplitudes
 
 
 def _film_response(problem: CellProblem) -> TruncatedSolution:
