@@ -399,12 +399,10 @@ def test_tilted_wall_is_the_limit_of_plain_slices(tilt_deg):
     cell = replace(CELL, sidewall_rad=math.radians(tilt_deg))
     coarse, fine = (plain_slices(cell, 0.15, 3, slices) for slices in (32, 64))
     limit = fine + (fine - coarse) / 3  # second order, Richardson: 1e-6 left
-    t = {stages: truncation(cell, 0.15, 3, stages=stages)[0] for stages in (4, 5, 6)}
-    assert abs(t[6] - limit) < 1e-5
-    assert abs(t[5] - t[6]) < 0.1 * abs(t[4] - t[5])  # order 2 m: a thousandth or so
+    assert abs(truncation(cell, 0.15, 3)[0] - limit) < 1e-5
     got = amplitude(cell, 0.15, harmonics=5)
     assert abs(got.t - amplitude(CELL, 0.15, harmonics=5).t) > 1e-3
-    assert abs(got.energy - 1) < 10 * ROUNDING  # forty collocation steps
+    assert abs(got.energy - 1) < 10 * ROUNDING  # seventy upright layers
 
 
 @pytest.mark.parametrize(
