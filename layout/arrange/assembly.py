@@ -2,19 +2,18 @@
 wafer of dies.
 """
 
-import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.arrange.parts import UNIT_NM, DieComponent
-from layout.arrange.record import PartInstances
+from layout.arrange.parts import UNIT_NM, DieComponent, moved_cell
+from layout.arrange.record import Placement
 from layout.formats import job_files
 from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
 from layout.mask.fields import FieldPlan
 from layout.process.process import LayerNumber
-from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
@@ -28,14 +27,14 @@ class PartPlacement:
     """A part and where it stands on the die."""
 
     part: DieComponent
-    at: tuple[PartInstances, ...]
+    at: tuple[Placement, ...]
 
-    def copies(self) -> tuple[CellReference, ...]:
-        """As arrays of its cell, in database units."""
-        return tuple(_copies(self.part.name, at) for at in self.at)
+    def copies(self, top: str) -> tuple[CellReference, ...]:
+        """As arrays of its cell ``top``, in database units."""
+        return tuple(_copies(top, at) for at in self.at)
 
 
-def _copies(child: str, at: PartInstances) -> CellReference:
+def _copies(child: str, at: Placement) -> CellReference:
     """An array of a cell at a place of the die, in database units."""
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
     step = (
@@ -164,24 +163,30 @@ def _joined(
 def _take(
     placed: PartPlacement, layers: JobLayers, cells: dict[str, MaskCell]
 ) -> tuple[CellReference, ...]:
-    """Copy the cells of a part into the mask, on the layers of the job.
+    """Copy the cells of a part into the mask, renamed where a name is in use.
 
     Args:
         placed: the part and its places.
-        layers: of the job; receives those of the part.
-        cells: of the mask; receives those of the part.
+        layers: of the whole mask; receives those of the part.
+        cells: of the whole mask; receives those of the part.
+
+    Returns:
+        References to the top cell of the part.
     """
-    numbers = layers.take(placed.part.library)
-    for name, cell in placed.part.library.cells.items():
-        if name in cells:
-            raise ProcessError(
-                f"two cells are named {name!r}; rename {placed.part.name!r}"
-            )
-        polygons: dict[LayerNumber, list[Array]] = {}
-        for layer, shapes in cell.polygons.items():
-            polygons.setdefault(numbers.get(layer, layer), []).extend(shapes)
-        cells[name] = dataclasses.replace(cell, polygons=polygons)
-    return placed.copies()
+    part = placed.part
+    numbers = layers.take(part.library)
+    new_names: dict[str, str] = {}
+    for name in part.library.cells:
+        taken = {*cells, *new_names.values()}
+        candidates = (f"{name}_{n}" for n in itertools.count(2))
+        new_names[name] = (
+            name
+            if name not in taken
+            else next(candidate for candidate in candidates if candidate not in taken)
+        )
+    for cell in part.library.cells.values():
+        cells[new_names[cell.name]] = moved_cell(cell, new_names, numbers)
+    return placed.copies(new_names[part.top])
 
 
 # write fields
@@ -204,7 +209,7 @@ def place_fields(
             continue
         steps = job_files.field_sequence(splits[part_placement.part.name])
         centres = np.array([(step.x_um, step.y_um) for step in steps])
-        for copies in part_placement.copies():
+        for copies in part_placement.copies(part_placement.part.top):
             if not copies.turn.quarter:
                 continue
             is_level = copies.turn.angle_deg % 180 == 0
@@ -238,5 +243,5 @@ def without_fields(
         one.part.name
         for one in placed
         if one.part.name in splits
-        and not all(copies.turn.quarter for copies in one.copies())
+        and not all(copies.turn.quarter for copies in one.copies(one.part.top))
     ]

@@ -1,4 +1,6 @@
-"""What stands on a die and on a wafer, as ARRANGEMENT.toml says it."""
+"""What stands on a die and on a wafer, as ARRANGEMENT.toml says it: lenses, cells of
+other files, a raster of dies.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -11,10 +13,10 @@ MOST_DIES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class PartInstances:
-    """Where a lens is placed, once or as an array.
+class Placement:
+    """Where a lens or cell is placed, once or as an array.
 
-    x_um, y_um: of its axis; of the first one of an array.
+    x_um, y_um: of its origin (the axis of a lens); of the first one of an array.
     turn_deg: counter-clockwise. mirrored: at the x axis, before the turn (turns a
     lens's circular handedness too).
     columns, rows: of an array. step_um: (x, y) from one to the next; needed where there
@@ -62,10 +64,37 @@ class LensPart:
     file: Path
     name: str
     furnished: bool | None = None
-    at: tuple[PartInstances, ...] = (PartInstances(),)
+    at: tuple[Placement, ...] = (Placement(),)
 
     def __post_init__(self) -> None:
         _named(self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class CellPart:
+    """A cell of a GDSII or OASIS file made elsewhere.
+
+    file: beside the arrangement. cell: what is placed, with all below it; left out: the
+    file's only top cell.
+    name: of the part in reports. relative_dose: of its layers, where no doses.csv of
+    these lies beside the file; a single dose is no proximity correction.
+    checked: whether its design rules are checked; where not, every verdict says so.
+    at: where it stands; left out: once, at (0, 0).
+    """
+
+    file: Path
+    name: str
+    cell: str = ""
+    relative_dose: float = field(default=1.0, metadata={"above": 0})
+    checked: bool = True
+    at: tuple[Placement, ...] = (Placement(),)
+
+    def __post_init__(self) -> None:
+        _named(self.name)
+        if not 0 < self.relative_dose < 1e6:
+            raise ProcessError(
+                f"relative_dose = {self.relative_dose}: need a finite dose above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,27 +178,37 @@ class WaferSettings:
 
 @dataclass(frozen=True, slots=True)
 class DieFloorplan:
-    """Lenses on a die, the die alone or on a wafer.
+    """Lenses and cells on a die, the die alone or on a wafer.
 
     name: of the top cell; ``NAME_DIE`` is the die on a wafer.
-    lens: what stands on the die. die: furniture for all lenses together. wafer:
+    lens, cell: what stands on the die. die: furniture for all lenses together. wafer:
     step and repeat of the die.
     """
 
     name: str = "ARRANGED"
     lens: tuple[LensPart, ...] = ()
+    cell: tuple[CellPart, ...] = ()
     die: FrameSettings | None = None
     wafer: WaferSettings | None = None
 
     def __post_init__(self) -> None:
         """Refuse an empty floorplan, and names used twice."""
         _named(self.name)
-        if not self.lens:
-            raise ProcessError("nothing to arrange: need a [[lens]]")
-        used_names = [self.name, *(part.name for part in self.lens)]
+        if not self.lens and not self.cell:
+            raise ProcessError("nothing to arrange: need a [[lens]] or a [[cell]]")
+        if self.die is not None and not self.lens:
+            raise ProcessError(
+                "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
+            )
+        used_names = [self.name, *(part.name for part in self.parts)]
         if self.die is not None:
             used_names.append("DIE")
         names.check_distinct_names(used_names)
+
+    @property
+    def parts(self) -> list[LensPart | CellPart]:
+        """Lenses, then cells."""
+        return [*self.lens, *self.cell]
 
     def furnished(self, part: LensPart) -> bool:
         """Whether a lens brings marks, label and test structures of its own."""

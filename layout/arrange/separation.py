@@ -10,7 +10,7 @@ import numpy as np
 
 from layout.arrange.assembly import PER_UM, PartPlacement
 from layout.arrange.parts import APERTURE, DieComponent, box_around
-from layout.drc.report import RuleViolation
+from layout.drc.report import Violation
 from layout.formats.library import CellReference, Orientation
 from layout.pec import psf
 from layout.process.process import Process
@@ -75,7 +75,7 @@ def reach_um(process: Process) -> float:
 
 def check_separation(
     placed: Sequence[PartPlacement], process: Process
-) -> list[RuleViolation]:
+) -> list[Violation]:
     """Pairs of parts closer than the gap rule, or in reach of scattered electrons.
 
     Rectilinear shapes are taken as they are. A lattice is taken as boxes of tiles (a
@@ -96,7 +96,7 @@ def check_separation(
     gap = process.rules.minimum_gap_nm * PER_UM / 1e3
     reach = reach_um(process) * PER_UM
     boxes = np.array([first.box() for first in standing])
-    violations: list[RuleViolation] = []
+    violations: list[Violation] = []
     for i, first in enumerate(standing):
         for j in np.flatnonzero(
             box_distance(boxes[i + 1 :], boxes[i]) < max(gap, reach)
@@ -132,7 +132,7 @@ def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
         ProcessError: more than 4000 copies of a part.
     """
     for placing in placed:
-        for copies in placing.copies():
+        for copies in placing.copies(placing.part.top):
             yield from _each(placing.part, copies)
 
 
@@ -152,7 +152,7 @@ def _between(
     gap: float,
     scattered: float,
     process: Process,
-) -> Iterator[RuleViolation]:
+) -> Iterator[Violation]:
     """Violations between two parts: the closest boxes of each common exposure.
 
     Args:
@@ -186,6 +186,6 @@ def _between(
         else:
             limit_nm = limit_units * 1e3 / PER_UM
             text = f"{part_1.text} to {part_2.text}: backscatter of one that the doses of the other do not know of"
-        yield RuleViolation(
+        yield Violation(
             "clearance", (left, bottom, right, top), distance_nm, limit_nm, text
         )

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import assembly, parts, separation, wafer
-from layout.arrange.record import DieFloorplan, PartInstances, WaferSettings
+from layout.arrange.record import CellPart, DieFloorplan, Placement, WaferSettings
 from layout.commands import make, page
 from layout.commands.job import FloorplanWork, Options, StageTimes
 from layout.drc.klayout import write_lyp
 from layout.drc.lattice import check_plan
+from layout.drc.library import check_library
 from layout.formats import compare, gdsii_write, job_files, oasis_write
+from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, library_of
 from layout.formats.reading import read_mask
 from layout.mask import build
@@ -25,8 +27,8 @@ from layout.process import process as processes
 from layout.process.jit import announce_compilation
 from layout.process.process import LayerNumber
 from layout.verify.exposure import verify_exposure
-from metalens.core import config, store
-from metalens.core.errors import ProcessError
+from metalens.core import config, reading, store
+from metalens.core.errors import MaskFileError, ProcessError
 
 _LISTED = 12  # spaces between parts that are listed one by one
 
@@ -39,7 +41,7 @@ def run(options: Options) -> int:
         options: of the command.
     """
     record = config.load(options.lens, DieFloorplan)
-    named = [part.file for part in record.lens]
+    named = [part.file for part in record.parts]
     process = (
         processes.Process()
         if options.process is None
@@ -69,12 +71,12 @@ def _refuse_negative(work: FloorplanWork) -> None:
     """
     record = work.record
     size = work.record.wafer
-    alone = all(record.furnished(part) for part in record.lens)
+    alone = all(record.furnished(part) for part in record.lens) and not record.cell
     alone &= record.die is None and not (size and size.marks)
     if work.process.tone == "negative" and not alone:
         raise ProcessError(
             "tone = 'negative' draws the die around each lens: need lenses that are "
-            "furnished, and no [die] or wafer.marks"
+            "furnished, and no [die], [[cell]] or wafer.marks"
         )
 
 
@@ -87,11 +89,11 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
         wafer.refuse_marks_off(record.wafer)
     work.placed, marks = _parts(work)
     with work.stages("room between parts"):
-        near = separation.check_separation(work.placed, work.process)
+        work.near = separation.check_separation(work.placed, work.process)
     spaces = [
         f"{violation.text}: {violation.value / 1e3:.3f} um apart, "
         f"need {violation.limit / 1e3:.4g}"
-        for violation in near
+        for violation in work.near
     ]
     unlisted = len(spaces) - _LISTED
     work.failures += spaces[:_LISTED] + ([f"{unlisted} more"] if unlisted > 0 else [])
@@ -112,6 +114,7 @@ def _parts(
     record = work.record
     process = work.process
     size = work.record.wafer
+    files = [assembly.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
     drawings = []
     for part in record.lens:
         path = work.options.lens.parent / part.file
@@ -127,7 +130,10 @@ def _parts(
             )
             for part, plan in zip(record.lens, plans, strict=True)
         ]
-        box = separation.extent_of_copies(sketches, exposed=True) / assembly.PER_UM
+        box = (
+            separation.extent_of_copies([*sketches, *files], exposed=True)
+            / assembly.PER_UM
+        )
         plans.append(
             build.die_surroundings(
                 drawings[0].source,
@@ -159,9 +165,10 @@ def _parts(
             record.lens, drawings, solved_plans, strict=False
         )
     ]
+    placed += files
     if record.die is not None:
         around = _frame_part(work, solved_plans[-1][0])
-        placed.append(assembly.PartPlacement(around, (PartInstances(),)))
+        placed.append(assembly.PartPlacement(around, (Placement(),)))
     return placed, mark
 
 
@@ -199,6 +206,66 @@ def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
     return parts.of_plan(name, plan, process, corrected=work.corrected)
 
 
+def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
+    """A cell of a mask file as a part of the die, checked and with its doses.
+
+    Args:
+        work: of the command; receives notes and failures.
+        part: file, cell and relative dose.
+
+    Raises:
+        MaskFileError: the file is missing, too large or cannot be read.
+    """
+    path = work.options.lens.parent / part.file
+    if not path.is_file():
+        raise MaskFileError(
+            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
+        )
+    limit = placement_limit(path)
+    content = read_mask(path, limit)
+    content.refuse_beyond(limit)
+    component = parts.of_file(
+        part.name,
+        path,
+        content,
+        work.process,
+        cell=part.cell,
+        relative_dose=part.relative_dose,
+    )
+    text_count = component.library.skipped["text"]
+    for number, kind in (
+        (text_count, "texts"),
+        (component.empty, "shapes without area"),
+    ):
+        if number:
+            work.notes.append(
+                f"{number} {kind} of {path.name} are left out: they draw nothing"
+            )
+    if part.checked:
+        layers = work.process.layers
+        skip = {layers.outline[0], layers.fields[0]}
+        drawn = {number for number, _ in component.library.layers}
+        with work.stages(f"{part.name}: check"):
+            chosen = [(number, None) for number in sorted(drawn - skip)]
+            report = check_library(component.library, work.process.rules, layers=chosen)
+        work.judge_rules(part.name, report)
+    else:
+        work.unchecked.append(part.name)
+    if work.corrected and component.uncorrected:
+        names = ", ".join(f"{a}/{b}" for a, b in list(component.uncorrected)[:8])
+        doses = sorted(
+            {component.library.doses[layer] for layer in component.uncorrected}
+        )
+        work.failures.append(
+            f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names}"
+            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the "
+            f"relative dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+            "correction; correct the file and lay its doses.csv beside it, or set "
+            "exposure.correct = false"
+        )
+    return component
+
+
 def _stepped(
     work: FloorplanWork,
     size: WaferSettings,
@@ -231,9 +298,7 @@ def _stepped(
     box_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
     steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=assembly.PER_UM)
-    at = tuple(
-        PartInstances(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks
-    )
+    at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
     marks = None if mark is None else assembly.PartPlacement(mark, at)
     return assembly.wafer_cell(work.record.name, die, steps, marks)
 
@@ -255,7 +320,7 @@ def _write(work: FloorplanWork, library: MaskLibrary) -> None:
         work.failures += [
             f"{name} does not read back as planned: {text}" for text in differences
         ]
-        work.read_back[name] = "; ".join(differences) or "as planned"
+        work.different |= {name} if differences else set()
         work.written[name] = path.stat().st_size
 
 
@@ -304,6 +369,7 @@ def _values(work: FloorplanWork, library: MaskLibrary) -> dict[str, Any]:
         "ok": not work.failures,
         "failures": work.failures,
         "notes": work.notes,
+        "unchecked": work.unchecked,
         "charge_uC": job_files.charge_uC(work.areas_um2, library.doses, work.process),
         "dies": 1 if work.dies is None else len(work.dies.index),
         "cells": len(library.cells),
@@ -335,7 +401,7 @@ def _sheet(work: FloorplanWork, library: MaskLibrary, fields: int) -> list[str]:
         "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; "
         "+y up):",
     ]
-    for part in work.record.lens:
+    for part in work.record.parts:
         for at in part.at:
             copies = at.columns * at.rows
             many = f", {at.columns} x {at.rows} copies" if copies > 1 else ""
@@ -372,7 +438,7 @@ def _sheet(work: FloorplanWork, library: MaskLibrary, fields: int) -> list[str]:
 def _text(work: FloorplanWork, library: MaskLibrary) -> str:
     """Summary for a person: verdict, notes, files and time."""
     target = work.options.output
-    lines = [] if work.failures else [work.verdict]
+    lines = [] if work.failures and not work.unchecked else [work.verdict]
     lines += work.notes
     lines += [
         f"  {target / name}: {size / 1e6:.3g} MB, read back"

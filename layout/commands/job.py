@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import tyro
 
 from layout.arrange import assembly, wafer
 from layout.arrange.record import DieFloorplan
-from layout.drc.report import DrcReport
+from layout.drc.report import DrcReport, Violation
 from layout.formats import compare, job_files
 from layout.formats.dxf import DxfWindow
 from layout.mask import build
@@ -199,7 +199,11 @@ class LayoutJob:
     @property
     def verdict(self) -> str:
         """First line of everything that tells about the mask."""
-        return _verdict(self.failures)
+        return (
+            "FAILS: " + "; ".join(self.failures)
+            if self.failures
+            else "The mask passes its own checks."
+        )
 
 
 @dataclass(eq=False, slots=True)
@@ -208,14 +212,16 @@ class FloorplanWork:
 
     failures: what keeps the mask from the writer.
     notes: what a person should know.
+    unchecked: parts whose design rules nobody checked here.
     lenses: {name: values of its layout.json}.
     written: {file: bytes}.
     dies: on the wafer.
     placed: parts on the die.
+    near: parts that stand too near each other.
     rules: violations of each part that is checked here.
     splits: write fields of each lens.
     areas_um2: of each layer, over the whole mask.
-    read_back: {file: differences from the plan, or that there are none}.
+    different: files that do not read back as planned.
     """
 
     options: Options
@@ -225,14 +231,16 @@ class FloorplanWork:
     stages: StageTimes
     failures: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    unchecked: list[str] = field(default_factory=list)
     lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
     written: dict[str, int] = field(default_factory=dict)
     dies: wafer.WaferDies | None = None
     placed: list[assembly.PartPlacement] = field(default_factory=list)
+    near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
     splits: dict[str, FieldPlan] = field(default_factory=dict)
     areas_um2: dict[LayerNumber, float] = field(default_factory=dict)
-    read_back: dict[str, str] = field(default_factory=dict)
+    different: set[str] = field(default_factory=set)
 
     @property
     def corrected(self) -> bool:
@@ -240,9 +248,22 @@ class FloorplanWork:
         return self.process.exposure.corrected
 
     @property
+    def warnings(self) -> list[str]:
+        """What was not checked, in words."""
+        return [
+            f"NOT CHECKED: the design rules of {name} (checked = false)."
+            for name in self.unchecked
+        ]
+
+    @property
     def verdict(self) -> str:
         """First line of everything that is said of the mask."""
-        return _verdict(self.failures)
+        if self.failures:
+            return " ".join(["FAILS: " + "; ".join(self.failures), *self.warnings])
+        if self.unchecked:
+            passed = "No fault was found by the checks that were made."
+            return " ".join([passed, *self.warnings])
+        return "The mask passes its own checks."
 
     def judge_rules(self, name: str, report: DrcReport) -> None:
         """Enter the design-rule check of a part.
@@ -255,10 +276,3 @@ class FloorplanWork:
         if not report.ok:
             violated = report.violated or "no shape to check"
             self.failures.append(f"{name}: design rules violated: {violated}")
-
-
-def _verdict(failures: Sequence[str]) -> str:
-    """What fails, or that nothing does."""
-    if failures:
-        return "FAILS: " + "; ".join(failures)
-    return "The mask passes its own checks."

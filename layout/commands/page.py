@@ -1,14 +1,16 @@
 """report.html of a mask: what will be made, whether it can be, what was written and how
-it read back.
+it was checked.
 """
 
 from pathlib import Path
+from typing import Any
 
+from layout.arrange import assembly, separation
 from layout.commands import pictures
 from layout.commands.job import FloorplanWork, LayoutJob
 from layout.drc.report import DrcReport, format_size
 from layout.formats.library import MaskLibrary
-from layout.pec.psf import point_exposure
+from layout.pec.psf import PointExposure, point_exposure
 from layout.process.process import ExposureSettings
 from metalens.core import report
 from metalens.core.report import Figure, KeyFigure, Section, Table
@@ -21,21 +23,27 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
     """Write report.html of one lens, and die.png.
 
     Args:
-        job: all that is known of the mask.
+        job: of the command.
         target: folder.
     """
     die_png = pictures.plot_die(job.plan, job.drc)
     (target / "die.png").write_bytes(die_png)
+    die_caption = "The whole die. Colour: share of the area that pillars cover."
     sections = [
         Section(
             "Die",
-            "Seen from the pillar side, in the coordinates of the lens: +y is up, so the "
-            "first row of the diameter map is the lowest. The F stands in the upper left "
-            "corner. metalens view shows every polygon.",
-            [Figure(die_png, "The whole die.", wide=True)],
+            "Two lithography steps: the pillar layer (with marks, label, dose-test "
+            "array and witness cells) and the aperture layer, which draws the openings "
+            "of the opaque film. The F stands in the upper left corner. The mask is "
+            "seen from the pillar side, against the light, in the coordinates of the "
+            "lens: +y is up here, so the first row of the diameter map is the lowest. "
+            "metalens view shows every polygon.",
+            [Figure(die_png, die_caption, wide=True)],
         ),
         _rules(job.drc),
+        _classes(job),
         *_exposure(job),
+        _write_fields(job),
     ]
     if job.options.study:
         from layout.study import page as study_page
@@ -50,25 +58,47 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
         for name, outcome in job.compared.items()
     }
     sections.append(_files(job.written, read_back, job.seconds))
-    pillars = int(job.plan.lattices[0].counts(len(job.plan.classes))[1:].sum())
-    violations = sum(job.drc.counts.values())
-    gap = format_size(job.drc.minimum_space_nm)
-    width = format_size(job.drc.minimum_width_nm)
     report.write_report(
         target / "report.html",
         f"Mask {job.plan.name}",
         sections,
-        lead=f"{job.verdict} A {job.source.profile} lens for "
-        f"{job.source.wavelength_um / nm:.0f} nm, {2 * job.made.radius_um / 1e3:.4g} mm "
-        f"across, as {pillars:,} pillars ({job.drc.shapes:,} on the die) in "
-        f"{len(job.plan.classes)} cells; process “{job.process.name}”.",
-        key_figures=[
-            KeyFigure("pillars", f"{job.drc.shapes:,}"),
-            KeyFigure("smallest gap", gap),
-            KeyFigure("thinnest pillar", width),
-            KeyFigure("violations", f"{violations:,}", violations == 0),
-        ],
+        lead=_lead(job),
+        key_figures=_key_figures(job),
     )
+
+
+def _lead(job: LayoutJob) -> str:
+    """First paragraph of the report: verdict, lens, and number of pillars."""
+    source = job.source
+    classes = job.plan.classes
+    pillars = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
+    die = ""
+    if job.drc.shapes != pillars:
+        die = f" ({job.drc.shapes:,} on the die, with its test arrays)"
+    return (
+        f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
+        f"{2 * job.made.radius_um / 1e3:.4g} mm across, as {pillars:,} pillars{die} in "
+        f"{len(classes)} cells; process “{job.process.name}”."
+    )
+
+
+def _key_figures(job: LayoutJob) -> list[KeyFigure]:
+    """Key figures of a mask: pillars, smallest sizes, violations, files."""
+    drc = job.drc
+    counts = drc.counts
+    as_planned = all(outcome.ok for outcome in job.compared.values())
+    violations = sum(counts.values())
+    too_close = counts["space"] + counts["overlap"]
+    gap, width = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
+    return [
+        KeyFigure("pillars", f"{drc.shapes:,}"),
+        KeyFigure("smallest gap", gap, too_close == 0),
+        KeyFigure("thinnest pillar", width, counts["width"] == 0),
+        KeyFigure("violations", f"{violations:,}", violations == 0),
+        KeyFigure(
+            "files read back", "as planned" if as_planned else "DIFFERENT", as_planned
+        ),
+    ]
 
 
 def _rules(drc_report: DrcReport) -> Section:
@@ -80,15 +110,46 @@ def _rules(drc_report: DrcReport) -> Section:
                 [rule, drc_report.limits[rule], n]
                 for rule, n in drc_report.counts.items()
             ],
-            "Limits in nm, corners in degrees, density as a share.",
+            "Checked on the drawn polygons, all pillars; limits in nm, corners in "
+            "degrees, density as a share.",
         )
     ]
     if drc_report.worst:
         keys = ("rule", "layer", "cell", "count", "worst", "limit")
         rows = [[entry[key] for key in keys] for entry in drc_report.worst[:_LISTED]]
-        text = "Violations by rule, layer and cell; mask.lyrdb marks their places."
-        items.append(Table(keys, rows, text))
+        items.append(Table(keys, rows, "Violations by rule, layer and cell."))
+        places = [
+            [v.rule, "({:.0f}, {:.0f})".format(*v.centre), v.value, v.limit, v.text]
+            for v in drc_report.violations[:_LISTED]
+        ]
+        head = ("rule", "(x, y) / nm", "measured", "needed", "where")
+        text = "The first violations; mask.lyrdb marks up to 500 of each rule."
+        items.append(Table(head, places, text))
     return Section("Design rules", drc_report.summary + ".", items)
+
+
+def _classes(job: LayoutJob) -> Section:
+    """Section on the drawn pillars: shape, sizes and steps."""
+    rules = job.process.rules
+    classes = job.plan.classes
+    shape = job.source.cell.shape
+    if classes[0].round:
+        kind, corners = "disc", "as a polygon of its area"
+    else:
+        two = job.source.pairs is not None
+        kind = f"{shape.kind} of its own width and length" if two else shape.name
+        corners = (
+            "with its corners on the grid; rounding by the etch is not made up for"
+        )
+    turned = job.source.diameters.angle_rad is not None
+    turns = f" and turns in steps of {rules.angle_step_deg:g} degrees" * turned
+    areas = [pillar.twice_area / 2 * job.plan.unit_nm**2 for pillar in classes]
+    return Section(
+        "Pillars",
+        f"Each is a {kind}, drawn in sizes in steps of {rules.diameter_step_nm} nm"
+        f"{turns} after the bias was taken off, {corners}: {len(classes)} cells of "
+        f"{min(areas):,.0f} to {max(areas):,.0f} nm².",
+    )
 
 
 def _exposure(job: LayoutJob) -> list[Section]:
@@ -100,7 +161,7 @@ def _exposure(job: LayoutJob) -> list[Section]:
             "Proximity effect correction of lens, dose test, witness cells, marks and "
             f"label together: relative dose {min(used):.3f} to {max(used):.3f} in "
             f"{len(job.dose.factors)} steps, a datatype each (doses.csv)."
-            f"{_fit_text(job.process.exposure)}"
+            f"{_fit_text(job.process.exposure, point_exposure(job.process.exposure))}"
         )
         sections.append(Section("Dose", text))
     if not job.verified:
@@ -145,15 +206,26 @@ def _exposure(job: LayoutJob) -> list[Section]:
     return sections
 
 
-def _fit_text(exposure: ExposureSettings) -> str:
+def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
     """What the Gaussians leave out of a measured table."""
     if exposure.csv is None:
         return ""
-    point = point_exposure(exposure)
     return (
         f" The point exposure is the table {exposure.csv.name}, as "
         f"{len(point.weights)} Gaussians: the energy within any radius differs by up "
         f"to {100 * point.fit_error:.2g} % of the whole from that of the table."
+    )
+
+
+def _write_fields(job: LayoutJob) -> Section:
+    """Section on write fields."""
+    split = job.fields
+    return Section(
+        "Write fields",
+        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
+        f"by {split.size_um[1]:.1f} µm at most; no border cuts a pillar: they keep "
+        f"{split.clearance_um / nm:.0f} nm. fields.csv lists them in the order of writing; "
+        "job.txt is the sheet for the operator, with doses and charge.",
     )
 
 
@@ -173,28 +245,100 @@ def _files(
     return Section("Files", text, items)
 
 
+# arrangements
+
+
 def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
-    """Write report.html of an arrangement.
+    """Write report.html of an arrangement, die.png (and wafer.png).
 
     Args:
-        work: all that is known of it.
-        library: cells of the mask.
+        work: of the command.
+        library: mask that was written.
     """
-    verdicts = {name: values["ok"] for name, values in work.lenses.items()}
-    verdicts |= {name: drc.ok for name, drc in work.rules.items()}
-    rows = [[name, "passes" if ok else "FAILS"] for name, ok in verdicts.items()]
-    dies = 1 if work.dies is None else len(work.dies.index)
-    caption = "Each lens has a report of its own, in the folder of its name."
-    passed = "Every part is within the design rules, and all stand far enough apart."
-    text = "\n\n".join(work.failures or [passed, *work.notes])
+    die_png = pictures.plot_floorplan(work.placed, work.near)
+    (work.folder / "die.png").write_bytes(die_png)
+    notes = " ".join(f"{note}." for note in work.notes)
+    figure = Figure(die_png, "Parts on the die.", wide=True)
+    text = f"Seen from the pillar side, +y up. {notes}".strip()
+    sections = [Section("Die", text, [figure])]
+    dies = 1
+    if work.dies is not None and work.record.wafer is not None:
+        dies = len(work.dies.index)
+        box = separation.extent_of_copies(work.placed) / assembly.PER_UM
+        wafer_png = pictures.plot_wafer(work.record.wafer, work.dies, box)
+        (work.folder / "wafer.png").write_bytes(wafer_png)
+        caption = "Dies within the edge exclusion, and marks."
+        text = f"{dies:,} whole dies; dies.csv lists them."
+        figure = Figure(wafer_png, caption, wide=True)
+        sections.append(Section("Wafer", text, [figure]))
+    read_back = {
+        name: "DIFFERENT" if name in work.different else "as planned"
+        for name in work.written
+    }
+    sections.append(_checks(work))
+    sections.append(_files(work.written, read_back, work.stages.seconds))
+    lead = (
+        f"{work.verdict} {len(work.lenses)} lenses on a die; process "
+        f"“{work.process.name}”. doses.csv: one dose for each layer and datatype; "
+        "job.txt: places, charge and doses; fields.csv: write fields of the lenses."
+    )
     report.write_report(
         work.folder / "report.html",
         f"Mask {library.name}",
-        [
-            Section("Checks", text, [Table(("part", "verdict"), rows, caption)]),
-            _files(work.written, work.read_back, work.stages.seconds),
+        sections,
+        lead=lead,
+        key_figures=[
+            KeyFigure("parts", str(len(work.placed))),
+            KeyFigure("dies", f"{dies:,}"),
+            KeyFigure("doses", str(len(library.doses))),
+            KeyFigure("what fails", str(len(work.failures)), not work.failures),
         ],
-        lead=f"{work.verdict} {len(work.lenses)} lenses on a die, {dies:,} whole dies; "
-        f"process “{work.process.name}”. job.txt: places, charge and doses; doses.csv; "
-        "fields.csv: write fields of the lenses; dies.csv: places of the dies.",
     )
+
+
+def _checks(work: FloorplanWork) -> Section:
+    """Rules, exposure and read-back of each part, and what stands too near what."""
+    rows = [_lens_row(name, values) for name, values in work.lenses.items()]
+    for name, drc in work.rules.items():
+        sizes = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
+        broken = sum(drc.counts.values())
+        verdict = "FAILS" if broken else "passes"
+        rows.append([name, f"{drc.shapes:,}", *sizes, broken, "", "", verdict])
+    rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
+    columns = "part, shapes, least gap, least feature, broken rules, exposure, "
+    columns += "read back, verdict"
+    caption = "Each lens has a report of its own, in the folder of its name."
+    items = [Table(columns.split(", "), rows, caption)]
+    if work.near:
+        near = [
+            [violation.text, violation.value / 1e3, violation.limit / 1e3]
+            for violation in work.near[:_LISTED]
+        ]
+        head = ("what", "distance / µm", "needed / µm")
+        items.append(Table(head, near, "Parts that stand too near each other."))
+    text = [*work.failures, *work.warnings]
+    if not work.failures:
+        checked = "Every part that was checked" if work.unchecked else "Every part"
+        text.append(
+            f"{checked} is within the design rules, and all stand far enough from each "
+            "other."
+        )
+    return Section("Checks", "\n\n".join(text), items)
+
+
+def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
+    """Of layout.json of a lens."""
+    exposed = [
+        f"{100 * exposure['worst_relative']:.2f} %, {exposure['worst_diameter_nm']:.2f} nm"
+        for exposure in values["exposure"].values()
+    ]
+    return [
+        name,
+        f"{values['pillars']:,}",
+        format_size(values["minimum_space_nm"]),
+        format_size(values["minimum_width_nm"]),
+        sum(values["violations"].values()),
+        exposed[0] if exposed else "not verified",
+        "DIFFERENT" if any(values["differences"].values()) else "as planned",
+        "passes" if values["ok"] else "FAILS",
+    ]

@@ -3,14 +3,15 @@ place, by another reader.
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import layout
 from layout.commands import make
-from layout.formats import job_files
-from layout.formats.library import QUARTERS
+from layout.formats import gdsii_write, job_files
+from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -28,7 +29,9 @@ def lens_map(name):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two small lenses, and a process without correction."""
+    """Two small lenses, a file of pads made elsewhere (its unit 5 nm), and a process
+    without correction.
+    """
     target = tmp_path_factory.mktemp("arranged")
     proxy = Proxy(
         np.array([[3.0, 3.0]]),
@@ -43,6 +46,16 @@ def folder(tmp_path_factory):
             lens_map(name), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
         )
         lens.save(target / f"{name}.h5", made)
+    pad = MaskCell(
+        "PAD", {(1, 0): [np.array([[0, 0], [400, 0], [400, 200], [0, 200]])]}
+    )
+    chip = MaskCell("CHIP", {(20, 3): [np.array([[0, 0], [9, 0], [9, 11]])]})
+    pads = CellReference(
+        "PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900)
+    )
+    chip = replace(chip, references=(pads,))
+    made = MaskLibrary("PADS", {"PAD": pad, "CHIP": chip}, unit_nm=5.0)
+    gdsii_write.write_gdsii(made, target / "pads.gds")
     (target / "process.toml").write_text(
         "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
     )
@@ -84,6 +97,11 @@ name = "B"
 furnished = false
 [[lens.at]]
 x_um = -90
+[[cell]]
+file = "pads.gds"
+name = "PADS"
+relative_dose = 1.5
+checked = false
 [wafer]
 diameter_mm = 3.2
 edge_exclusion_mm = 0.1
@@ -141,6 +159,11 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
         # pillars are symmetric: the middle of their box is their place, but for one
         # step of the grid
         assert {(p.x, p.y) for p in found} == wanted
+        pads = db.Region(there.top_cell().begin_shapes_rec(there.layer(1, 1)))
+        assert pads.count() == 60 * len(
+            dies
+        )  # 1.5 of the dose: a datatype of their own
+        assert pads.area() == 60 * len(dies) * 2000 * 1000
     sizes = [
         (tmp_path / "m" / file).stat().st_size for file in ("mask.gds", "mask.oas")
     ]
@@ -152,13 +175,18 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
     assert sizes[0] < len(dies) * lone[0] / 4
     assert sizes[1] < len(dies) * lone[1] / 4
     page = (tmp_path / "m" / "report.html").read_text()
-    assert "2 lenses on a die" in page
+    assert (
+        "NOT CHECKED: the design rules of PADS (checked = false). 2 lenses on a die"
+        in page
+    )
     sheet = (tmp_path / "m" / "job.txt").read_text()
     assert "mirrored" in sheet
-    assert "b.h5" in sheet
+    assert "pads.gds" in sheet
     assert f"{len(dies)} whole dies" in page
+    assert (tmp_path / "m" / "wafer.png").is_file()
     held = job_files.read_dose_table(tmp_path / "m" / "doses.csv")
     assert held[1, 0] == 1.0
+    assert held[1, 1] == held[20, 3] == 1.5
 
 
 def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(
@@ -186,18 +214,19 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(
     # nearer than 70 nm
     assert "A at (0, 0) um to B at (4.58, 4.58) um, pillars: 0.000 um apart" in told
     assert "B at (4.6, -4.9) um, pillars" not in told
-    strict = "[exposure]\ncorrect = false\n[rules]\nminimum_feature_nm = 140\n"
-    (folder / "strict.toml").write_text(strict)
-    (folder / "arrangement.toml").write_text(beside)
-    words = ["layout", str(folder / "arrangement.toml"), "-o", str(tmp_path / "m")]
-    words += ["--process", str(folder / "strict.toml"), "--force", "--gds"]
-    assert cli.main(words) == 1  # pillars of 120 nm
-    assert "passes its own checks" not in capsys.readouterr().out
+    pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
+    assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
+    told = capsys.readouterr().out
+    assert (
+        "  FAILED: PADS: design rules violated: 1 width, 2 corner" in told.splitlines()
+    )
+    assert "passes its own checks" not in told
     page = (tmp_path / "m" / "report.html").read_text()
     assert (
-        "FAILS: A: design rules violated:"
+        "FAILS: PADS: design rules violated: 1 width"
         in page[page.index("<h1") : page.index("<h2")]
     )
+    assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0
 
 
 @pytest.mark.slow  # two corrections and certificates: 20 s
@@ -244,6 +273,7 @@ def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(
     one = '[[lens]]\nfile = "b.h5"\nname = "B"\n'
     for text in (
         one + "furnished = false\n",
+        one + '[[cell]]\nfile = "pads.gds"\nname = "P"\n',
         one + "furnished = true\n[die]\nsize_um = [900, 800]\n",
     ):
         (folder / "arrangement.toml").write_text(text)
@@ -253,8 +283,12 @@ def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(
 
 def test_bad_arrangements_are_refused_by_file_and_key(folder, tmp_path, capsys):
     for text, said in (
-        ('name = "X"\n', "need a [[lens]]"),
-        ('[[lens]]\nfile = "none.h5"\nname = "N"\n', "none.h5"),
+        ('name = "X"\n', "need a [[lens]] or a [[cell]]"),
+        ('[[cell]]\nfile = "none.gds"\nname = "N"\n', "none.gds"),
+        (
+            '[[cell]]\nfile = "pads.gds"\nname = "P"\ncell = "PIT"\n',
+            "no cell 'PIT' in the mask",
+        ),
         ('[[lens]]\nfile = "a.h5"\nname = "A"\nat = [{columns = 2}]\n', "step_um"),
         (
             '[[lens]]\nfile = "a.h5"\nname = "A"\n[wafer]\npitch_um = [100, 900]\n',

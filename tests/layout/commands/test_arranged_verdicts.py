@@ -1,5 +1,5 @@
-"""Doses of an arrangement beside a plain sum of Gaussians over KLayout's shapes; its
-layers, write fields, charge and time.
+"""What an arrangement says of doses, of rules that nobody checked, and of shapes that
+draw nothing; its doses beside a plain sum of Gaussians over KLayout's shapes.
 """
 
 import csv
@@ -9,6 +9,8 @@ import math
 import numpy as np
 import pytest
 
+from layout.formats import gdsii_write
+from layout.formats.library import MaskCell, MaskLibrary
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -32,9 +34,15 @@ verniers = false
 PLAIN = "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
 
 
+def square(x, y, side):
+    return np.array([[x, y], [x + side, y], [x + side, y + side], [x, y + side]])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A dense lens and a sparse one of thin pillars."""
+    """A dense lens and a sparse one of thin pillars; pads of another tool, sound or
+    with shapes that have no area.
+    """
     target = tmp_path_factory.mktemp("verdicts")
     rng = np.random.default_rng(3)
     maps = {
@@ -52,6 +60,16 @@ def folder(tmp_path_factory):
             "hyperbolic",
         )
         lens.save(target / f"{name}.h5", made)
+    pads = MaskCell("PADS", {(1, 0): [square(0, 0, 5000), square(9000, 0, 4000)]})
+    flat = np.array([[0, 0], [700, 0], [1400, 0]])
+    there_and_back = np.array([[0, 0], [700, 0], [700, 300], [700, 0]])
+    thin = MaskCell(
+        "THIN",
+        {(1, 0): [square(0, 0, 5000)], (20, 3): [flat], (21, 0): [there_and_back]},
+    )
+    for cell in (pads, thin):
+        file = target / f"{cell.name.lower()}.gds"
+        gdsii_write.write_gdsii(MaskLibrary(cell.name, {cell.name: cell}), file)
     (target / "pec.toml").write_text(PEC)
     (target / "plain.toml").write_text(PLAIN)
     return target
@@ -62,6 +80,84 @@ def run(folder, text, target, process):
     path.write_text(text)
     words = ["--process", str(folder / process), "-o", str(target), "--force", "--gds"]
     return cli.main(["layout", str(path), *words])
+
+
+CELL = """
+[[cell]]
+file = "{file}"
+name = "PADS"
+checked = {checked}
+[[cell.at]]
+x_um = 31.5
+y_um = -12.0
+"""
+
+
+def texts(target, printed):
+    return (
+        printed,
+        (target / "report.html").read_text(),
+        (target / "job.txt").read_text(),
+    )
+
+
+def test_shapes_of_a_file_without_corrected_doses_fail_and_are_said(
+    folder, tmp_path, capsys
+):
+    target = tmp_path / "m"
+    text = CELL.format(file="pads.gds", checked="true")
+    assert run(folder, text, target, "pec.toml") == 1
+    for said in texts(target, capsys.readouterr().out):
+        assert (
+            "PADS: 2 shapes on 1/0 of pads.gds get the relative dose 1 without" in said
+        )
+        assert "proximity correction" in said
+        assert "passes its own checks" not in said
+    assert (
+        run(folder, text, target, "plain.toml") == 0
+    )  # one dose is what was asked for
+    table = folder / "doses.csv"
+    table.write_text("layer,datatype,relative_dose\n1,0,0.87\n")
+    try:
+        assert run(folder, text, target, "pec.toml") == 0
+    finally:
+        table.unlink()
+    rows = list(csv.DictReader((target / "doses.csv").open()))
+    assert [float(row["relative_dose"]) for row in rows] == [0.87]
+
+
+def test_a_part_that_was_not_checked_never_reads_as_sound(folder, tmp_path, capsys):
+    target = tmp_path / "m"
+    assert (
+        run(folder, CELL.format(file="pads.gds", checked="false"), target, "plain.toml")
+        == 0
+    )
+    for said in texts(target, capsys.readouterr().out):
+        assert "NOT CHECKED: the design rules of PADS (checked = false)" in said
+        assert "passes its own checks" not in said
+        assert "very part is within" not in said
+    values = json.loads((target / "layout.json").read_text())
+    assert values["unchecked"] == ["PADS"]
+
+
+def test_shapes_without_area_are_left_out_and_said(folder, tmp_path, capsys):
+    db = pytest.importorskip("klayout.db")
+    target = tmp_path / "m"
+    assert (
+        run(folder, CELL.format(file="thin.gds", checked="true"), target, "plain.toml")
+        == 0
+    )
+    for said in texts(target, capsys.readouterr().out):
+        assert "2 shapes without area of thin.gds are left out" in said
+    there = db.Layout()
+    there.read(str(target / "mask.gds"))
+    drawn = {
+        (info.layer, info.datatype): db.Region(
+            there.top_cell().begin_shapes_rec(there.layer(info))
+        ).area()
+        for info in there.layer_infos()
+    }
+    assert drawn == {(1, 0): 25_000_000}
 
 
 DIE = """
