@@ -3,7 +3,6 @@
 import contextlib
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from metalens.core import config
 from metalens.core.errors import TrainingError
 from metalens.core.store import replace_atomically, write_text
 
-VERSION = 10
+VERSION = 11
 ABOUT = "about"
 _TENSOR = "\0tensor"
 
@@ -25,7 +24,7 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
 
     Args:
         state: nested dicts and lists of tensors, numbers, strings, booleans and None;
-            keys are strings or integers.
+            keys are strings.
         settings: the run's config record; kept as TOML so that a resume can compare it.
         path: of the file.
 
@@ -35,14 +34,23 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
         TrainingError: the state holds something else.
     """
     tensors: dict[str, Tensor] = {}
-    tree = _separate_tensors(state, "", tensors)
+
+    def keep_tensor(value: object) -> dict[str, str]:
+        if not isinstance(value, Tensor):
+            raise TrainingError(
+                f"checkpoint entry {value!r} is a {type(value).__name__}; need tensors, numbers, text"
+            )
+        name = str(len(tensors))
+        tensors[name] = value.detach().contiguous().clone()
+        return {_TENSOR: name}
+
     about = {
         "kind": "checkpoint",
         "version": VERSION,
-        "state": tree,
+        "state": state,
         "settings": config.dumps(settings),
     }
-    _write(Path(path), tensors, ABOUT, json.dumps(about))
+    _write(Path(path), tensors, ABOUT, json.dumps(about, default=keep_tensor))
 
 
 def save_network(
@@ -109,8 +117,7 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
 
     Raises:
         TrainingError: missing, truncated or foreign file, another version, or a run of
-            other settings (the
-            difference is named).
+            other settings (the difference is named).
     """
     path = Path(path)
     if not path.is_file():
@@ -119,82 +126,41 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
         )
     try:
         with safe_open(str(path), framework="pt") as file:
-            about = _about(file.metadata() or {})
-            _check(path, about, settings)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        merged: dict[str, Any] = _insert_tensors(about["state"], tensors)
-    except TrainingError:
-        raise
-    except (
-        SafetensorError,
-        OSError,
-        LookupError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+            about: dict[str, Any] = json.loads(
+                (file.metadata() or {}).get(ABOUT, "{}"),
+                object_hook=lambda node: (
+                    file.get_tensor(node[_TENSOR]) if _TENSOR in node else node
+                ),
+            )
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise TrainingError(
             f"{path}: truncated or not a checkpoint ({error})"
         ) from error
-    return merged
+    kind, version = about.get("kind", "no kind"), about.get("version", "no version")
+    if (kind, version) != ("checkpoint", VERSION):
+        raise TrainingError(
+            f"{path} holds {kind!r} version {version}, need 'checkpoint' version {VERSION}; train again, or go on "
+            "with the release that wrote it"
+        )
+    changed = settings_difference(about["settings"], settings)
+    if changed:
+        raise TrainingError(
+            f"{path} belongs to other settings; start a new run or undo the change:\n{changed}"
+        )
+    state: dict[str, Any] = about["state"]
+    return state
 
 
 def settings_difference(old: str, settings: object) -> str:
     """Lines ``key: old -> new`` of settings that differ from those in TOML; '' for
     none.
-
-    A setting that the old ones lack is taken at its present default. One whose default
-    changes behaviour needs another :data:`VERSION`.
     """
-    before = _flat_toml(old)
-    after = _flat_toml(config.dumps(settings))
-    defaults = _flat_toml(config.dumps(_with_defaults(settings)))
-    before = {key: value for key, value in defaults.items() if key in after} | before
-    keys = sorted(before.keys() | after.keys())
-    changed = [k for k in keys if before.get(k) != after.get(k)]
+    before, after = _flat_toml(old), _flat_toml(config.dumps(settings))
     return "\n".join(
-        f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed
+        f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}"
+        for k in sorted(before.keys() | after.keys())
+        if before.get(k) != after.get(k)
     )
-
-
-def _with_defaults(settings: Any) -> Any:
-    """Settings of the same kind, with every field that has a default at it."""
-    values: dict[str, Any] = {}
-    for field in fields(settings):
-        value = getattr(settings, field.name)
-        if is_dataclass(value):
-            values[field.name] = _with_defaults(value)
-        elif field.default is MISSING and field.default_factory is MISSING:
-            values[field.name] = value
-    return type(settings)(**values)
-
-
-def _about(metadata: dict[str, str]) -> dict[str, Any]:
-    try:
-        about: dict[str, Any] = json.loads(metadata.get(ABOUT, "{}"))
-    except json.JSONDecodeError:
-        return {}
-    return about
-
-
-def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
-    """Refuse a file of another kind or version, or of other settings.
-
-    Raises:
-        TrainingError: with the difference.
-    """
-    if metadata.get("kind") != "checkpoint" or metadata.get("version") != VERSION:
-        found = metadata.get("kind", "no kind"), metadata.get("version", "no version")
-        raise TrainingError(
-            f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}; train again, or go on "
-            "with the release that wrote it"
-        )
-    changed = settings_difference(metadata["settings"], settings)
-    if changed:
-        raise TrainingError(
-            f"{path} belongs to other settings; start a new run or undo the change:\n{changed}"
-        )
 
 
 def _flat_toml(text: str) -> dict[str, str]:
@@ -207,44 +173,6 @@ def _flat_toml(text: str) -> dict[str, str]:
             key, value = line.split(" = ", 1)
             result[table + key] = value
     return result
-
-
-def _separate_tensors(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
-    """JSON tree of a state, with tensors replaced by names and put into ``tensors``.
-
-    Raises:
-        TrainingError: neither a container, a tensor nor a plain value.
-    """
-    if isinstance(node, Tensor):
-        tensors[name] = node.detach().contiguous().clone()
-        return {_TENSOR: name}
-    if isinstance(node, dict):
-        return {
-            "items": [
-                [k, _separate_tensors(v, f"{name}/{k}", tensors)]
-                for k, v in node.items()
-            ]
-        }
-    if isinstance(node, list | tuple):
-        return [
-            _separate_tensors(v, f"{name}/{i}", tensors) for i, v in enumerate(node)
-        ]
-    if node is None or isinstance(node, bool | int | float | str):
-        return node
-    raise TrainingError(
-        f"checkpoint entry {name or '/'} is a {type(node).__name__}; need tensors, numbers, text"
-    )
-
-
-def _insert_tensors(tree: Any, tensors: dict[str, Tensor]) -> Any:
-    """The state of a JSON tree of :func:`_separate_tensors` and its tensors."""
-    if isinstance(tree, list):
-        return [_insert_tensors(v, tensors) for v in tree]
-    if isinstance(tree, dict):
-        if _TENSOR in tree:
-            return tensors[tree[_TENSOR]]
-        return {k: _insert_tensors(v, tensors) for k, v in tree["items"]}
-    return tree
 
 
 def append_entry(path: Path, entry: dict[str, Any]) -> None:

@@ -445,7 +445,9 @@ class Trainer:
             self.model.coefficients_rad.copy_(state["coefficients_rad"])  # type: ignore[arg-type]
             self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
         for name, optimiser in self.optimisers.items():
-            optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
+            saved: dict[str, Any] = state["optimisers"][name]  # type: ignore[index]
+            moments = {int(k): v for k, v in saved["state"].items()}
+            optimiser.load_state_dict({**saved, "state": moments})
             align_moments(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
