@@ -7,12 +7,12 @@ import torch
 from benchmarks import Row, fastest
 from benchmarks.peers import layered
 from codesign.eye import dataset, renderer
-from codesign.eye.population import CameraRig, model_parameters
+from codesign.eye.population import CameraRig
 from codesign.eye.renderer import PinholeCamera
 from metalens.image import Grid, pupil, scene, uniform_imager
 from metalens.image.pupil import Pupil
 from metalens.psf import integrate_pixels
-from tests.codesign.eye import plain_eye
+from tests.codesign.eye import model, plain_eye
 
 NONE = float("nan")
 
@@ -35,7 +35,7 @@ def rows() -> list[Row]:
 def _twin_error(states: object, camera: PinholeCamera) -> float:
     few = states[:2]  # type: ignore[index]
     out = renderer.render(few, camera=camera)
-    p = model_parameters(few, CameraRig(), pixel_rad=camera.pitch_um / 2000.0)
+    p = model.rows_of_camera(few, CameraRig(), camera)
     light, *_ = plain_eye.render_in_torch(p, CameraRig(), camera)
     return float((out.frames.radiance - light).norm() / light.norm())
 

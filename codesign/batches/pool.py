@@ -50,7 +50,7 @@ def render_pool(scenes: EyeScenes, count: int) -> FramePool:
     parts = []
     for number, start in enumerate(range(0, count, CHUNK)):
         parts.append(_render_part(scenes, number, min(CHUNK, count - start)))
-    nominal_um = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
+    nominal_um = scenes.rig.pupil_um.numpy()
     light, depth, mask, place_um, seen_um, axis, points = (
         np.concatenate(rows) for rows in zip(*parts, strict=True)
     )
@@ -80,9 +80,7 @@ def _render_part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...
     if mask.shape[-1] % MASK == 0:
         mask = F.avg_pool2d(mask, mask.shape[-1] // MASK)
     coverage = (mask[:, 0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    nominal_um = torch.tensor(
-        [*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64
-    )
+    nominal_um = scenes.rig.pupil_um
     place_um, seen_um = (
         ((nominal_um + moved) / states.scale[:, None]).numpy()
         for moved in (rendered.labels.slip_um, rendered.labels.shift_um)

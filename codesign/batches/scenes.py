@@ -62,6 +62,9 @@ class SceneConfig:
         make-up, uneven light, shadows
         and movement (:mod:`codesign.eye.appearance`): for faces and lamps that nobody
         modelled.
+    elevation_deg: of the camera below the gaze straight ahead. azimuth_deg: of the
+    camera towards the temple. eye_distance_mm: lens to pupil without slippage.
+    right_eye: the mirror image of the left eye before the same camera.
     pool: frames that training draws from again and again, at another scale each time; 0
     renders every frame anew.
     """
@@ -74,6 +77,10 @@ class SceneConfig:
     depth_sd_mm: float = 0.0
     variety: float = 1.0
     pool: int = 0
+    elevation_deg: float = 45.0
+    azimuth_deg: float = 0.0
+    eye_distance_mm: float = 21.0
+    right_eye: bool = False
 
     def __post_init__(self) -> None:
         if (
@@ -85,15 +92,18 @@ class SceneConfig:
                 f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
                 "margin below them, and a scale below 0.5"
             )
-        nearest = 1e-3 * CameraRig().distance_um
+        if max(abs(self.elevation_deg), abs(self.azimuth_deg)) > 80:
+            raise ConfigError(
+                f"elevation_deg = {self.elevation_deg}, azimuth_deg = {self.azimuth_deg}: need angles of -80 to 80"
+            )
         if (
             min(self.slip_mm) < 0
-            or self.slip_mm[2] >= nearest
+            or self.slip_mm[2] >= self.eye_distance_mm
             or not all(0 <= turn < 60 for turn in self.gaze_deg)
         ):
             raise ConfigError(
                 f"slip_mm = {self.slip_mm}, gaze_deg = {self.gaze_deg}: need largest slippages of 0 or more, along z "
-                f"below the {nearest:g} mm that the eye stands before the lens, and angles of 0 to 60, as eyes turn"
+                f"below the {self.eye_distance_mm:g} mm of scenes.eye_distance_mm, and angles of 0 to 60, as eyes turn"
             )
         if self.pool < 0 or not self.depth_sd_mm >= 0 or not 0 <= self.variety <= 4:
             raise ConfigError(
@@ -108,7 +118,8 @@ class SceneConfig:
         Largest slippage, and two standard deviations between people.
         """
         reach = self.slip_mm[2] * 1e3 + 2e3 * self.depth_sd_mm
-        return CameraRig().distance_um - reach, CameraRig().distance_um + reach
+        distance = self.eye_distance_mm * 1e3
+        return distance - reach, distance + reach
 
     @property
     def motion(self) -> MotionRanges:
@@ -149,7 +160,13 @@ class EyeScenes:
     @property
     def rig(self) -> CameraRig:
         """Camera and lamps."""
-        return replace(CameraRig(), sensor_distance_um=self.sensor_distance_um)
+        return CameraRig(
+            self.settings.eye_distance_mm * 1e3,
+            math.radians(self.settings.elevation_deg),
+            sensor_distance_um=self.sensor_distance_um,
+            azimuth_rad=math.radians(self.settings.azimuth_deg),
+            right_eye=self.settings.right_eye,
+        )
 
     @property
     def depths_um(self) -> tuple[float, float]:

@@ -29,7 +29,7 @@ def write_network_file(
     scale = exported.OutputScale(
         frame_mm=size * pitch_um * 1e-3,
         slip_mm=inner.slip_scale_mm,
-        elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
+        rig=run.scenes(EXPERIMENT).rig,
         axis=inner.axis_weight > 0,
         points=inner.point_weight > 0,
     )

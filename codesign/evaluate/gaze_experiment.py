@@ -209,7 +209,8 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
         looks_deg: (n, 2) gaze across and down in the frame of the face.
         rig: pose of camera and lamps.
     """
-    kappa = torch.stack([states.trait("kappa_x_rad"), states.trait("kappa_y_rad")], 1)
+    across = rig.temple * states.trait("kappa_x_rad")
+    kappa = torch.stack([across, states.trait("kappa_y_rad")], 1)
     unmounted = torch.zeros_like(states.mount_rad)
     turned = replace(
         states,
@@ -217,9 +218,7 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
         mount_rad=unmounted,
     )
     for _ in range(TURNS):
-        error_deg = looks_deg - face_angles(
-            eye.eye_axes(turned, rig)[1].numpy(), rig.elevation_rad
-        )
+        error_deg = looks_deg - face_angles(eye.eye_axes(turned, rig)[1].numpy(), rig)
         turned = replace(
             turned, gaze_rad=turned.gaze_rad + torch.from_numpy(np.radians(error_deg))
         )
@@ -562,8 +561,8 @@ def read_from(
     axes = [
         prediction.axis for prediction in predictions if prediction.axis is not None
     ]
-    tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
-    angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
+    rig = source.run.scenes(EXPERIMENT).rig
+    angles = face_angles(torch.cat(axes).double().numpy(), rig) if axes else None
     return NetworkReadings(centre * source.run.window_um * 1e-3, slip_mm, angles)
 
 

@@ -1,6 +1,5 @@
 from . import dataset as dataset
 from . import landmarks as landmarks
-from . import model as model
 from . import population as population
 from . import renderer as renderer
 from . import textures as textures
@@ -17,7 +16,6 @@ from .population import CameraRig as CameraRig
 from .population import EyeStates as EyeStates
 from .population import MotionRanges as MotionRanges
 from .population import SubjectTrait as SubjectTrait
-from .population import face_axes as face_axes
 from .population import mean_eye_um as mean_eye_um
 from .population import model_parameters as model_parameters
 from .renderer import FrameLabels as FrameLabels

@@ -6,8 +6,8 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from codesign.eye import model
 from codesign.eye.textures import SIZE, STEPS
 from metalens.core import threads
 from metalens.core.arrays import Array
@@ -19,29 +19,43 @@ _inlined = numba.njit(forceinline=True, **SETTINGS)
 COLUMNS, ROWS = 16, 4  # of a tile: vector registers, and independent work to fill them
 LANES = ROWS * COLUMNS
 SAMPLES = 4  # textures that one pass samples, at most
+# what a frame is rendered from; lengths in um, the camera at the origin looks along
+# +z, x to the right, y down
+VECTORS = (
+    "centre", "face_x", "face_y", "face_z", "axis", "iris_x", "iris_y", "plane",
+    "lamp_a", "lamp_b", "lamp_c",
+)  # fmt: skip
+NUMBERS = (
+    "sclera_r", "cornea_r", "cornea_d", "limbus_r", "limbus_d", "pupil_r", "pupil_d",
+    "index", "lid_r", "blend", "edge", "upper", "lower", "skew", "middle", "half",
+    "crease", "iris", "iris_contrast", "sclera", "veins", "skin", "pores", "lashes",
+    "pupil", "glint", "ambient", "gain", "brow", "t_iris", "t_vein", "t_skin", "t_fine",
+    "t_lash", "offset_x", "offset_y", "turn_x", "turn_y", "caruncle",
+)  # fmt: skip
 # vectors are tuples of three
-Parameters: Any = namedtuple("Parameters", model.NAMES)  # type: ignore[misc]
+Parameters: Any = namedtuple("Parameters", VECTORS + NUMBERS)  # type: ignore[misc]
+COUNT = 3 * len(VECTORS) + len(NUMBERS)
 
-# first lane of every quantity in a tile; three quantities for a vector
+# first lane of every quantity in a tile; three quantities for a vector. The last seven
+# are the planes of a rendered frame
 (
     U, W, D, _, _, S, GX, GY, UPPER, LOWER, N, _, _, TS, M, _, _, TC, C, _, _, INSIDE,
-    SEEN, BARE, FRONT, NEAR, DISC, PUPIL, BROWN, VIRTUAL, R, WHITE, FAR, BACK, HOLE,
+    DISC, PUPIL, BROWN, VIRTUAL, R, WHITE, NEAR, FAR, BARE, SEEN, FRONT, BACK, HOLE,
     PLACE,
 ) = (LANES * k for k in range(36))  # fmt: skip
+PLANES = 7
 TILE, WORDS = PLACE + 2 * SAMPLES * LANES, 2 * SAMPLES * LANES
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _load(a: Any, at: Any, step: Any) -> Any:
-    """(3,) vector stored in ``a`` at ``at``, its components ``step`` apart."""
-    return a[at], a[at + step], a[at + 2 * step]
+def _load(x: Any, at: Any) -> Any:
+    """(3,) vector at lane ``at`` of tile ``x``: one plane of lanes a component."""
+    return x[at], x[at + LANES], x[at + 2 * LANES]
 
 
 @_inlined  # type: ignore[untyped-decorator]
 def _store(x: Any, at: Any, v: Any) -> None:
-    """Write vector ``v`` to lane ``at`` of tile ``x``: one plane of lanes a
-    component.
-    """
+    """Write vector ``v`` to lane ``at`` of tile ``x``."""
     x[at], x[at + LANES], x[at + 2 * LANES] = v
 
 
@@ -348,7 +362,7 @@ def _shade_skin(p: Any, t: Any, x: Any, words: Any) -> None:
         _texture_indices(p.t_lash, gx * f32(0.011) + shift_y, lower_row, x, words, 3, i)
     _fetch_texels(t, words, 4)
     for i in range(LANES):
-        d, n = _load(x, D + i, LANES), _load(x, N + i, LANES)
+        d, n = _load(x, D + i), _load(x, N + i)
         face = x[GX + i], x[GY + i], x[UPPER + i], x[LOWER + i]
         pictures = (
             _interpolate_texel(x, words, 0, i),
@@ -368,7 +382,7 @@ def _shade_globe(p: Any, x: Any) -> None:
     """
     cornea_centre = _add_scaled(p.centre, p.cornea_d, p.axis)
     for i in range(LANES):
-        d = _load(x, D + i, LANES)
+        d = _load(x, D + i)
         ts, _, m = _intersect_sphere(p.centre, p.sclera_r, 1e6, d)
         tc, free, c = _intersect_sphere(cornea_centre, p.cornea_r, 1e4, d)
         forward = _dot(c, p.axis) * p.cornea_r + p.cornea_d - p.limbus_d
@@ -388,7 +402,7 @@ def _shade_iris(p: Any, t: Any, x: Any, words: Any) -> None:
     """
     width = max(p.limbus_r - p.pupil_r, f32(300))
     for i in range(LANES):
-        d, c = _load(x, D + i, LANES), _load(x, C + i, LANES)
+        d, c = _load(x, D + i), _load(x, C + i)
         a, b, path = _refract_to_iris(p, x[TC + i], c, d)
         r = math.sqrt(a * a + b * b + f32(1))
         rim = f32(3) * p.edge + f32(120)
@@ -416,7 +430,7 @@ def _shade_iris(p: Any, t: Any, x: Any, words: Any) -> None:
 def _shade_sclera(p: Any, t: Any, x: Any, words: Any) -> None:
     """Albedo of the white of the eye, with its vessel texture."""
     for i in range(LANES):
-        m = _load(x, M + i, LANES)
+        m = _load(x, M + i)
         u = _dot(m, p.iris_x) * f32(190) + p.offset_x
         v = _dot(m, p.iris_y) * f32(190) + p.offset_y
         _texture_indices(p.t_vein, u, v, x, words, 0, i)
@@ -436,9 +450,9 @@ def _shade_light(p: Any, x: Any) -> None:
     """
     for i in range(LANES):
         cornea, disc, pupil = x[INSIDE + i], x[DISC + i], x[PUPIL + i]
-        d = _load(x, D + i, LANES)
-        m = _load(x, M + i, LANES)
-        c = _load(x, C + i, LANES)
+        d = _load(x, D + i)
+        m = _load(x, M + i)
+        c = _load(x, C + i)
         ts, tc, openness = x[TS + i], x[TC + i], x[SEEN + i]
         point = _scaled(ts + cornea * (tc - ts), d)
         normal = _add_scaled(_scaled(f32(1) - cornea, m), cornea, c)
@@ -474,7 +488,7 @@ def _shade(p: Any, t: Any, x: Any, words: Any) -> None:
     ``p``: parameters of the frame. ``t``: packed texture bank. ``x``: planes of the
     tile, float32. ``words``: texel scratch, int32.
     """
-    for i in range(NEAR, PLACE):
+    for i in range(DISC, PLACE):
         x[i] = f32(0)
     _shade_face(p, x)
     least, largest = _tile_range(x, SEEN)
@@ -489,92 +503,60 @@ def _shade(p: Any, t: Any, x: Any, words: Any) -> None:
         _shade_light(p, x)
 
 
-@_inlined  # type: ignore[untyped-decorator]
-def _copy_out(x: Any, at: Any, out: Any, row: Any, column: Any) -> None:
-    """Copy the plane at offset ``at`` of a tile to (y, x) of ``out``, clipped to the
-    frame.
-    """
-    for j in range(min(ROWS, out.shape[0] - row)):
-        for i in range(min(COLUMNS, out.shape[1] - column)):
-            out[row + j, column + i] = x[at + j * COLUMNS + i]
-
-
-@_inlined  # type: ignore[untyped-decorator]
-def _unpack(row: Any) -> Any:
-    """The parameters of a frame by name."""
-    v = row
-    return Parameters(  # type: ignore[call-arg]
-        _load(v, 0, 1), _load(v, 3, 1), _load(v, 6, 1), _load(v, 9, 1),
-        _load(v, 12, 1), _load(v, 15, 1), _load(v, 18, 1), _load(v, 21, 1),
-        _load(v, 24, 1), _load(v, 27, 1), _load(v, 30, 1),
-        v[33], v[34], v[35], v[36], v[37], v[38], v[39], v[40], v[41], v[42], v[43],
-        v[44], v[45], v[46], v[47], v[48], v[49], v[50], v[51], v[52], v[53], v[54],
-        v[55], v[56], v[57], v[58], v[59], v[60], v[61], v[62], v[63], v[64], v[65],
-        v[66], v[67], v[68], v[69], v[70], v[71],
-    )  # fmt: skip
-
-
 @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
 def render_strips(
-    first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array,
-    w: Array, light: Array, cover: Array, depth: Array, pupil: Array,
-) -> None:  # fmt: skip
+    first: int, end: int, rows: Array, bank: Array, rays: Array, out: Array
+) -> None:
     """Render jobs ``first`` to ``end`` - 1, each a strip of ROWS rows of one frame.
 
     Job number j is strip j mod S of frame j // S, of S strips a frame. See
-    :func:`render_rows`.
+    :func:`render_frames`.
 
     Args:
-        parameters: (n, COUNT) of the frames. scale: (n,) factor of the depths.
-        bank: packed textures. u: (x,) tangents of the rays across.
-        w: (y,) tangents of the rays down. light: (n, 2, y, x) radiance to fill.
-        cover: (n, 2, y, x) coverage to fill. depth: (n, 2, y, x) depth to fill, um.
-        pupil: (n, 1, y, x) share of pupil to fill.
+        rows: (n, COUNT) parameters. bank: packed textures. rays: (pixels,) tangents.
+        out: (n, PLANES, y, x) to fill.
     """
-    strips = (len(w) + ROWS - 1) // ROWS
+    pixels = len(rays)
+    strips = (pixels + ROWS - 1) // ROWS
     tile, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
     for job in range(first, end):
         frame, row = job // strips, job % strips * ROWS
-        named = _unpack(parameters[frame])
-        for column in range(0, len(u), COLUMNS):
+        v = to_fixed_tuple(rows[frame], COUNT)
+        named = Parameters(
+            v[0:3], v[3:6], v[6:9], v[9:12], v[12:15], v[15:18], v[18:21], v[21:24],
+            v[24:27], v[27:30], v[30:33], *v[33:],
+        )  # fmt: skip
+        for column in range(0, pixels, COLUMNS):
             for j in range(ROWS):  # beyond the frame its last row and column repeat
                 for i in range(COLUMNS):
-                    tile[U + j * COLUMNS + i] = u[min(column + i, len(u) - 1)]
-                    tile[W + j * COLUMNS + i] = w[min(row + j, len(w) - 1)]
+                    tile[U + j * COLUMNS + i] = rays[min(column + i, pixels - 1)]
+                    tile[W + j * COLUMNS + i] = rays[min(row + j, pixels - 1)]
             _shade(named, bank, tile, words)
-            for i in range(LANES):
-                tile[FRONT + i] *= scale[frame]
-                tile[BACK + i] *= scale[frame]
-            _copy_out(tile, NEAR, light[frame, 0], row, column)
-            _copy_out(tile, FAR, light[frame, 1], row, column)
-            _copy_out(tile, BARE, cover[frame, 0], row, column)
-            _copy_out(tile, SEEN, cover[frame, 1], row, column)
-            _copy_out(tile, FRONT, depth[frame, 0], row, column)
-            _copy_out(tile, BACK, depth[frame, 1], row, column)
-            _copy_out(tile, HOLE, pupil[frame, 0], row, column)
+            for plane in range(PLANES):
+                lane = NEAR + plane * LANES
+                for j in range(min(ROWS, pixels - row)):
+                    for i in range(min(COLUMNS, pixels - column)):
+                        out[frame, plane, row + j, column + i] = tile[
+                            lane + j * COLUMNS + i
+                        ]
 
 
-def render_rows(
-    parameters: Array, scale: Array, bank: Array, u: Array, w: Array, light: Array,
-    cover: Array, depth: Array, pupil: Array,
-) -> None:  # fmt: skip
-    """Render frames into the arrays ``light``, ``cover``, ``depth``, ``pupil``, on all
-    threads.
+def render_frames(rows: Array, bank: Array, rays: Array) -> Array:
+    """(n, PLANES, y, x) float32 square frames of a pinhole camera, on all threads.
 
-    All arrays are float32. Sheet 0 is skin, sheet 1 the eye; light is multiplied by the
-    coverage. What is hidden is not shaded.
+    The planes: radiance of skin and eye, times their coverage, 1 for full light; their
+    coverage; their depth in um; the share of pupil. What is hidden is not shaded.
 
     Args:
-        parameters: (n, :data:`codesign.eye.model.COUNT`). scale: (n,) of the depths.
+        rows: (n, COUNT) float32 parameters, in the order of VECTORS and NUMBERS.
         bank: of :func:`codesign.eye.textures.packed_bank`.
-        u, w: (x,) and (y,) tangents of the rays.
-        light, cover, depth: (n, 2, y, x) to fill: radiance of full light 1, share, um.
-        pupil: (n, 1, y, x) to fill, share.
+        rays: (pixels,) float32 tangents across, and down.
 
     Accuracy: 1e-3 of full light against float64, at edges a pixel wide.
     """
-    arrays = (parameters, scale, bank, u, w, light, cover, depth, pupil)
+    out = np.empty((len(rows), PLANES, len(rays), len(rays)), np.float32)
     threads.run_split(
-        len(parameters) * -(-len(w) // ROWS),
-        lambda first, end: render_strips(first, end, *arrays),
+        len(rows) * -(-len(rays) // ROWS),
+        lambda first, end: render_strips(first, end, rows, bank, rays, out),
     )
+    return out

@@ -2,14 +2,14 @@
 the pupil through the cornea.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
-from codesign.eye import model
-
 NAMES = (
     "medial canthus", "lateral canthus", "upper margin", "lower margin",
-    "limbus right", "limbus down", "limbus left", "limbus up", "corneal apex",
+    "limbus temporal", "limbus down", "limbus nasal", "limbus up", "corneal apex",
 )  # fmt: skip
 SETTLED_UM = 1e-6  # converged distance on the iris: 1e-9 of a tangent
 # least depth of projected points; also for points behind the camera
@@ -25,77 +25,77 @@ def project_points(points_um: Tensor) -> Tensor:
     return points_um[..., :2] / points_um[..., 2:].clamp_min(NEAREST_UM)
 
 
-def landmark_points(p: Tensor) -> Tensor:
+def landmark_points(p: Mapping[str, Tensor]) -> Tensor:
     """(n, len(NAMES), 2) tangents x / z, y / z of the landmarks, without refraction.
 
     Canthi and lid margins on the lid sphere, four points of the limbus, corneal apex.
 
     Args:
-        p: (n, COUNT) parameters.
+        p: of :func:`codesign.eye.model_parameters`.
     """
-    centre, axis, across, below, right, down, out = (
-        p[:, k : k + 3]
-        for k in (
-            model.CENTRE,
-            model.AXIS,
-            model.IRIS_X,
-            model.IRIS_Y,
-            model.FACE_X,
-            model.FACE_Y,
-            model.FACE_Z,
-        )
+    centre, axis, across, below = (
+        p[name] for name in ("centre", "axis", "iris_x", "iris_y")
     )
-    v = p[:, :, None]
-    middle = v[:, model.MIDDLE]
-    half = 0.98 * v[:, model.HALF]
+    middle, half, upper, lower, lid, ring, radius, ball, cornea = (
+        p[name][:, None]
+        for name in (
+            "middle", "half", "upper", "lower", "lid_r", "limbus_d", "limbus_r",
+            "cornea_d", "cornea_r",
+        )
+    )  # fmt: skip
 
     def on_lid(x: Tensor, y: Tensor) -> Tensor:
-        z = torch.sqrt((v[:, model.LID_R] ** 2 - x**2 - y**2).clamp_min(1e4))
-        return centre + x * right + y * down + z * out
+        z = torch.sqrt((lid**2 - x**2 - y**2).clamp_min(1e4))
+        return centre + x * p["face_x"] + y * p["face_y"] + z * p["face_z"]
 
     zero = torch.zeros_like(middle)
-    ring, radius = v[:, model.LIMBUS_D], v[:, model.LIMBUS_R]
-    points = [on_lid(middle - half, zero), on_lid(middle + half, zero)]
-    points += [on_lid(middle, -v[:, model.UPPER]), on_lid(middle, v[:, model.LOWER])]
+    points = [on_lid(middle - 0.98 * half, zero), on_lid(middle + 0.98 * half, zero)]
+    points += [on_lid(middle, -upper), on_lid(middle, lower)]
     points += [
         centre + ring * axis + radius * side
         for side in (across, below, -across, -below)
     ]
-    points.append(centre + (v[:, model.CORNEA_D] + v[:, model.CORNEA_R]) * axis)
+    points.append(centre + (ball + cornea) * axis)
     return project_points(torch.stack(points, 1))
 
 
-def trace_to_iris(p: Tensor, tangents: Tensor) -> Tensor:
+def trace_to_iris(p: Mapping[str, Tensor], tangents: Tensor) -> Tensor:
     """(k, n, m, 2) points, um, where rays meet the iris plane behind the cornea.
 
     Snell's law at the corneal sphere, as in :mod:`codesign.eye.kernel`.
 
     Args:
-        p: (n, COUNT) parameters. tangents: (k, n, m, 2) of the rays.
+        p: of :func:`codesign.eye.model_parameters`.
+        tangents: (k, n, m, 2) of the rays.
     """
-    v = p.mT[:, None, :, None]  # vectors along the first axis: sums over it are quick
+    # vectors along the first axis: sums over it are quick
     centre, axis, across, below = (
-        v[k : k + 3] for k in (model.CENTRE, model.AXIS, model.IRIS_X, model.IRIS_Y)
+        p[name].mT[:, None, :, None] for name in ("centre", "axis", "iris_x", "iris_y")
+    )
+    ball, radius, index, plane = (
+        p[name][:, None] for name in ("cornea_d", "cornea_r", "index", "pupil_d")
     )
     ray = torch.stack([*tangents.unbind(-1), torch.ones_like(tangents[..., 0])])
     ray = ray / (ray * ray).sum(0).sqrt()
-    cornea = centre + v[model.CORNEA_D] * axis
+    cornea = centre + ball * axis
     along = (cornea * ray).sum(0)
     closest = cornea - along * ray
-    discriminant = v[model.CORNEA_R] ** 2 - (closest * closest).sum(0)
+    discriminant = radius**2 - (closest * closest).sum(0)
     hit = (along - discriminant.clamp_min(1e4).sqrt()) * ray
-    normal = (hit - cornea) / v[model.CORNEA_R]
-    eta, cosine = 1 / v[model.INDEX], -(normal * ray).sum(0)
+    normal = (hit - cornea) / radius
+    eta, cosine = 1 / index, -(normal * ray).sum(0)
     bend = eta * cosine - (1 - eta**2 * (1 - cosine**2)).clamp_min(1e-4).sqrt()
     refracted = eta * ray + bend * normal
-    point = hit - centre - v[model.PUPIL_D] * axis
+    point = hit - centre - plane * axis
     slope = -(refracted * axis).sum(0)
     path = ((point * axis).sum(0) / slope.clamp_min(0.05)).clamp_min(0)
     point = point + path * refracted
     return torch.stack([(point * across).sum(0), (point * below).sum(0)], -1)
 
 
-def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
+def iris_to_camera(
+    p: Mapping[str, Tensor], iris_um: Tensor, *, steps: int = 12
+) -> Tensor:
     """(n, m, 2) tangents of the rays that reach points of the iris plane after
     refraction.
 
@@ -103,7 +103,7 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
     straight projection of the entrance pupil.
 
     Args:
-        p: (n, COUNT) parameters.
+        p: of :func:`codesign.eye.model_parameters`.
         iris_um: (n, m, 2) points in the plane of the iris.
         steps: Newton steps at most.
 
@@ -113,11 +113,10 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         projection: always finite.
     """
     centre, axis, across, below = (
-        p[:, None, k : k + 3]
-        for k in (model.CENTRE, model.AXIS, model.IRIS_X, model.IRIS_Y)
+        p[name][:, None] for name in ("centre", "axis", "iris_x", "iris_y")
     )
     # entrance pupil: apparent position 0.55 mm nearer, 13 % larger
-    lift = p[:, None, model.PUPIL_D, None] + 550.0
+    lift = p["pupil_d"][:, None, None] + 550.0
     straight = project_points(
         centre
         + lift * axis

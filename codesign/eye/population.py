@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import model
 from codesign.eye.textures import KINDS, VARIANTS
 from metalens.core.errors import SceneError
 
@@ -33,7 +32,10 @@ POPULATION: Mapping[str, SubjectTrait] = {
     name: SubjectTrait(**row)
     for name, row in tomllib.loads(_DATA.read_text("utf-8")).items()
 }
-TEXTURES = ("iris", "vein", "skin", "fine", "lash", "offset_x", "offset_y", "turn")
+TEXTURES = (
+    "t_iris", "t_vein", "t_skin", "t_fine", "t_lash", "offset_x", "offset_y", "turn",
+)  # fmt: skip
+BLEND_UM = 1600.0  # over which lid shell and face plane run into each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +43,15 @@ class CameraRig:
     """Camera and lamps on the glasses.
 
     distance_um: lens to pupil when nothing slipped. The paper's bench sits 2 cm below
-    the eye at 45 degrees, whose
-        axis meets the pupil at 28 mm, outside the 16-26 mm of its own simulation; we
-        keep angle and depth range.
+    the eye at 45 degrees, whose axis meets the pupil at 28 mm, outside the 16-26 mm of
+    its own simulation; we keep angle and depth range.
     elevation_rad: of the face's normal above the direction to the camera; the camera
     looks up.
-    aim_um: (x, y) of the nominal pupil beside the camera's axis.
+    azimuth_rad: of the camera from the face's normal towards the temple.
+    right_eye: the mirror image of a left eye.
+    aim_um: (x, y) of the nominal pupil beside the camera's axis, x towards the temple.
     sensor_distance_um: lens to sensor.
-    lamps_um: positions of the flood LEDs in the camera's frame.
+    lamps_um: positions of the flood LEDs in the camera's frame, x towards the temple.
     """
 
     distance_um: float = 21_000.0
@@ -60,30 +63,40 @@ class CameraRig:
         (-9e3, -5e3, 0.0),
         (0.0, -12e3, 3e3),
     )
+    azimuth_rad: float = 0.0
+    right_eye: bool = False
 
     def __post_init__(self) -> None:
         if not (
-            self.distance_um > 0
-            and math.isfinite(self.distance_um)
-            and abs(self.elevation_rad) < 1.4
+            0 < self.distance_um < math.inf
+            and max(abs(self.elevation_rad), abs(self.azimuth_rad)) < 1.4
         ):
             raise SceneError(
-                f"rig at {self.distance_um} um, {self.elevation_rad} rad: need a distance above 0 and |angle| < 1.4"
+                f"rig at {self.distance_um} um, {self.elevation_rad} rad up, {self.azimuth_rad} rad aside: need a "
+                "distance above 0 and |angle| < 1.4"
             )
-        if len(self.lamps_um) != model.LED_COUNT:
-            raise SceneError(f"{len(self.lamps_um)} lamps, need {model.LED_COUNT}")
+        if len(self.lamps_um) != 3:
+            raise SceneError(f"{len(self.lamps_um)} lamps, need 3")
 
+    @property
+    def temple(self) -> float:
+        """Direction of the temple along x: 1 for a left eye, -1 for a right eye."""
+        return -1.0 if self.right_eye else 1.0
 
-def face_axes(elevation_rad: float) -> Tensor:
-    """(3, 3) rows right, down and out of the face in the frame of a camera below it.
+    @property
+    def pupil_um(self) -> Tensor:
+        """(3,) nominal position of the pupil in the camera's frame."""
+        x, y = self.aim_um
+        return torch.tensor([self.temple * x, y, self.distance_um], dtype=torch.float64)
 
-    Args:
-        elevation_rad: of the face's normal above the camera's direction.
-    """
-    s, c = math.sin(elevation_rad), math.cos(elevation_rad)
-    return torch.tensor(
-        [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64
-    )
+    @property
+    def face_axes(self) -> Tensor:
+        """(3, 3) rows right, down and out of the face in the camera's frame."""
+        s, c = math.sin(self.elevation_rad), math.cos(self.elevation_rad)
+        azimuth = self.temple * self.azimuth_rad
+        sa, ca = math.sin(azimuth), math.cos(azimuth)
+        rows = [[ca, -sa * s, -sa * c], [0.0, c, -s], [-sa, -ca * s, -ca * c]]
+        return torch.tensor(rows, dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -114,25 +127,16 @@ class EyeStates:
 
     def __post_init__(self) -> None:
         n = len(self.traits)
-        shapes = {
-            "traits": (n, len(POPULATION)),
-            "textures": (n, len(TEXTURES)),
-            "gaze_rad": (n, 2),
-            "torsion_rad": (n,),
-        }
-        shapes |= {
-            "slip_um": (n, 3),
-            "mount_rad": (n, 2),
-            "aperture": (n,),
-            "scale": (n,),
-        }
-        for name, shape in shapes.items():
+        tails = {"traits": (len(POPULATION),), "textures": (len(TEXTURES),)}
+        tails |= {"gaze_rad": (2,), "slip_um": (3,), "mount_rad": (2,)}
+        for name in self.__slots__:
+            shape = (n, *tails.get(name, ()))
             value = getattr(self, name)
             if tuple(value.shape) != shape:
                 raise SceneError(f"{name} has shape {tuple(value.shape)}, need {shape}")
-            if not bool(torch.isfinite(value).all()):
-                row = int(torch.nonzero(~torch.isfinite(value))[0, 0])
-                raise SceneError(f"{name} of state {row} is not finite")
+            bad = torch.nonzero(~torch.isfinite(value))
+            if len(bad):
+                raise SceneError(f"{name} of state {int(bad[0, 0])} is not finite")
 
     def __len__(self) -> int:
         return len(self.traits)
@@ -215,8 +219,8 @@ def model_parameters(
     *,
     pixel_rad: float,
     exposed: EyeStates | None = None,
-) -> Tensor:
-    """(n, COUNT) renderer parameters of :mod:`codesign.eye.model`, float64.
+) -> dict[str, Tensor]:
+    """Renderer parameters by name, float64: (n,) numbers and (n, 3) vectors.
 
     Differentiable in gaze, torsion, slip and mount. The lids follow the vertical gaze
     by half the motion of the sclera. Exposure gain grows with the square of the face's
@@ -227,8 +231,13 @@ def model_parameters(
         pixel_rad: angle of a pixel, which sets the softness of edges.
         exposed: states that the automatic exposure was set at; by default these,
             without following their derivatives.
+
+    Returns:
+        traits and textures of the states, and what
+        :data:`codesign.eye.kernel.Parameters` needs beside them.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
+    t |= dict(zip(TEXTURES, states.textures.unbind(1), strict=True))
     size = t["size"]
     cornea = t["cornea_radius_um"] * size
     limbus = t["limbus_radius_um"] * size
@@ -236,17 +245,13 @@ def model_parameters(
     limbus_plane, cornea_centre = _limbus_and_cornea_um(sclera, cornea, limbus)
     pupil_plane = cornea_centre + cornea - t["pupil_behind_um"] * size
     face = _face(rig, states)
-    axis, across, down = _rotated_axes(face, states)
+    axis, across, down = _rotated_axes(face, rig, states)
     centre = (
         _turn(_nominal_centre(rig, t["depth_um"], pupil_plane), states.mount_rad)
         + states.slip_um
     )
-    plane = centre + face[2] * (cornea_centre + cornea - t["plane_um"])[:, None]
-    lamps = (
-        torch.tensor(rig.lamps_um, dtype=torch.float64)
-        .flatten()
-        .expand(len(states), -1)
-    )
+    lamps = torch.tensor(rig.lamps_um, dtype=torch.float64)
+    lamps = lamps * torch.tensor([rig.temple, 1.0, 1.0], dtype=torch.float64)
     lid_shift = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
     lower = t["fissure_lower_um"] * size + 0.9 * lid_shift
     upper = (
@@ -256,76 +261,41 @@ def model_parameters(
     half_width = t["fissure_half_um"] * size
     exposed_states = states if exposed is None else exposed
     depth = _exposure_depth(rig, t["depth_um"], pupil_plane, exposed_states)
-    gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
-    edge = 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0
-    parameters = {
-        model.CENTRE: centre, model.FACE_X: face[0], model.FACE_Y: face[1], model.FACE_Z: face[2], model.AXIS: axis,
-        model.IRIS_X: across, model.IRIS_Y: down, model.PLANE: plane, model.LED: lamps,
-        model.SCLERA_R: sclera, model.CORNEA_R: cornea, model.CORNEA_D: cornea_centre, model.LIMBUS_R: limbus,
-        model.LIMBUS_D: limbus_plane, model.PUPIL_D: pupil_plane, model.LID_R: sclera + t["lid_thickness_um"],
-        model.EDGE: edge, model.UPPER: upper, model.LOWER: lower, model.SKEW: t["fissure_skew_um"] * size,
-        model.HALF: half_width, model.GAIN: gain, model.AMBIENT: t["ambient"] / (depth.clamp_min(3000.0) / 20e3) ** 2,
-        model.CARUNCLE: t["fissure_middle_um"] - 0.93 * half_width,
-    }  # fmt: skip
-    return _row(parameters | _copied_traits(t) | _texture_parameters(states.textures))
-
-
-BLEND_UM = 1600.0  # over which lid shell and face plane run into each other
-AS_THEY_ARE = {  # traits that are renderer parameters unchanged
-    model.PUPIL_R: "pupil_radius_um", model.INDEX: "index", model.MIDDLE: "fissure_middle_um",
-    model.CREASE: "crease_um", model.IRIS: "iris", model.IRIS_CONTRAST: "iris_contrast",
-    model.SCLERA: "sclera", model.VEINS: "veins", model.SKIN: "skin",
-    model.PORES: "pores", model.LASHES: "lashes", model.PUPIL: "pupil", model.GLINT: "glint",
-    model.BROW: "brow",
-}  # fmt: skip
-PICTURES = {
-    model.T_IRIS: "iris", model.T_VEIN: "vein", model.T_SKIN: "skin", model.T_FINE: "fine", model.T_LASH: "lash",
-    model.OFFSET_X: "offset_x", model.OFFSET_Y: "offset_y",
-}  # fmt: skip
-
-
-def _copied_traits(traits: Mapping[str, Tensor]) -> dict[int, Tensor]:
-    """Renderer parameters by index that are traits unchanged, and the blend of the
-    face.
-    """
-    return {model.BLEND: torch.full_like(traits["size"], BLEND_UM)} | {
-        index: traits[name] for index, name in AS_THEY_ARE.items()
+    brightness = (depth.clamp_min(3000.0) / 20e3) ** 2
+    return t | {
+        "centre": centre,
+        "face_x": face[0],
+        "face_y": face[1],
+        "face_z": face[2],
+        "axis": axis,
+        "iris_x": across,
+        "iris_y": down,
+        "plane": centre + face[2] * (cornea_centre + cornea - t["plane_um"])[:, None],
+        "lamp_a": lamps[0].expand(len(states), 3),
+        "lamp_b": lamps[1].expand(len(states), 3),
+        "lamp_c": lamps[2].expand(len(states), 3),
+        "sclera_r": sclera,
+        "cornea_r": cornea,
+        "cornea_d": cornea_centre,
+        "limbus_r": limbus,
+        "limbus_d": limbus_plane,
+        "pupil_r": t["pupil_radius_um"],
+        "pupil_d": pupil_plane,
+        "lid_r": sclera + t["lid_thickness_um"],
+        "blend": torch.full_like(size, BLEND_UM),
+        "edge": 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0,
+        "upper": upper,
+        "lower": lower,
+        "skew": t["fissure_skew_um"] * size,
+        "middle": t["fissure_middle_um"],
+        "half": half_width,
+        "crease": t["crease_um"],
+        "ambient": t["ambient"] / brightness,
+        "gain": t["exposure"] * brightness / 1.6,
+        "turn_x": torch.cos(t["turn"]),
+        "turn_y": torch.sin(t["turn"]),
+        "caruncle": t["fissure_middle_um"] - 0.93 * half_width,
     }
-
-
-def _texture_parameters(textures: Tensor) -> dict[int, Tensor]:
-    """Renderer parameters by index of texture numbers, offsets and iris rotation."""
-    columns = dict(zip(TEXTURES, textures.unbind(1), strict=True))
-    turn = {
-        model.TURN_X: torch.cos(columns["turn"]),
-        model.TURN_Y: torch.sin(columns["turn"]),
-    }
-    return turn | {index: columns[name] for index, name in PICTURES.items()}
-
-
-def _row(places: Mapping[int, Tensor]) -> Tensor:
-    """(n, COUNT) parameters of frames from their values by first column index.
-
-    Each value is (n,) or (n, columns).
-
-    Raises:
-        SceneError: an index is left out, or filled twice.
-    """
-    columns = []
-    filled = 0
-    for place in sorted(places):
-        if place != filled:
-            raise SceneError(
-                f"parameter {filled} of a frame is {'left out' if place > filled else 'filled twice'}"
-            )
-        values = places[place]
-        columns.append(values if values.ndim == 2 else values[:, None])
-        filled += columns[-1].shape[1]
-    if filled != model.COUNT:
-        raise SceneError(
-            f"a frame has {filled} parameters, the picture reads {model.COUNT}"
-        )
-    return torch.cat(columns, 1)
 
 
 def mean_eye_um(rig: CameraRig) -> tuple[tuple[float, float, float], float]:
@@ -370,24 +340,22 @@ def eye_axes(states: EyeStates, rig: CameraRig) -> tuple[Tensor, Tensor]:
     Args:
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
     """
-    axis, across, down = _rotated_axes(_face(rig, states), states)
+    axis, across, down = _rotated_axes(_face(rig, states), rig, states)
     tan_x = torch.tan(states.trait("kappa_x_rad"))
     tan_y = torch.tan(states.trait("kappa_y_rad"))
-    visual = (
-        axis - tan_x[:, None] * across - tan_y[:, None] * down
-    )  # nose to -x, up to -y
+    # towards the nose, and up
+    visual = axis - tan_x[:, None] * across - tan_y[:, None] * down
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
 def _face(rig: CameraRig, states: EyeStates) -> tuple[Tensor, Tensor, Tensor]:
-    """(n, 3) axes right, down and out of the face in the camera's frame, after the
-    mount.
+    """(n, 3) axes of the face, to the temple, down and out, in the camera's frame,
+    after the mount.
     """
     right, down, out = (
-        _turn(row.expand(len(states), 3), states.mount_rad)
-        for row in face_axes(rig.elevation_rad)
+        _turn(row.expand(len(states), 3), states.mount_rad) for row in rig.face_axes
     )
-    return right, down, out
+    return rig.temple * right, down, out
 
 
 def _nominal_centre(rig: CameraRig, depth_um: Tensor, behind_um: Tensor) -> Tensor:
@@ -395,10 +363,10 @@ def _nominal_centre(rig: CameraRig, depth_um: Tensor, behind_um: Tensor) -> Tens
 
     ``behind_um``: distance of the pupil before the centre.
     """
-    out = face_axes(rig.elevation_rad)[2]
-    aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return aim + depth_um[:, None] * along - behind_um[:, None] * out
+    return (
+        rig.pupil_um + depth_um[:, None] * along - behind_um[:, None] * rig.face_axes[2]
+    )
 
 
 def _exposure_depth(
@@ -415,25 +383,26 @@ def _exposure_depth(
 
 
 def _rotated_axes(
-    face: tuple[Tensor, Tensor, Tensor], states: EyeStates
+    face: tuple[Tensor, Tensor, Tensor], rig: CameraRig, states: EyeStates
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Optic axis, iris x and iris y axis, (n, 3) each, of eyes at a gaze and torsion.
+    """Optic axis, iris x (to the temple) and iris y axis, (n, 3) each, of eyes at a
+    gaze and torsion.
 
     Rodrigues rotation by the gaze angle about an axis in the face plane (Listing's
     law), then torsion about the optic axis. Smooth up to a rotation of pi: no gimbal
     lock.
 
     Args:
-        face: right, down and out axes of the face.
+        face: axes of the face to the temple, down and out.
     """
-    right, down, out = face
-    gx, gy = states.gaze_rad[:, :1], states.gaze_rad[:, 1:]
+    temple, down, out = face
+    gx, gy = rig.temple * states.gaze_rad[:, :1], states.gaze_rad[:, 1:]
     angle = torch.sqrt(gx**2 + gy**2 + 1e-24)
     sinc = torch.sin(angle) / angle
     versine = 2 * (torch.sin(angle / 2) / angle) ** 2
-    gaze = gx * right + gy * down
+    gaze = gx * temple + gy * down
     axis = torch.cos(angle) * out + sinc * gaze
-    across = right - gx * (versine * gaze + sinc * out)
+    across = temple - gx * (versine * gaze + sinc * out)
     lower = down - gy * (versine * gaze + sinc * out)
     c = torch.cos(states.torsion_rad)[:, None]
     s = torch.sin(states.torsion_rad)[:, None]

@@ -1,5 +1,6 @@
 """Frames of eyes: radiance and coverage of two sheets, depth, pupil masks and labels."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import kernel, model, textures
+from codesign.eye import kernel, textures
 from codesign.eye.landmarks import iris_to_camera, landmark_points
 from codesign.eye.population import (
     CameraRig,
@@ -135,34 +136,35 @@ def render(
     p = model_parameters(
         states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed
     )
-    frames, mask = _render_arrays(p, states.scale, rig, camera, texture_seed)
-    return RenderedFrames(
-        frames, mask, _labels(states, p, mask, rig=rig, camera=camera)
-    )
+    rays = camera.tangents(rig).astype(np.float32)
+    bank = textures.packed_bank(texture_seed)
+    planes = torch.from_numpy(kernel.render_frames(parameter_rows(p), bank, rays))
+    light, cover, depth = planes[:, :2], planes[:, 2:4], planes[:, 4:6]
+    depth *= states.scale.float()[:, None, None, None]
+    mask = planes[:, 6]
+    labels = _labels(states, p, mask, rig=rig, camera=camera)
+    return RenderedFrames(Frames(light, cover, depth), mask, labels)
 
 
-def _render_arrays(
-    p: Tensor, scale: Tensor, rig: CameraRig, camera: PinholeCamera, seed: int
-) -> tuple[Frames, Tensor]:
-    """Frames and pupil masks from renderer parameters, by the compiled kernel in
-    float32.
+def parameter_rows(p: Mapping[str, Tensor]) -> Array:
+    """(n, kernel.COUNT) float32 parameters of frames, as the compiled kernel reads
+    them.
 
     Args:
-        p: (n, COUNT) parameters. scale: (n,) factor of the depths.
+        p: of :func:`codesign.eye.model_parameters`.
     """
-    n, size = len(p), camera.pixels
-    light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
-    pupil = np.empty((n, 1, size, size), np.float32)
-    values, scales = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    rays = camera.tangents(rig).astype(np.float32)
-    bank = textures.packed_bank(seed)
-    kernel.render_rows(values, scales, bank, rays, rays, light, cover, depth, pupil)
-    sheets = Frames(*map(torch.from_numpy, (light, cover, depth)))
-    return sheets, torch.from_numpy(pupil[:, 0])
+    columns = [p[name] for name in kernel.VECTORS + kernel.NUMBERS]
+    rows = torch.cat([c.reshape(len(c), -1) for c in columns], 1)
+    return np.asarray(rows.detach().numpy(), np.float32)
 
 
 def _labels(
-    states: EyeStates, p: Tensor, mask: Tensor, *, rig: CameraRig, camera: PinholeCamera
+    states: EyeStates,
+    p: Mapping[str, Tensor],
+    mask: Tensor,
+    *,
+    rig: CameraRig,
+    camera: PinholeCamera,
 ) -> FrameLabels:
     """Labels of frames from states, renderer parameters and pupil masks.
 
@@ -170,14 +172,16 @@ def _labels(
     (shoelace formula).
 
     Args:
-        p: (n, COUNT) parameters. mask: (n, y, x) visible share of pupil.
+        p: of :func:`model_parameters`. mask: (n, y, x) visible share of pupil.
     """
-    p = p.detach()
-    scale = states.scale[:, None]
-    centre = p[:, model.CENTRE : model.CENTRE + 3]
-    pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
+    scale, nominal = states.scale[:, None], rig.pupil_um
+    centre = p["centre"]
+    pupil = centre + p["pupil_d"][:, None] * p["axis"]
     optic, visual = eye_axes(states, rig)
-    nominal = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
+    depth = torch.zeros_like(centre)
+    depth[:, 2] = states.trait("depth_um")
+    # of an eye that looks straight ahead, before a camera turned by its mounting
+    unslipped = _turn(nominal + depth, states.mount_rad)
     middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
@@ -191,9 +195,9 @@ def _labels(
     centroid = torch.where(visible_area[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return FrameLabels(
         slip_um=scale * (nominal + states.slip_um) - nominal,
-        shift_um=scale * (_unslipped_place_um(states, rig) + states.slip_um) - nominal,
-        optic_axis=optic.detach(),
-        visual_axis=visual.detach(),
+        shift_um=scale * (unslipped + states.slip_um) - nominal,
+        optic_axis=optic,
+        visual_axis=visual,
         centre_um=scale * centre,
         pupil_um=scale * pupil,
         pupil_px=middle,
@@ -203,28 +207,9 @@ def _labels(
     )
 
 
-def _unslipped_place_um(states: EyeStates, rig: CameraRig) -> Tensor:
-    """(n, 3) pupil position of an eye that looks straight ahead, without slip, um.
-
-    In the frame of a camera turned by its mounting.
-    """
-    depth = (
-        torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        * states.trait("depth_um")[:, None]
-    )
-    return _turn(
-        torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64) + depth,
-        states.mount_rad,
-    )
-
-
-def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
+def _pupil_points(p: Mapping[str, Tensor], rim: int = 24) -> Tensor:
     """(n, 1 + rim, 2) centre and rim of the pupil in the plane of the iris."""
     turn = torch.arange(rim, dtype=torch.float64) * (2 * torch.pi / rim)
-    circle = torch.cat(
-        [
-            torch.zeros(1, 2, dtype=torch.float64),
-            torch.stack([torch.cos(turn), torch.sin(turn)], 1),
-        ]
-    )
-    return p[:, model.PUPIL_R, None, None] * circle
+    circle = torch.stack([torch.cos(turn), torch.sin(turn)], 1)
+    points = torch.cat([torch.zeros(1, 2, dtype=torch.float64), circle])
+    return p["pupil_r"][:, None, None] * points

@@ -121,7 +121,7 @@ def calibrated_error_deg(
     rig = test.scenes.rig
     how = how or SphereCalibrator(rig)
     calibrating = max(3, round(share * test.each))
-    true_deg = face_angles(test.labels.visual_axis.numpy(), rig.elevation_rad)
+    true_deg = face_angles(test.labels.visual_axis.numpy(), rig)
     errors = []
     for first in range(0, test.people * test.each, test.each):
         calibration = np.arange(first, first + calibrating)

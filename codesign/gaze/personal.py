@@ -37,12 +37,12 @@ class PersonalGaze:
 
     mean: the population's eye. own: (7,) centre and radius beside it in mm, two angles
     in deg, roll in rad.
-    elevation_rad: of the face before the camera. rest: of the sphere's angles and the
+    rig: pose of the camera. rest: of the sphere's angles and the
     slippage, to what it misses.
     """
 
     mean: EyeGeometry
-    elevation_rad: float
+    rig: CameraRig
     own: Array
     rest: ResidualRegressor | None
 
@@ -62,7 +62,7 @@ class PersonalGaze:
         ray = optical_axis(
             torch.from_numpy(pupil_mm), torch.from_numpy(-slip_mm), geometry
         )
-        angles = face_angles(ray.direction.numpy(), self.elevation_rad) + self.own[4:6]
+        angles = face_angles(ray.direction.numpy(), self.rig) + self.own[4:6]
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 
@@ -150,7 +150,7 @@ def calibrate_person(
     pupil, slip = (np.ascontiguousarray(a, dtype=float) for a in (pupil_mm, slip_mm))
 
     def sphere_of(own: Array) -> PersonalGaze:
-        return PersonalGaze(mean, rig.elevation_rad, own, None)
+        return PersonalGaze(mean, rig, own, None)
 
     def residual(unit: Array, reading_deg: float) -> Array:
         error = sphere_of(unit * SPREAD).sphere(pupil, slip) - gaze_deg

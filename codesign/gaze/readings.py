@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from codesign.eye import face_axes
+from codesign.eye import CameraRig
 from metalens.core.arrays import Array
 
 
@@ -54,15 +54,15 @@ class PersonCalibrator(Protocol):
         """
 
 
-def face_angles(direction: Array, elevation_rad: float) -> Array:
+def face_angles(direction: Array, rig: CameraRig) -> Array:
     """(n, 2) angles across and down, deg, in the frame of the face, of directions (n,
     3) in the camera's.
 
     Args:
         direction: (n, 3) unit vectors in the camera's frame.
-        elevation_rad: of the face's normal above the camera's direction.
+        rig: pose of the camera.
     """
-    right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
+    right, down, out = rig.face_axes.numpy() @ np.asarray(direction).T
     return np.asarray(
         np.degrees(
             np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from codesign.eye import face_axes
+from codesign.eye import CameraRig
 from codesign.network.subnet import Subnet
 from metalens.core.store import replace_atomically
 
@@ -30,15 +30,14 @@ OUTPUTS = {  # name: what it is
 class OutputScale:
     """What turns a network's answers into lengths and angles.
 
-    frame_mm: edge of all pixels. slip_mm: unit of the slippage. elevation_rad: of the
-    face's normal above the direction
-    to the camera. axis, points: whether training gave them weight; what it did not is
+    frame_mm: edge of all pixels. slip_mm: unit of the slippage. rig: pose of the camera.
+    axis, points: whether training gave them weight; what it did not is
     left out.
     """
 
     frame_mm: float
     slip_mm: tuple[float, float, float]
-    elevation_rad: float
+    rig: CameraRig
     axis: bool = True
     points: bool = True
 
@@ -80,9 +79,7 @@ class ExportedNetwork(nn.Module):
 
     def _angles(self, axis: Tensor) -> Tensor:
         """(batch, 2) angles across and down, deg, of optic axes of any length."""
-        right, down, out = (
-            axis @ face_axes(self.scale.elevation_rad).to(axis).mT
-        ).unbind(1)
+        right, down, out = (axis @ self.scale.rig.face_axes.to(axis).mT).unbind(1)
         horizontal = torch.sqrt(right**2 + out**2)
         return torch.stack(
             [torch.atan2(right, out), torch.atan2(down, horizontal)], 1
@@ -130,7 +127,9 @@ def write_onnx(
             "pixels": size,
             "pitch_um": pitch_um,
             "frame_mm": scale.frame_mm,
-            "elevation_rad": scale.elevation_rad,
+            "elevation_rad": scale.rig.elevation_rad,
+            "azimuth_rad": scale.rig.azimuth_rad,
+            "right_eye": scale.rig.right_eye,
         }
         _describe(part, shapes, {name: repr(value) for name, value in camera.items()})
 

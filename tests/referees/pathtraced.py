@@ -26,15 +26,13 @@ from codesign.eye import (
     CameraRig,
     EyeStates,
     PinholeCamera,
-    model,
-    model_parameters,
     renderer,
     textures,
 )
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
-from tests.codesign.eye import plain_eye
+from tests.codesign.eye import model, plain_eye
 from tests.referees.traced_shapes import LAMP_RADIUS_MM, build
 
 REGIONS = ("pupil", "iris", "sclera", "skin", "edges", "mirrors")
@@ -192,9 +190,7 @@ def picture(made: Comparison, path: Path) -> None:
 
 
 def _parameters(states: EyeStates, rig: CameraRig, camera: PinholeCamera) -> Tensor:
-    return model_parameters(
-        states[:1], rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
-    )[0]
+    return model.rows_of_camera(states[:1], rig, camera)[0]
 
 
 def _bank() -> Tensor:

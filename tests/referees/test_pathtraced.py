@@ -5,10 +5,11 @@ refusals without Mitsuba.
 import numpy as np
 import pytest
 
-from codesign.eye import model, renderer
 from codesign.eye import population as eye
+from codesign.eye import renderer
 from codesign.eye.population import CameraRig
 from codesign.eye.renderer import PinholeCamera
+from tests.codesign.eye import model
 from tests.referees import pathtraced, traced_shapes
 
 CAMERA = PinholeCamera(pixels=32, pitch_um=45.0)

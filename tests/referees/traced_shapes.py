@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import CameraRig, PinholeCamera, model
+from codesign.eye import CameraRig, PinholeCamera
 from metalens.core.arrays import Array
-from tests.codesign.eye import plain_eye
+from tests.codesign.eye import model, plain_eye
 
 LAMP_RADIUS_MM = (
     2.0  # of the emitting spheres, large enough to be met by chance through the cornea

@@ -1,7 +1,7 @@
 """The scene model on torch tensors: exact, differentiable and slow. What the compiled
 renderer (:mod:`codesign.eye.kernel`) is compared with.
 
-``p`` holds the parameters of a frame at the indices of :mod:`codesign.eye.model`, ``t``
+``p`` holds the parameters of a frame at the indices of :mod:`tests.codesign.eye.model`, ``t``
 the bank of textures.
 """
 
@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from codesign.eye import textures
-from codesign.eye.model import (
+from codesign.eye.population import CameraRig
+from codesign.eye.renderer import PinholeCamera
+from tests.codesign.eye.model import (
     AMBIENT,
     AXIS,
     BLEND,
@@ -61,8 +63,6 @@ from codesign.eye.model import (
     UPPER,
     VEINS,
 )
-from codesign.eye.population import CameraRig
-from codesign.eye.renderer import PinholeCamera
 
 Real = Any  # a torch tensor
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.eye import landmarks, model
+from codesign.eye import landmarks
 from codesign.eye import population as eye
 from codesign.eye.population import POPULATION, CameraRig, EyeStates, MotionRanges
 from codesign.eye.renderer import PinholeCamera
 from metalens.core.errors import SceneError
-from tests.codesign.eye import plain_eye
+from tests.codesign.eye import model, plain_eye
 
 FRONTAL = CameraRig(elevation_rad=0.0, aim_um=(0.0, 0.0))
 
@@ -76,11 +76,9 @@ def test_listing_turns_by_the_shortest_way(gaze):
     """Axes stay orthonormal, the axis makes the stated angle, and the rotation has no
     part about the primary axis.
     """
-    p = pack(mean_states(gaze_rad=torch.tensor([gaze], dtype=torch.float64)))[0]
-    axes = torch.stack([p[k : k + 3] for k in (model.IRIS_X, model.IRIS_Y, model.AXIS)])
-    face = torch.stack(
-        [p[k : k + 3] for k in (model.FACE_X, model.FACE_Y, model.FACE_Z)]
-    )
+    p = pack(mean_states(gaze_rad=torch.tensor([gaze], dtype=torch.float64)))
+    axes = torch.stack([p[name][0] for name in ("iris_x", "iris_y", "axis")])
+    face = torch.stack([p[name][0] for name in ("face_x", "face_y", "face_z")])
     assert torch.allclose(axes @ axes.mT, torch.eye(3, dtype=torch.float64), atol=1e-12)
     assert float(axes[2] @ face[2]) == pytest.approx(
         math.cos(math.hypot(*gaze)), abs=1e-12
@@ -101,7 +99,7 @@ def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
     apex = 21000.0 - 3600.0
     assert tangent * (apex + virtual) == pytest.approx(10.0 * n * virtual / s, rel=1e-4)
     ray = torch.tensor([[0.0]], dtype=torch.float64)
-    q = p.mT[:, :, None]
+    q = model.rows(mean_states(), FRONTAL, 0.0045).mT[:, :, None]
     dx, dy, dz = plain_eye.ray(ray, ray)
     bank = torch.zeros(80, 256, 256, dtype=torch.float64)
     _, depth, pupil = plain_eye.eye(q, bank, ray, ray, ray + 5e3, ray + 5e3, dx, dy, dz)
@@ -117,15 +115,13 @@ def test_refracted_rays_obey_snell_at_the_cornea():
     target = torch.tensor([[[1500.0, -700.0]]], dtype=torch.float64)
     t = landmarks.iris_to_camera(p, target)[0, 0].numpy()
     d = np.array([*t, 1.0]) / math.hypot(*t, 1.0)
-    value = p[0].numpy()
-    centre, axis = value[0:3], value[model.AXIS : model.AXIS + 3]
-    ball = centre + value[model.CORNEA_D] * axis
+    value = {name: part[0].numpy() for name, part in p.items()}
+    centre, axis, x, y = (value[k] for k in ("centre", "axis", "iris_x", "iris_y"))
+    ball = centre + value["cornea_d"] * axis
     b = ball @ d
-    hit = (b - math.sqrt(b**2 - ball @ ball + value[model.CORNEA_R] ** 2)) * d
-    normal = (hit - ball) / value[model.CORNEA_R]
-    x = value[model.IRIS_X : model.IRIS_X + 3]
-    y = value[model.IRIS_Y : model.IRIS_Y + 3]
-    point = centre + value[model.PUPIL_D] * axis + 1500.0 * x - 700.0 * y
+    hit = (b - math.sqrt(b**2 - ball @ ball + value["cornea_r"] ** 2)) * d
+    normal = (hit - ball) / value["cornea_r"]
+    point = centre + value["pupil_d"] * axis + 1500.0 * x - 700.0 * y
     inner = (point - hit) / np.linalg.norm(point - hit)
     assert np.linalg.norm(np.cross(normal, d)) == pytest.approx(
         1.3375 * np.linalg.norm(np.cross(normal, inner)), rel=1e-7
@@ -162,7 +158,8 @@ def test_gradient_of_the_parameters_is_exact():
     states = eye.draw_states(3, 5)
 
     def packed(gaze, slip):
-        p = pack(replace(states, gaze_rad=gaze, slip_um=slip), CameraRig())
+        moved = replace(states, gaze_rad=gaze, slip_um=slip)
+        p = model.rows(moved, CameraRig(), 0.0045)
         return torch.cat(
             [p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1
         )  # edge and exposure are held
@@ -189,3 +186,18 @@ def test_motion_ranges_hold():
     )
     assert (drawn.slip_um.abs().amax(0) <= torch.tensor([1.0, 2.0, 3.0])).all()
     assert 0.8 <= float(drawn.scale.min()) < float(drawn.scale.max()) <= 1.2
+
+
+@pytest.mark.parametrize(("elevation", "azimuth"), [(0.7, 0.0), (-0.3, 0.4)])
+def test_a_camera_sees_the_face_from_its_elevation_and_azimuth(elevation, azimuth):
+    """Spherical angles of the camera in the face: below the eyes and towards the temple,
+    at +x of a left eye.
+    """
+    rig = CameraRig(elevation_rad=elevation, azimuth_rad=azimuth)
+    to_camera = rig.face_axes @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    c = math.cos(elevation)
+    want = [c * math.sin(azimuth), math.sin(elevation), c * math.cos(azimuth)]
+    assert to_camera.tolist() == pytest.approx(want, abs=1e-14)
+    square = rig.face_axes @ rig.face_axes.mT
+    assert torch.allclose(square, torch.eye(3, dtype=torch.float64))
+    assert float(rig.face_axes[1, 0]) == 0  # rows of the camera are level

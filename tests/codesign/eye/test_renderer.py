@@ -14,14 +14,15 @@ from codesign.eye import dataset, renderer
 from codesign.eye import population as eye
 from codesign.eye.population import POPULATION, CameraRig, EyeStates
 from codesign.eye.renderer import PinholeCamera
-from tests.codesign.eye import plain_eye
+from codesign.gaze import face_angles
+from tests.codesign.eye import model, plain_eye
 
 SMALL = PinholeCamera(pixels=64, pitch_um=22.5)
 STATES = eye.draw_states(4, 5)
 
 
 def _p(states, camera=SMALL):
-    return eye.model_parameters(states, CameraRig(), pixel_rad=camera.pitch_um / 2000.0)
+    return model.rows_of_camera(states, CameraRig(), camera)
 
 
 def test_compiled_frames_agree_with_the_twin():
@@ -252,9 +253,44 @@ def test_hidden_pupils_have_empty_masks_or_thin_ones(name, change):
 
 def test_gradient_of_the_twin_is_finite_at_the_limits():
     states = extremes(60, 3)
-    p = eye.model_parameters(states, CameraRig(), pixel_rad=0.045).requires_grad_(True)
+    p = model.rows(states, CameraRig(), 0.045).requires_grad_(True)
     light, *_ = plain_eye.render_in_torch(
         p, CameraRig(), PinholeCamera(pixels=12, pitch_um=150.0)
     )
     light.sum().backward()
     assert bool(torch.isfinite(p.grad).all())
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.35])
+def test_a_right_eye_is_the_mirror_image_of_a_left_one(azimuth):
+    """Scene and camera mirrored about x = 0: the same bytes from right to left; across
+    the gaze, and everything else along x, changes its sign.
+    """
+    lamps = ((9e3, -4e3, 0.0), (-6e3, -5e3, 1e3), (1e3, -12e3, 3e3))
+    left = CameraRig(azimuth_rad=azimuth, lamps_um=lamps)
+    mirrored = replace(
+        STATES,
+        gaze_rad=STATES.gaze_rad * torch.tensor([-1.0, 1.0]),
+        slip_um=STATES.slip_um * torch.tensor([-1.0, 1.0, 1.0]),
+        mount_rad=STATES.mount_rad * torch.tensor([1.0, -1.0]),
+    )
+    seen = renderer.render(STATES, rig=left, camera=SMALL)
+    right = replace(left, right_eye=True)
+    other = renderer.render(mirrored, rig=right, camera=SMALL)
+    for name in ("radiance", "coverage", "depth_um"):
+        pair = [getattr(one.frames, name) for one in (seen, other)]
+        assert torch.allclose(pair[0], pair[1].flip(-1), rtol=0, atol=0), name
+    assert torch.equal(seen.pupil, other.pupil.flip(-1))
+    for name in ("slip_um", "shift_um", "optic_axis", "centre_um", "pupil_um"):
+        pair = [getattr(one.labels, name) for one in (seen, other)]
+        x = torch.tensor([-1.0, 1.0, 1.0])
+        assert torch.allclose(pair[0], pair[1] * x, rtol=1e-12, atol=1e-12), name
+    flipped = torch.tensor([63.0, 0.0]) - other.labels.landmarks_px
+    flipped *= torch.tensor([1.0, -1.0])
+    assert torch.allclose(seen.labels.landmarks_px, flipped, atol=1e-9)
+    gaze = [
+        face_angles(one.labels.visual_axis.numpy(), rig)
+        for one, rig in ((seen, left), (other, right))
+    ]
+    np.testing.assert_allclose(gaze[1], gaze[0] * [-1, 1], atol=1e-9)
+    assert np.abs(gaze[0][:, 0]).min() > 1  # deg: a yaw of 0 would show nothing

@@ -7,8 +7,7 @@ import math
 import pytest
 import torch
 
-from codesign.eye import model
-from tests.codesign.eye import plain_eye
+from tests.codesign.eye import model, plain_eye
 
 BANK = torch.zeros(80, 256, 256, dtype=torch.float64)  # pictures without any texture
 FAR = 1e9

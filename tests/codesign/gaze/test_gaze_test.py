@@ -66,12 +66,11 @@ def test_an_axis_that_is_read_is_calibrated_by_what_other_people_s_tells(group):
             len(true), 3, generator=rng
         )
         centre = torch.from_numpy(true.pupil_mm / (64 * 18e-3))
-        tilt = SCENES.rig.elevation_rad
         axis /= axis.norm(dim=1, keepdim=True)
-        angles = face_angles(axis.numpy(), tilt)
+        angles = face_angles(axis.numpy(), SCENES.rig)
         found.append(replace(bench.read_of(who, centre, slip), axis_deg=angles))
     theirs, read = found
-    looked = face_angles(before.labels.visual_axis.numpy(), tilt)
+    looked = face_angles(before.labels.visual_axis.numpy(), SCENES.rig)
     prior = shared.learn_population(theirs, looked, np.arange(len(looked)) // 60)
     # twelve points for a dozen terms of one's own
     assert calibrated_error_deg(group, read, how=prior) < 0.38 * 1.3

@@ -64,12 +64,13 @@ def _known(gaze, every):
 
 def test_face_angles_undo_the_tilt_of_the_camera():
     s, c = math.sin(0.7), math.cos(0.7)
+    tilted = CameraRig(elevation_rad=0.7)
     ahead = np.array(
         [[0.0, -s, -c]]
     )  # out of a face that the camera sees from 0.7 rad below
-    assert np.allclose(personal.face_angles(ahead, 0.7), 0, atol=1e-12)
+    assert np.allclose(personal.face_angles(ahead, tilted), 0, atol=1e-12)
     turned = ahead * math.cos(0.2) + math.sin(0.2) * np.array([[1.0, 0.0, 0.0]])
-    assert np.allclose(personal.face_angles(turned, 0.7), [[math.degrees(0.2), 0.0]])
+    assert np.allclose(personal.face_angles(turned, tilted), [[math.degrees(0.2), 0.0]])
 
 
 def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():

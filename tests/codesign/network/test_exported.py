@@ -2,6 +2,7 @@
 that it says, for any batch.
 """
 
+import ast
 import copy
 import dataclasses
 
@@ -9,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.eye import CameraRig
 from codesign.network import architecture as arch
 from codesign.network import exported
 from codesign.network.subnet import Subnet
 from codesign.network.supernet import Supernet, recalibrate_batch_norm
 
 SPACE = arch.SearchSpace()
-SCALE = exported.OutputScale(frame_mm=1.87, slip_mm=(1.4, 0.9, 2.3), elevation_rad=0.6)
+SCALE = exported.OutputScale(
+    frame_mm=1.87, slip_mm=(1.4, 0.9, 2.3), rig=CameraRig(elevation_rad=0.6)
+)
 
 
 @pytest.fixture(scope="module")
@@ -119,10 +123,12 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
         "points_mm": "mm"
     }
     assert whole.graph.output[5].doc_string.endswith("deg")
-    about = {p.key: float(p.value) for p in whole.metadata_props}
+    about = {p.key: ast.literal_eval(p.value) for p in whole.metadata_props}
     assert about == {
         "pixels": 61,
         "pitch_um": 30.0,
         "frame_mm": 1.87,
         "elevation_rad": 0.6,
+        "azimuth_rad": 0.0,
+        "right_eye": False,
     }
