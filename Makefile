@@ -8,7 +8,7 @@ OUT    ?= demo
 # Without byte code on the disk every worker and every command that a test starts would compile all modules again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow check bench peers bench-peers test-peers notebooks site wheel-check clean
+.PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow check bench peers bench-peers notebooks site wheel-check clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -25,7 +25,7 @@ demo: setup
 # Loops are compiled once, before the workers begin.
 test: setup
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.warm
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m 'not slow and not peers'
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m 'not slow'
 
 # The numeric tests under the arithmetic of other processors, and compiled loops as they are written; -all: the whole default suite under each of them.
 test-arithmetic: setup
@@ -35,7 +35,7 @@ test-arithmetic-all: setup
 	$(BIN)/python tests/arithmetic.py all
 
 test-slow: setup
-	$(BIN)/python -m pytest -m 'slow and not peers'
+	$(BIN)/python -m pytest -m slow
 
 check: setup
 	$(BIN)/ruff check .
@@ -54,9 +54,6 @@ peers: setup
 
 bench-peers: peers
 	.venv-peers/bin/python -m benchmarks --peers
-
-test-peers: peers
-	.venv-peers/bin/python -m pytest -m peers tests
 
 notebooks: setup
 	$(BIN)/python -m examples.run

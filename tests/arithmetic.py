@@ -128,7 +128,7 @@ def main(words: list[str]) -> int:
             "--dist",
             "loadfile",
             "-m",
-            "not slow and not peers",
+            "not slow",
         ]
         done = subprocess.run(
             [*command, *folders], cwd=ROOT, env=environment(name), check=False

@@ -6,7 +6,7 @@ benchmarks.studies.shaped_cells N [SEED
 [KIND ...]]`` another number. The referee is the same Fourier method at truncations that
 no bar has seen (orders within
 ``FINEST``), the mean of the last three with their spread as its doubt; ``make
-test-peers`` holds shapes against fmmax,
+bench-peers`` compares shapes with fmmax,
 which shares no code. No times are taken.
 """
 

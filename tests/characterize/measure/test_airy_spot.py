@@ -36,33 +36,6 @@ def on_pixels(pixel_um, x_um, y_um):
     return shot, uniform_filter(airy(radius), FINE), radius, step
 
 
-@pytest.mark.parametrize(
-    ("pixel_um", "fwhm", "ee80"), [(0.9, 0.06, 0.09), (0.45, 0.004, 0.02)]
-)
-def test_widths_are_those_of_the_light_on_pixels_and_wider_by_what_a_pixel_is_taken_as_even(
-    pixel_um, fwhm, ee80
-):
-    """Of twelve places on the pixels the widest errors: 5.5 and 8.2 % at 2.3 pixels a
-    FWHM, 0.3 and 1.95 % at 4.6.
-    """
-    shot, seen, radius, step = on_pixels(pixel_um, 0.31, -0.44)
-    found = metrics.measure_spot(shot, step_um=pixel_um)
-    middle = seen[len(seen) // 2]
-    half = 2 * np.interp(
-        -middle.max() / 2,
-        -middle[len(middle) // 2 :],
-        radius[len(middle) // 2, len(middle) // 2 :],
-    )
-    order = np.argsort(radius, axis=None)
-    held = np.cumsum(seen.ravel()[order]) * step**2
-    wanted = np.interp(0.8 * shot.sum(), held, radius.ravel()[order])
-    assert 0 <= found.fwhm_um / half - 1 < fwhm
-    assert 0 <= found.ee80_um / wanted - 1 < ee80
-    assert found.centroid_um == pytest.approx(
-        (0.31, -0.44), abs=0.02
-    )  # rings that the window's edge cuts
-
-
 def test_encircled_energy_beyond_the_core_is_the_closed_form():
     """1 - J0² - J1² of 2 pi NA r / wavelength, over what the window holds; pixels blur
     rings alone.

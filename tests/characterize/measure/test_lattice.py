@@ -110,33 +110,6 @@ def drawn(rows=40, columns=44):
     return 185 + 40 * np.sin(0.013 * ((x - 9.3) ** 2 + 1.3 * (y - 31.7) ** 2)) + 1.1 * x
 
 
-def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
-    design, (row, column), n = drawn(), (17, 6), 6
-    rng = np.random.default_rng(3)
-    part = design[row : row + n, column : column + n]
-    made = part - 4.2 + 0.05 * (part - 185) + 0.7 * rng.standard_normal(part.shape)
-    made[2, 4] += 25.0  # one that went wrong
-    p = PITCH / PIXEL
-    place = (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) * p
-    side = int(n * p)
-    found = sem.measure_diameters(
-        picture(place, made.ravel(), (side, side), top=0.9),
-        sem.SemMicrograph(PIXEL, PITCH),
-    )
-    laid = overlay.overlay_design(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
-    assert laid.clearly
-    where = overlay.register_to_mask(found, laid).site
-    assert where.min(0).tolist() == [row, column]
-    assert np.flatnonzero(laid.outlier).tolist() == [2 * n + 4]
-    assert np.allclose(laid.designed_nm, part.ravel())
-    for middle, bias, sigma, count in overlay.bias_table(laid, knots=3):
-        assert (
-            abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL
-        )  # edges of a blurred rim: as above
-        assert 0 < sigma < 1.5
-        assert count > 6
-
-
 @pytest.mark.parametrize(
     ("design", "angle_deg", "ratio", "turn_deg"),
     [

@@ -7,7 +7,6 @@ import pytest
 from scipy import ndimage
 
 from characterize.measure import sem
-from characterize.measure.lattice import ImageLattice
 from metalens.core.errors import CaptureError
 
 PIXEL, PITCH = 4.0, 400.0
@@ -113,25 +112,3 @@ def test_calibrated_edge_bias_comes_off_both_sides():
         image, sem.SemMicrograph(PIXEL, PITCH, edge_bias_nm=3.7)
     ).diameter_nm
     assert plain - calibrated == pytest.approx(np.full(16, 7.4), abs=1e-9)
-
-
-def test_summaries_of_the_diameters():
-    four = np.array([201.0, 202.0, np.nan, 204.0, 209.0])
-    zero, no = np.zeros(5), np.zeros(5, bool)
-    site = np.stack([np.arange(5), np.arange(5)[::-1]], axis=1)
-    where = (
-        site,
-        ImageLattice(np.zeros(2), np.array([0.0, 7.0]), np.array([6.0, 0.0])),
-    )
-    found = sem.MeasuredDiameters(zero, zero, four, zero, no, no, *where, no)
-    assert found.mean_nm == pytest.approx(204.0)
-    assert found.three_sigma_nm == pytest.approx(3 * np.sqrt((9 + 4 + 0 + 25) / 4))
-    known = found.bias(np.array([200.0, 200.0, 200.0, 200.0, 200.0]))
-    assert known.value == pytest.approx(4.0)
-    assert known.sigma == pytest.approx(np.sqrt((9 + 4 + 0 + 25) / 3) / 2)
-    assert (
-        sem.MeasuredDiameters(zero, zero, four * 0 + 5, zero, no, no, *where, no)
-        .bias(3.0)
-        .sigma
-        == 0.05
-    )  # never surer than this

@@ -79,21 +79,6 @@ def test_a_spot_near_the_border_of_its_frame_is_found_there(place):
     )  # less of the rings is seen: 1 % of the light
 
 
-def test_a_second_spot_outside_the_core_does_not_move_the_pattern():
-    """Of 0.9, six and a half pixels off; the core ends five from the brightest. Beside
-    a pattern laid on by hand.
-    """
-    core = pixels(0 * U, (33, 36), 1.0, (0.3, -0.2))
-    image = core + 0.9 * pixels(0 * U, (33, 36), 1.0, (6.8, -0.2))
-    ideal = frames.airy_pattern(
-        DESIGN, capture(image, 1.0), image.shape, place_px=(0.3, -0.2)
-    )
-    want = metrics.strehl_ratio(image, ideal - np.median(frames._rim(ideal)))
-    assert frames._strehl(image, DESIGN, capture(image, 1.0)) == pytest.approx(
-        want, rel=2e-3
-    )
-
-
 def test_the_strehl_ratio_of_an_aberrated_spot_is_that_of_its_peak():
     """0.6 rad of coma, a pixel of half the core: 0.03, as its peak is not quite as
     narrow as the perfect one.

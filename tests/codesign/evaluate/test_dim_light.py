@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from codesign.adapt import source as finished
@@ -42,25 +41,3 @@ def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):
     assert 20 * math.log10(signal / noise) == pytest.approx(15.0, abs=1e-3)
     assert half.exposure_e == pytest.approx(here.exposure_e / 4)  # half the diameter
     assert half.ambient_e == pytest.approx(here.ambient_e / 4)
-
-
-def test_good_light_is_each_run_s_own(source):
-    bright = replace(CONFIG, snr_db=None)
-    assert experiment.experiment_sensors([source], bright) == [
-        source.run.trainer.sensor
-    ]
-
-
-def test_subjects_have_the_variety_of_training(source):
-    scenes = source.run.scenes(experiment.EXPERIMENT)
-    bare, _ = experiment.states_of(CONFIG, 0, scenes)
-    varied = replace(scenes, settings=replace(scenes.settings, variety=4.0))
-    changed = []
-    for subject in range(6):
-        rows = bare[slice(2)]
-        one, other = (
-            experiment.render_subject(rows, CONFIG, subject, s).pinhole().numpy()
-            for s in (scenes, varied)
-        )
-        changed.append(np.abs(one - other).max() / one.max())
-    assert min(changed) > 0.01

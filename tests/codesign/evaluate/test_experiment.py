@@ -12,7 +12,7 @@ import torch
 from codesign.adapt import source as finished
 from codesign.batches import EyeScenes, SceneConfig
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentTrials
+from codesign.evaluate.gaze_experiment import ExperimentTrials
 from codesign.eye import population as eye
 from codesign.eye.population import CameraRig
 from codesign.gaze import people_file, personal, shared
@@ -24,19 +24,6 @@ from tests.codesign import made_lens as m
 from tests.referees.seen_pupil import pupil_of
 
 SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, people=9)
-
-
-def test_looks_points_people_and_noise_are_drawn_apart():
-    """Of the same seed and number no two draws are alike."""
-    streams = (
-        experiment.LOOKS,
-        experiment.POINTS,
-        experiment.PEOPLE,
-        experiment.NOISE,
-        2 * experiment.NOISE,
-    )
-    drawn = [np.random.default_rng([7, 3, one]).random(4).tolist() for one in streams]
-    assert len({tuple(one) for one in drawn}) == len(streams)
 
 
 @pytest.fixture(scope="module")
@@ -66,17 +53,6 @@ def _trial(config, subjects):
             for f in ExperimentTrials.__slots__
         )
     )
-
-
-def test_the_paper_s_counts():
-    config = ExperimentConfig()
-    assert config.frames == 20 * 49 * 7 == 6860
-    assert np.ptp(config.stimuli_deg, axis=0).tolist() == [35.0, 25.0]
-    assert sorted(np.unique(np.diff(np.sort(config.slips_mm[:, 2])))) == [0.0, 2.5]
-    trial = _trial(config, 1)
-    assert trial.group(AXIAL).sum() == 5 * 49
-    assert trial.group(LATERAL).sum() == 3 * 49
-    assert (trial.group(AXIAL) & trial.group(LATERAL)).sum() == 49  # the origin
 
 
 def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):

@@ -63,28 +63,6 @@ def test_the_image_has_the_light_of_the_scene_and_less_of_its_detail(found):
     assert 0 < found.error < 0.3
 
 
-def test_psfs_are_those_of_the_middle_and_the_rim(found):
-    """The outermost samples, those that are blurred into the frame included, lie 300 um
-    behind the lens.
-    """
-    beside = 48  # samples of 3 um: half a window of 288 um
-    rim = math.degrees(math.atan((24 + 2 * beside - 1) / 2 * 3.0 / 300.0))
-    assert found.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
-    assert found.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
-    assert np.all(np.diff(found.depth_um) > 0)
-    assert found.psf.shape == (
-        3,
-        3,
-        3,
-        97,
-        97,
-    )  # first, middle and last; 288 um about a sample
-    # a lens that is alike to both sides: left and right PSFs are each other's mirror
-    # images, to the nodes' own error
-    left, right = found.psf[1, 1, 0], found.psf[1, 1, 2][:, ::-1]
-    assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(left)
-
-
 def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
     """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field
     angles alike.

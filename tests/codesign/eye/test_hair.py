@@ -61,24 +61,3 @@ def test_lashes_that_sink_cross_the_eye():
     assert rows.max() <= BOTTOM + 1
     crossed = np.flatnonzero(np.diff(rows) > 1)[0]
     assert rows[crossed] - TOP == pytest.approx(1.1 * reach, abs=0.1 * reach + 1)
-
-
-def test_lashes_lean_outward():
-    """Beyond the opening at both ends, and in the mean farther from its middle than
-    their roots are.
-    """
-    _, picture = drawn(0.0, 0.9)
-    far, middle = picture[: TOP - 6], (LEFT + RIGHT + 1) // 2
-    assert far[:, :LEFT].sum() > 0
-    assert far[:, RIGHT + 1 :].sum() > 0
-    columns = np.arange(SIZE)
-    for half in (slice(0, middle), slice(middle, SIZE)):
-        at = float((far[:, half] * columns[half]).sum() / far[:, half].sum())
-        assert (
-            abs(at - middle) > 18 + 2
-        )  # roots: 18 in the mean; leant by 1.4 / 72 of that, times 14 pixels of length
-
-
-def test_no_lashes_without_an_opening_and_the_same_from_the_same_draws():
-    assert not draw_lashes(torch.zeros(SIZE, SIZE), np.full(12, 0.6)).any()
-    assert np.array_equal(drawn(0.3, 0.5)[1], drawn(0.3, 0.5)[1])

@@ -78,25 +78,6 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
                 assert likelihood(k, tried[0], tried[1], tried[2][0]) < best + 1e-6
 
 
-def test_people_who_do_not_differ_keep_a_variance_above_zero():
-    """Answers on one line, without noise: every variance falls to 1e-9 deg² and its
-    covariance, and nothing is nan.
-    """
-    design = np.stack([np.ones(12), np.linspace(-1, 1, 12)], 1)
-    line = np.array([[2.0, -3.0], [0.5, 4.0]])
-    found = shared.fit_mixed_model(
-        design,
-        design @ line,
-        np.arange(12) % 4,
-        first=np.array([25.0, 1.0]),
-        rounds=300,
-    )
-    for part in (found.variance, found.noise):
-        assert (part >= 1e-9).all()
-        assert (part < 1e-5).all()
-    assert found.own(design[:3], design[:3] @ line) == pytest.approx(line, abs=1e-9)
-
-
 def _read(rng, people, each, common):
     """Gaze of people whose axis is misread by kappa, a gain, and by what a slippage of
     each does to all alike.

@@ -185,30 +185,6 @@ def test_a_disc_placed_at_any_angle_is_as_wide_as_itself(tmp_path, capsys, suffi
     assert values["minimum_width_nm"] == pytest.approx(99, abs=2**0.5)
 
 
-def test_flat_ends_of_a_half_ring_are_no_thin_features(tmp_path, capsys):
-    angle = np.pi * np.arange(65) / 64
-    along = np.column_stack([np.cos(angle), np.sin(angle)])
-    write(tmp_path / "m.gds", {(1, 0): [np.vstack([2100 * along, 1900 * along[::-1]])]})
-    code, values = run(capsys, tmp_path / "m.gds")
-    assert (code, values["violations"]["width"]) == (0, 0)
-    process = tmp_path / "p.toml"
-    process.write_text("[rules]\nminimum_feature_nm = 203\n")
-    code, values = run(capsys, tmp_path / "m.gds", "--process", process)
-    assert code == 1
-    assert values["minimum_width_nm"] == pytest.approx(200, abs=2**0.5)
-
-
-def test_a_wedge_is_narrower_than_any_limit_at_its_tip(tmp_path, capsys):
-    """20 degrees are a violation, an equilateral triangle and a rotated square none."""
-    wedge = [(0, 0), (2000, 0), (2000, 728)]
-    triangle = 400 * np.array([(0, 9), (1, 9), (0.5, 9 + 3**0.5 / 2)])
-    square = disc(210, 4, 0.3) + np.array([4000, 0])
-    write(tmp_path / "m.gds", {(1, 0): [wedge, triangle, square]})
-    code, values = run(capsys, tmp_path / "m.gds")
-    assert (code, values["violations"]["corner"]) == (1, 1)
-    assert values["worst"][0]["worst"] == pytest.approx(20.0, abs=0.05)
-
-
 def rectangle(rng):
     return np.array(box(0, 0, rng.uniform(60, 300), rng.uniform(100, 600)))
 

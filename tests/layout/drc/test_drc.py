@@ -12,15 +12,9 @@ from hypothesis import strategies as st
 
 from layout.drc.lattice import check_plan
 from layout.drc.report import DrcReport
-from layout.mask.plan import (
-    FigureCell,
-    MaskPlan,
-    PillarArray,
-    PillarClass,
-    pillar_classes,
-)
+from layout.mask.plan import MaskPlan, PillarArray, PillarClass, pillar_classes
 from layout.process.process import DesignRules, KeepOutZone
-from layout.shapes import convex, polygon
+from layout.shapes import polygon
 from tests.referees.convex import convex_gap
 
 LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
@@ -141,12 +135,6 @@ def test_gap_is_the_least_of_all_pairs_by_brute_force(rows):
         assert math.isinf(found.minimum_space_nm)
 
 
-def test_gap_of_two_neighbours_is_pitch_less_their_flats():
-    plan = plan_of([200, 300], [[1, 2]])
-    flats = [made.outline[:, 0].max() for made in plan.classes]
-    assert check_plan(plan, LOOSE).minimum_space_nm == 400 - flats[0] - flats[1]
-
-
 def test_overlap_and_touch_are_found_with_their_place():
     found = check_plan(plan_of([420], [[1, 1, 0, 1]]), LOOSE)
     assert found.counts["overlap"] == 1
@@ -247,16 +235,6 @@ def test_structures_that_meet_are_found(make_plan):
     assert found.counts["clearance"] == 1
 
 
-def test_width_of_a_regular_polygon_and_of_a_triangle():
-    octagon = polygon.pillar_polygon(1000, vertices=8)
-    assert convex.least_width(octagon) == pytest.approx(
-        min(2 * octagon[:, 0].max(), abs(octagon @ (1, 1)).max() * math.sqrt(2))
-    )
-    assert convex.least_width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(
-        12 / 5
-    )  # height on the hypotenuse
-
-
 def test_summary_says_what_was_found():
     report = check_plan(
         plan_of([200, 380], [[1, 2, 2]]), DesignRules(minimum_gap_nm=70)
@@ -270,51 +248,6 @@ def test_summary_says_what_was_found():
             plan_of([200], np.full((50, 50), 1)), DesignRules(minimum_gap_nm=70)
         ).summary
     )
-
-
-def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
-    plan = make_plan()
-    cross = np.array(
-        [
-            [0, 0],
-            [4000, 0],
-            [4000, 300],
-            [320, 300],
-            [320, 4000],
-            [300, 4000],
-            [300, 300],
-            [0, 300],
-        ]
-    )
-    slot = np.array(
-        [
-            [0, 0],
-            [900, 0],
-            [900, 900],
-            [535, 900],
-            [535, 200],
-            [500, 200],
-            [500, 900],
-            [0, 900],
-        ]
-    )
-    figures = tuple(
-        FigureCell("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)})
-        for shape in (cross, slot)
-    )
-    rules = DesignRules(minimum_feature_nm=80, minimum_gap_nm=70, maximum_density=1)
-    before = check_plan(plan, rules)
-    thin, narrow = (
-        check_plan(plan.replace(figures=(figure,)), rules) for figure in figures
-    )
-    assert thin.counts["width"] == before.counts["width"] + 1
-    assert thin.minimum_width_nm == 20
-    assert narrow.counts["notch"] == before.counts["notch"] + 1
-    assert narrow.minimum_space_nm == 35
-    for found, rule, limit in ((thin, "width", 80), (narrow, "notch", 70)):
-        assert {
-            v.limit for v in found.violations if v.rule == rule and "figures" in v.text
-        } == {limit}
 
 
 def test_feet_that_nearly_meet_are_found():

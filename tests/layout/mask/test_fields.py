@@ -99,26 +99,6 @@ def test_a_field_below_the_pitch_is_refused():
         fields.split_write_fields(hyperbolic(21).diameters, process(0.3))
 
 
-def test_stitching_hurts_as_the_square_of_the_offset_and_not_at_all_at_zero():
-    lens = hyperbolic()
-    loss = []
-    for error in (0.0, 10.0, 20.0):
-        chosen = process(30.0, stitching_nm=error)
-        report = stitching.simulate_stitching(
-            lens,
-            fields.split_write_fields(lens.diameters, chosen),
-            chosen,
-            draws=100,
-            seed=1,
-        )
-        loss.append(1 - report.strehl.mean())
-    assert loss[0] == pytest.approx(0, abs=1e-6)
-    assert loss[2] / loss[1] == pytest.approx(
-        4, rel=0.05
-    )  # Marechal: 1 - variance of the phase; the next order is 1e-3
-    assert (report.change > 0).all()
-
-
 def test_the_loss_is_what_the_variance_of_the_ramps_says():
     # 1 - S = variance over the pillars of k delta (sin of the angle to the focus + to
     # the source)

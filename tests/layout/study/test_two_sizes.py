@@ -153,26 +153,6 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
     )
 
 
-def test_fields_of_pairs_add_up_to_their_light():
-    lens = two_sizes(51)
-    process = Process(write_field=WriteField(size_um=10.0))
-    where = focus.FocusWindow(
-        np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
-    )
-    ready = focus.prepare_focus(lens, where)
-    _, moments = stitching.field_moments(
-        lens, fields.split_write_fields(lens.diameters, process), ready
-    )
-    wide, long = lens.diameters.diameter_um, lens.diameters.length_um
-    exact = plain_sum.field(
-        lens, np.where(wide > 0, formula(wide, long, "x"), 0), where
-    )
-    assert (
-        abs(ready.light(moments.sum(0)[None])[0] - exact).max()
-        < 1e-4 * abs(exact).max()
-    )  # float32 sums
-
-
 def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
     lens = two_sizes(31)
     process = Process(write_field=WriteField(size_um=6.0))

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.special import erf
 
 import layout
 from layout.formats import job_files
-from layout.pec import polygon_edges, psf
-from layout.pec.polygon_edges import ExposedPolygons
+from layout.pec import psf
 from layout.process.process import EtchProfile, ExposureSettings, Process
 from layout.verify.exposure import verify_exposure
 from layout.verify.written_lens import LensRows
@@ -159,35 +157,6 @@ def test_without_a_point_exposure_nothing_is_verified():
     plan, content, table = written(Process(), furnished=False)
     with pytest.raises(ProcessError, match="alpha_um, beta_um, eta"):
         verify(plan, content, table, Process())
-
-
-def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
-    boxes = np.array(
-        [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
-    )  # left, bottom, right, top
-    corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
-    polygons = ExposedPolygons(corners, np.array([1.3, 0.7]), np.array([3, 3]))
-    points = np.random.default_rng(0).uniform(-1, 4, (40, 2))
-    points[:3] = [
-        [1.1, 0.0],
-        [3.0, 0.4],
-        [3.0, 0.8],
-    ]  # on an edge, on a shared edge, on a corner
-    terms = [(0.4, 0.6), (1.1, 0.3)]
-    want = np.zeros(len(points))
-    for (l, b, r, t), dose in zip(boxes, polygons.dose, strict=True):
-        for a, w in terms:
-            across = (erf((r - points[:, 0]) / a) - erf((l - points[:, 0]) / a)) / 2
-            want += (
-                dose
-                * w
-                * across
-                * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a))
-                / 2
-            )
-    assert polygon_edges.exposure_at_edges(points, polygons, terms) == pytest.approx(
-        want, abs=1e-9
-    )
 
 
 def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():

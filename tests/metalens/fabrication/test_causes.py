@@ -17,9 +17,8 @@ from metalens.fabrication.perturbations import (
     WaveguideModel,
 )
 from metalens.fabrication.process import State
-from metalens.fabrication.response import RelativeResponse, Sensitivity, SolvedResponse
+from metalens.fabrication.response import Sensitivity
 
-RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
 COUNT = len(perturbations.names_of_kind(ResponseError))
 
@@ -192,37 +191,6 @@ def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_f
         )
 
 
-def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_series():
-    """Of two pillars: ln t by three causes, the middle one solved as 0.5 + 0.3 a - 2
-    a²; the proxy says 0.45.
-    """
-    slopes = RNG.normal(size=(3, 2)) + 1j * RNG.normal(size=(3, 2))
-    slopes[1] = 0
-    flat = np.zeros((3, 3, 2), complex)
-    flat[:, 0] = 0.5, 0.6j
-    flat[1, 1:] = [[0.3, -0.2j], [-2.0, 1.0]]
-    proxy = np.array([0.45, 0.55j])
-    amounts = np.array([0.2, 0.07, -0.4])
-    made = RelativeResponse(slopes, flat, proxy)
-    row = flat[1, 0] + flat[1, 1] * 0.07 + flat[1, 2] * 0.07**2
-    plain = np.exp(0.2 * slopes[0] - 0.4 * slopes[2])
-    assert made.factor(amounts) == pytest.approx(plain * row / proxy, rel=1e-12)
-    assert made.factor(np.zeros(3)) == pytest.approx(flat[0, 0] / proxy, rel=1e-12)
-    rates = made.rates(amounts)
-    assert rates[[0, 2]] == pytest.approx(slopes[[0, 2]])
-    assert rates[1] == pytest.approx(
-        (flat[1, 1] + 2 * flat[1, 2] * 0.07) / row, rel=1e-12
-    )
-    step = np.array([0, 1e-6, 0])
-    by_difference = (
-        np.log(made.factor(amounts + step) / made.factor(amounts - step)) / 2e-6
-    )
-    assert rates[1] == pytest.approx(by_difference, rel=1e-6)
-    assert RelativeResponse(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(
-        plain, rel=1e-12
-    )
-
-
 class Line:
     """A proxy of straight phase and transmission."""
 
@@ -265,32 +233,6 @@ def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
         Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1
     )
     assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
-
-
-def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
-    """t of the middle cause solved over three diameters; its slope is not counted a
-    second time.
-    """
-    at = np.array([0.12, 0.18, 0.24, 0.28])
-    powers = np.zeros((3, 2, 4), complex)
-    powers[:, 0] = 0.8 * np.exp(1j * (7.2 * at + 19 * at**2))
-    powers[1, 1] = (3 + 2j) * at
-    solved = SolvedResponse(0.85, at, powers)
-    slopes = Sensitivity(
-        np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved
-    )
-    made = response.prepare_response(Line(), slopes, np.array([0.18, 0.24]))
-    amounts = answering(0.5, 0.02, -0.3)
-    want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
-    proxy = response.designed_transmission(Line(), at[1:3], 0.85)
-    assert made.factor(amounts) * proxy == pytest.approx(
-        want * np.exp(0.15j - 0.03), rel=1e-9
-    )
-    beyond = response.prepare_response(Line(), slopes, np.array([0.1, 0.3]))
-    ends = response.designed_transmission(Line(), at[[0, 3]], 0.85)
-    assert beyond.factor(answering()) == pytest.approx(
-        powers[0, 0, [0, 3]] / ends, rel=1e-9
-    )
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.cell import Cell, Film, Index
+from metalens.cell import Cell, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import SceneError
 from metalens.design import Focus, profiles
@@ -177,57 +177,6 @@ def test_an_imager_of_a_lens_file_carries_its_stray_light(lens):
     made = imager(lens, Grid((8, 8), STEP, (3e3, 6e3), window=SAMPLES), tolerance=5e-2)
     assert made.stray is not None
     assert set(made.stray.shares) == {-1, 0, 2, 3}
-
-
-def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
-    """Filter and sensor glass as the file has them, 60 um of 240: against the PSFs of
-    all pillars through them.
-
-    As :func:`test_psfs_of_gathered_pillars_are_those_of_all_pillars`, of a lens made
-    for its films: a carrier without
-    them would run away from the pillars by 0.2 rad in every micrometre at the rim.
-    """
-    films = Layers(
-        front=(Film(Index(1.45), 300.0),),
-        behind=(Film(Index(1.7), 25.0), Film(Index(1.5), 35.0)),
-    )
-    focus = Focus(0.85, DISTANCE, FOCUS, films)
-    x = (np.arange(251) - 125) * PITCH
-    wanted = np.remainder(
-        profiles.hyperbolic_phase(x, x[:, None], focus) - 0.2, 2 * math.pi
-    )
-    wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
-    diameter = np.where(
-        np.hypot(x, x[:, None]) <= 50.0,
-        0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi),
-        0.0,
-    )
-    glazed = replace(lens, diameters=DiameterMap(diameter, PITCH), layers=films)
-    grid = Grid((5, 5), STEP, (4000.0, 4000.0), margin=SAMPLES // 2, window=SAMPLES)
-    made = imager(glazed, grid, tolerance=0.1)
-    middle = len(made.plan.y_um) // 2, len(made.plan.x_um) // 2
-    place = float(made.plan.x_um[middle[1]]), float(made.plan.y_um[middle[0]])
-    reduced = glazed.layers.after(DISTANCE, 0.85).reduced_um
-    fine, wide = 9, SAMPLES + 4
-    angles = tuple(math.atan(at / reduced) for at in place)
-    seen = from_lens(
-        glazed, View((4000.0,), (angles,), wide * STEP, wide * fine), tolerance=1e-4
-    )
-    light = torch.as_tensor(seen.intensity[0, 0]).double()
-    box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
-    want = integrate_pixels(
-        torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0],
-        STEP / fine,
-        pitch_um=STEP,
-    )[2:-2, 2:-2]
-    got = made.stack[middle[0], middle[1], 0].double()
-    assert float(texture_error(got, want / want.sum())) < 3e-2
-    bare = (
-        imager(glazed, grid, tolerance=0.1, layers=Layers())
-        .stack[middle[0], middle[1], 0]
-        .double()
-    )
-    assert float(texture_error(bare, want / want.sum())) > 0.1
 
 
 def test_pillars_that_answer_x_and_y_apart_are_no_unpolarised_image(lens):

@@ -94,50 +94,6 @@ def test_psfs_of_both_polarisations_are_those_of_plane_waves(place, depth, kind,
         assert scalar > 1.8 * error
 
 
-def test_what_the_flux_adds_to_a_scalar_is_that_of_plane_waves():
-    """NA 0.6, 1.8e-3 of the PSF. A sixth of it is left: of the light that the fold
-    takes back, which all but cancels.
-    The strongest of the four alone is worse than the scalar: its light weighs steep
-    rays by (1 + cos) / (2 √cos)."""
-    distance, step, count = 33.0, 1.2, 9
-    about = {
-        "radius": RADIUS,
-        "distance": distance,
-        "focus": FOCUS,
-        "design_wavelength": WAVE,
-    }
-    referee = Referee(**about, fine=0.3, count=320)
-    optics = Optics(
-        SmoothWave(Focus(WAVE, distance, FOCUS), RADIUS), Layers(), distance
-    )
-    at = torch.zeros(1, 2, dtype=torch.float64)
-    depths = torch.tensor([4000.0])
-
-    def seen(components):
-        window = Window(count, step, True, components)
-        light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[
-            0, 0
-        ].double()
-        return light / light.sum()
-
-    flux, scalar = (
-        torch.from_numpy(
-            referee.sampled(of((0.0, 0.0), 4000.0, WAVE), step, count).copy()
-        )
-        for of in (referee.flux, referee.intensity)
-    )
-    want = flux / flux.sum() - scalar / scalar.sum()
-    assert float(want.norm() / (flux / flux.sum()).norm()) == pytest.approx(
-        1.8e-3, rel=0.1
-    )
-    left = [
-        float((seen(components) - seen(0) - want).norm() / want.norm())
-        for components in (4, 1)
-    ]
-    assert left[0] < 0.25
-    assert left[1] > 1
-
-
 @pytest.mark.parametrize(
     ("slope", "towards"),
     [((0.0, 0.0), (0.0, 0.0)), ((0.3, -0.2), (-0.1, 0.4)), ((0.5, 0.4), (0.5, 0.4))],

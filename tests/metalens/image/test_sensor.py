@@ -63,41 +63,6 @@ def test_pixel_larger_than_the_image_holds_all_its_light():
     assert float(pixels) == pytest.approx(float(IMAGE.sum()), rel=1e-12)
 
 
-def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
-    assert torch.equal(integrate_pixels(IMAGE, 1.7, pitch_um=1.7), IMAGE)
-    aside = integrate_pixels(IMAGE, 1.7, pitch_um=1.7, shift_um=(0.0, 1.7))
-    assert torch.allclose(
-        aside[:, :-1], IMAGE[:, 1:], rtol=0, atol=1e-12
-    )  # places of edges to 1e-14 of 50 samples
-    more = integrate_pixels(
-        IMAGE, 1.7, pitch_um=1.7, shape=(len(IMAGE) + 2, IMAGE.shape[1])
-    )
-    assert more.shape == (len(IMAGE) + 2, IMAGE.shape[1])
-    assert torch.allclose(more[1:-1], IMAGE, rtol=0, atol=1e-12)
-    n = IMAGE.shape[1]
-    for about in (
-        {"pitch_um": 1.7 * (1 + 1e-9)},
-        {"pitch_um": 1.7, "grid_um": 1.7 * (1 + 1e-9)},
-    ):
-        near = integrate_pixels(IMAGE, 1.7, shape=(len(IMAGE), n), **about)
-        assert (
-            0 < float((near - IMAGE).abs().max()) < 1e-9 * n * float(IMAGE.abs().max())
-        )  # edges move so far, 4 of them
-    width = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
-    with torch.no_grad():
-        assert integrate_pixels(IMAGE, 1.7, pitch_um=width) is IMAGE
-    slope = torch.autograd.grad(
-        integrate_pixels(IMAGE, 1.7, pitch_um=width, grid_um=1.7)[20, 30], width
-    )[0]
-    low, high = (
-        float(integrate_pixels(IMAGE, 1.7, pitch_um=1.7 + s, grid_um=1.7)[20, 30])
-        for s in (-1e-6, 1e-6)
-    )
-    assert float(slope) == pytest.approx(
-        (high - low) / 2e-6, rel=1e-5
-    )  # it has its derivative here too
-
-
 def test_shift_moves_the_pixel_grid_towards_plus_x():
     spot = torch.zeros(30, 30, dtype=torch.float64)
     spot[15, 17] = 1

@@ -3,18 +3,13 @@
 import dataclasses
 import json
 
-import numpy as np
 import pytest
 
-from metalens import cli
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Cross
-from metalens.core import executor
 from metalens.core.errors import CellError, ConfigError
-from metalens.core.report import CommandConsole
-from metalens.library import plots, workers
+from metalens.library import plots
 from metalens.library import study as cell_study
-from metalens.library.curve import SolvedNodes
 from metalens.library.study import CellStudy
 
 SMALL = CellStudy(
@@ -118,81 +113,3 @@ def test_the_page_says_what_is_printable_of_any_shape():
         "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm"
         in page
     )
-
-
-SOLVED = SolvedNodes(np.array([0.1]), np.array([[1 + 0.5j, 0.1j]]), np.array([0.2]))
-TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"
-
-
-def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
-    """After one of two cells the user presses Ctrl-C, and a kill cuts the line that
-    follows; that cell is not solved
-    again, and the folder is that of a run that nobody stopped."""
-    (tmp_path / "study.toml").write_text(TWO)
-    monkeypatch.chdir(tmp_path)
-    solved, answers = [], {}
-
-    def run(work, tasks):  # in this process, each once
-        for i, task in enumerate(tasks):
-            answers[task] = answers.get(task) or work(task)
-            yield i, answers[task]
-
-    def stopped(work, tasks):
-        yield next(run(work, tasks))
-        raise KeyboardInterrupt
-
-    def counted(work, tasks):
-        solved.append(len(tasks))
-        return run(work, tasks)
-
-    monkeypatch.setattr(executor, "run_parallel", stopped)
-    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.INTERRUPTED
-    assert not (tmp_path / "out").exists()
-    journal = tmp_path / "out.resume"
-    assert len(journal.read_text().splitlines()) == 2
-    with open(journal, "ab") as file:
-        file.write(b'["cut sho')
-    monkeypatch.setattr(executor, "run_parallel", counted)
-    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
-    assert solved == [1]  # the other cell
-    assert not journal.exists()
-    (tmp_path / "whole").mkdir()
-    assert (
-        cli.main(["study", "study.toml", "-o", "whole/out", "--quiet"]) == cli.SUCCESS
-    )
-    for name in ("README.md", "cell_study.json", "cell_study.png"):
-        assert (tmp_path / "out" / name).read_bytes() == (
-            tmp_path / "whole" / "out" / name
-        ).read_bytes()
-
-
-def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
-    tmp_path, monkeypatch
-):
-    """What was solved for a table of n that has been edited since does not get into the
-    result.
-    """
-    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
-    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
-    study, solved = CellStudy(pillar=str(table)), []
-
-    def told(work, tasks):
-        solved.append(tasks)
-        for i, _ in enumerate(tasks):
-            yield i, [SOLVED]
-
-    def done(settings):
-        solved.clear()
-        workers.SweepJournal(path, settings).run(
-            ["curve"], CommandConsole(quiet=True), "cells"
-        )
-        return any(solved)
-
-    monkeypatch.setattr(executor, "run_parallel", told)
-    assert [done(study), done(study)] == [True, False]
-    assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [
-        True,
-        True,
-    ]
-    table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.55,0\n")
-    assert [done(study), done(study)] == [True, False]

@@ -171,36 +171,6 @@ def test_the_flux_of_a_psf_is_poyntings_of_plane_waves():
     assert flux.error <= 1e-5
 
 
-def test_two_wavelengths_of_flux_are_those_of_each_alone():
-    """Weighed by their light; of two lenses in a batch each has its own."""
-    phase, level, _ = lens(distance=14.0, count=40)
-    given = about(
-        depths_um=[200.0],
-        sensor_distance_um=14.0,
-        window_um=6.0,
-        samples=12,
-        polarisation="flux",
-    )
-    bent = phase + 0.4 * np.hypot(*np.indices((40, 40)) - 17.0) / 20
-    both = psf.psf_stack(
-        np.array([[phase, bent], [bent, phase]]),
-        level,
-        **given | dict(wavelength_um=[0.85, 0.8], weights=[1.0, 3.0]),
-    )
-    for k, maps in enumerate(((phase, bent), (bent, phase))):
-        one, other = (
-            psf.psf_stack(m, level, **given | dict(wavelength_um=w))
-            for m, w in zip(maps, (0.85, 0.8), strict=True)
-        )
-        light = (
-            0.25 * one.intensity * one.energy_um2
-            + 0.75 * other.intensity * other.energy_um2
-        )
-        assert both.intensity[k] * both.energy_um2[k] == pytest.approx(
-            light, abs=1e-4 * light.max()
-        )
-
-
 def test_a_polarisation_that_maps_cannot_tell_is_refused():
     phase, level, _ = lens(distance=14.0, count=40)
     with pytest.raises(

@@ -9,14 +9,10 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from scipy.special import fresnel
 
 from metalens import propagate
 from metalens.cell import Cell, Film, Index
 from metalens.core.errors import ConfigError, PropagationError
-from metalens.design import Focus
-from metalens.image import Optics, SmoothWave, Window
-from metalens.image.points import psfs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.optics import Layers, Stop
 from metalens.psf import SourceExtent, View, from_lens, psf_stack
@@ -379,92 +375,6 @@ def test_depths_behind_a_stop_are_each_as_alone() -> None:
             all_.intensity[1, i], one.intensity[0], rtol=0, atol=1e-12
         )
         assert all_.energy_um2[1, i] == pytest.approx(one.energy_um2[0], rel=1e-10)
-
-
-def test_shadow_is_fresnels_edge_bent_by_its_radius() -> None:
-    """By Fresnel integrals of scipy, at narrow places: edges in the plane of the light
-    and across it.
-    """
-    glass, thick, radius, tangents = 1.6, 350.0, 180.0, (0.21, 0.28)
-    layers = Layers(front=(Film(Index(glass), thick),), stop=Stop(radius, thick))
-    sine = 0.35 / math.hypot(1, 0.35)
-    cosine = math.sqrt(1 - (sine / glass) ** 2)
-    shift = thick * sine / glass / cosine
-    from_edge = np.linspace(-40.0, 60.0, 81)
-    for way, other in (((0.6, 0.8), False), ((-0.8, 0.6), True)):
-        length, along = (
-            thick / glass / cosine**3,
-            thick / glass / cosine,
-        )  # d tan / dp in the plane, tan / p across it
-        length, along = (along, length) if other else (length, along)
-        places = [
-            shift * c + (radius - from_edge) * w
-            for c, w in zip((0.6, 0.8), way, strict=True)
-        ]
-        w = from_edge * math.sqrt(2 / (WAVE * length))
-        sines, cosines = fresnel(w)
-        edge = 0.5 + np.exp(-0.25j * np.pi) / math.sqrt(2) * (cosines + 1j * sines)
-        slope = (
-            math.sqrt(2 / (WAVE * length))
-            * np.exp(-0.25j * np.pi + 0.5j * np.pi * w * w)
-            / math.sqrt(2)
-        )
-        want = edge - 1j * WAVE * along / (4 * math.pi * radius) * slope
-        got = layers.shadow(tangents, math.inf, WAVE, (places[0], places[1]), 1e-2)
-        np.testing.assert_allclose(
-            got, want, atol=2e-5
-        )  # of the table, 1e-7 over the width in w, 8e-4
-
-
-@pytest.mark.parametrize("middle", [(0.0, 0.0), (-37.0, 11.0)])
-def test_image_engine_and_every_pillar_see_the_same_stop(
-    middle: tuple[float, float],
-) -> None:
-    """PSFs by rays of a smooth wave against sums over pillars; 1.6e-2 is what both
-    differ by without a stop as well.
-    """
-    layers = Layers(front=(Film(Index(GLASS), 160.0),), stop=Stop(70.0, 160.0, middle))
-    radius, pitch, step, fine = 130.0, 0.45, 3.0, 7
-    place = (np.arange(579) - 289) * pitch
-    x, y = np.meshgrid(place, place)
-
-    def bent(across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
-        return 2.0 * (across / radius) ** 3 + 1.5 * (down / radius) ** 2 * (
-            across / radius
-        )
-
-    wave = SmoothWave(Focus(WAVE, 500.0, 6000.0, layers), radius, bent)
-    spots = torch.from_numpy(x), torch.from_numpy(y)
-    phase = (wave.carrier_rad(*spots) + bent(*spots)).numpy()
-    level = (np.hypot(x, y) <= radius).astype(float)
-    points = (np.arange(22 * fine) - (22 * fine - 1) / 2) / fine
-    triangles = np.maximum(1 - np.abs(points - (np.arange(21) - 10)[:, None]), 0)
-    for at, depth in (((0.0, 0.0), 2500.0), ((140.0, 50.0), math.inf)):
-        where = {
-            "depths_um": torch.tensor([depth], dtype=torch.float64),
-            "wavelength_um": WAVE,
-        }
-        window = Window(21, step, curved=True)
-        got = psfs(
-            Optics(wave, layers, 500.0),
-            torch.tensor([at], dtype=torch.float64),
-            **where,
-            window=window,
-        )
-        light = got[0, 0].double().numpy()
-        stack = psf_stack(
-            phase, level, pitch_um=pitch, wavelength_um=WAVE, sensor_distance_um=500.0, depths_um=[depth],
-            angle_rad=[math.atan(a / 500.0) for a in at], window_um=22 * step, samples=22 * fine, tolerance=3e-4,
-            layers=layers, integrate=False,
-        )  # fmt: skip
-        want = triangles @ stack.intensity[0] @ triangles.T
-        assert _apart(light / light.sum(), want / want.sum()) < 2e-2
-        # the light on the stop is the whole: 3 % are bent beyond 63 um, faces take
-        # nothing here
-        assert light.sum() == pytest.approx(1.0, abs=0.05)
-        assert stack.energy_um2[0] == pytest.approx(
-            math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03
-        )
 
 
 def test_stops_that_cannot_be_are_refused_by_name() -> None:

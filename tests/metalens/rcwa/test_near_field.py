@@ -110,39 +110,6 @@ def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(
         [-0.07, 0, 0.47, 0.58], z)])  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("light", "incident"),
-    [
-        (Incidence(WAVELENGTH, 0.0, "y"), (0, 1)),
-        (Incidence(WAVELENGTH, 0.0, "p", 0.7), (math.cos(0.7), math.sin(0.7))),
-        (Incidence(WAVELENGTH, 0.0, "s", 0.7), (-math.sin(0.7), math.cos(0.7))),
-        (Incidence(WAVELENGTH, 0.3, "x", math.pi / 2), (1, 0)),
-        (Incidence(WAVELENGTH, 0.3, "y", math.pi), (0, 1)),
-        (
-            Incidence(WAVELENGTH, 0.3, "p", math.pi),
-            (-math.sqrt(1 - (math.sin(0.3) / 1.46) ** 2), 0),
-        ),
-    ],
-)
-def test_the_light_that_comes_has_the_stated_amplitude_and_direction(light, incident):
-    """Into its own substrate: nothing is reflected, E at the origin is that of the
-    light.
-    """
-    same = Index(1.46)
-    got = near_field(
-        Cell(0.3, 0.2, same, same, same, same),
-        0.1,
-        light,
-        x_um=[0],
-        y_um=[0],
-        z_um=[0],
-        harmonics=1,
-    )
-    assert got.e[:2, 0, 0, 0] == pytest.approx(np.array(incident), abs=1e-12)
-    assert np.linalg.norm(got.e) == pytest.approx(1.0)
-    assert np.linalg.norm(got.h) == pytest.approx(1.46)
-
-
 def test_power_through_every_plane_of_a_lossless_cell_is_that_which_leaves():
     """Products on a grid finer than the orders; what (2) adds near the wall has no mean
     but for truncation (3e-4).
