@@ -1,12 +1,9 @@
-"""Compiled loops: light on the nodes of a pupil, pillars averaged over cells, and
-sources weighted for every kernel.
-"""
+"""Compiled loop that averages pillars over cells, and which tensors it may read."""
 
 from typing import Any
 
 import numba
 import numpy as np
-import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -18,52 +15,6 @@ from metalens.propagate import sincos_turns32
 # compiled loops know names of their own module
 PART: int = response.PART
 put: Any = response.evaluate_row  # type: ignore[has-type]
-
-
-def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
-    """(depths, y, x) complex64 weight exp(2πi (turns + Σ mix paths)).
-
-    Args:
-        weight, turns: (y, x) float64. paths: (few, y, x) float64 in turns; mix:
-            (depths, few).
-    """
-    out = np.empty((len(mix), *turns.shape, 2), np.float32)
-    light = weight.astype(np.float32)
-    run_split(
-        turns.shape[0],
-        lambda a, b: _phasors(light[a:b], turns[a:b], paths[:, a:b], mix, out[:, a:b]),
-    )
-    return out.view(np.complex64)[..., 0]
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
-    """Write weight · exp(2πi (turns + mix @ paths)) into ``out``, real and imaginary.
-
-    Row by row, so that the sum of a depth stays in the first cache. Of each row only
-    the part from the first to the last open node is computed.
-
-    Args:
-        weight, turns: (nodes, nodes) amplitude and phase / 2π.
-        paths: (few, nodes, nodes) over the wavelength.
-        mix: (depths, few).
-        out: (depths, nodes, nodes, 2) float32.
-    """
-    depths, few = mix.shape
-    line = np.empty(turns.shape[1])
-    for y in range(turns.shape[0]):
-        open_ = np.nonzero(weight[y])[0]
-        start, stop = (open_[0], open_[-1] + 1) if len(open_) else (0, 0)
-        out[:, y, :start] = 0
-        out[:, y, stop:] = 0
-        for d in range(depths):
-            line[start:stop] = turns[y, start:stop]
-            for v in range(few):
-                for x in range(start, stop):
-                    line[x] += mix[d, v] * paths[v, y, x]
-            for x in range(start, stop):
-                c, s = sincos_turns32(line[x] - np.rint(line[x]))
-                out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s
 
 
 def cells(
@@ -130,16 +81,6 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
                         sums[1, cell] += phase[j]
                         sums[2, cell] += 1
         out[:, row] = sums / (side * side)
-
-
-def is_compilable(a: Tensor) -> bool:
-    """Whether compiled code may read the values: single precision, in main memory,
-    without derivatives.
-
-    Args:
-        a: a tensor.
-    """
-    return a.dtype in (torch.float32, torch.complex64) and is_plain_value(a)
 
 
 def is_plain_value(a: Tensor) -> bool:

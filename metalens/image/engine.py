@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args
 
@@ -16,7 +17,6 @@ from metalens.image.low_rank import frame_maps, plane_images
 from metalens.image.plan import Grid, ImagingPlan, plan_nodes, sum_over_spectrum
 from metalens.image.points import Optics, sampling
 from metalens.image.scene import Frames
-from metalens.image.splines import spline_matrix
 from metalens.image.stray import stray_of
 from metalens.image.texture import CONTRAST, scene_error
 from metalens.image.waves import SmoothWave, Wave, wave_of
@@ -94,12 +94,6 @@ def imager(
     source = spectrum or SpectralNodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
     reduced_um = layers.after(distance_um, focus.wavelength_um).reduced_um
     middle_um = reduced_um * math.tan(field[0]), reduced_um * math.tan(field[1])
-    is_round = (
-        isinstance(wave, SmoothWave)
-        and wave.added_rad is None
-        and field == (0.0, 0.0)
-        and (layers.stop is None or layers.stop.centred)
-    )
 
     def build(within: float) -> Imager:
         plan = plan_nodes(
@@ -108,7 +102,6 @@ def imager(
             source,
             middle_um,
             tolerance=within,
-            folds=is_round,
             polarisation=polarisation,
         )
         stack, energy = node_psfs(optics, plan, device)
@@ -147,8 +140,8 @@ def node_psfs(
 ) -> tuple[Tensor, Tensor]:
     """PSFs of all nodes, each of sum 1, and their relative illumination.
 
-    Both are differentiable in the wave's factor. A round lens on a square grid is
-    computed on one eighth of the nodes.
+    Both are differentiable in the wave's factor. A round lens on the axis is computed
+    on one quarter of the nodes.
 
     Args:
         optics: wave of the lens, layers and lens-sensor distance.
@@ -158,13 +151,22 @@ def node_psfs(
     Returns:
         ((rows, columns, depths, h, w) PSFs, (rows, columns, depths) illumination).
     """
-    if plan.folds:
-        light = _folded(optics, plan, device)
-    else:
-        at = plan.places_um.to(device)
-        light = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
-        size = len(plan.y_um), len(plan.x_um)
-        light = light.reshape(*size, *light.shape[1:])
+    count = len(plan.y_um), len(plan.x_um)
+    wave, stop = optics.wave, optics.layers.stop
+    folds = (
+        isinstance(wave, SmoothWave)
+        and wave.added_rad is None
+        and (stop is None or stop.centred)
+        and bool((plan.places_um.sum(0).abs() < 1e-6).all())
+    )
+    computed = [(n + 1) // 2 for n in count] if folds else count
+    at = plan.places_um.reshape(*count, 2)[: computed[0], : computed[1]]
+    light = sum_over_spectrum(
+        optics, at.reshape(-1, 2).to(device), plan.depths_um, plan.waves, plan.window
+    )
+    light = light.reshape(*computed, *light.shape[1:])
+    if folds:
+        light = _unfolded(light, count)
     return normalise_psfs(light, optics, plan)
 
 
@@ -205,25 +207,17 @@ def _cosine4(
     return torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)) ** 2)
 
 
-def _folded(optics: Optics, plan: ImagingPlan, device: torch.device | str) -> Tensor:
-    """(nodes, nodes, depths, h, w) PSFs of a round lens on a square grid on its axis.
+def _unfolded(quarter: Tensor, count: Sequence[int]) -> Tensor:
+    """(rows, columns, depths, h, w) PSFs of a round lens from those of one quarter.
 
-    One eighth of the nodes is computed. The others follow by mirror images in x, in y
-    and in the diagonal.
+    Args:
+        quarter: of the nodes with y and x up to the axis.
+        count: (rows, columns) of all nodes.
     """
-    count = len(plan.x_um)
-    half = (count + 1) // 2
-    pairs = [(i, j) for i in range(half) for j in range(i, half)]
-    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs])
-    octant = sum_over_spectrum(
-        optics, at.to(device), plan.depths_um, plan.waves, plan.window
-    )
-    out = octant.new_zeros(count, count, *octant.shape[1:])
-    for (i, j), psf in zip(pairs, octant, strict=True):
-        for row, in_row in ((i, psf), (count - 1 - i, psf.flip(-2))):
-            for column, image in ((j, in_row), (count - 1 - j, in_row.flip(-1))):
-                out[row, column] = image
-                out[column, row] = image.mT
+    out = quarter
+    for axis, total in enumerate(count):
+        mirrored = out.narrow(axis, 0, total // 2).flip(axis, axis - 2)
+        out = torch.cat([out, mirrored], axis)
     return out
 
 
@@ -293,7 +287,7 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
     parts = {
         "psfs": scene_error(used, (true * cosine4).to(used)) * dimmer,
-        "planes": _plane_error(prepared),
+        "planes": prepared.light.plane_error,
         "spectrum": max(plan.waves.error, 0.0),
         "transform": model_error.transform_error(judged) * share,
         "folded": model_error.folding_error(judged) * share,
@@ -306,31 +300,6 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
         shadow = _shadow_error(optics, wave, few, judged_psfs, plan.window.step_um)
         parts["stop"] = shadow * dimmer
     return parts
-
-
-def _plane_error(prepared: Imager) -> float:
-    """Relative RMS error of images of uniformly illuminated planes, the worst depth.
-
-    Images by the low-rank kernels are compared with images by the nodes' own PSFs, at
-    the depth nodes and half-way between them in 1/z.
-    """
-    nearest, farthest = prepared.light.vergence
-    nodes = len(prepared.plan.depths_um)
-    count = 2 * nodes - 1
-    depths = 1 / torch.linspace(nearest, farthest, count, dtype=torch.float64)
-    field = prepared.field
-    to_depths = spline_matrix(torch.linspace(0, 1, count), nodes).to(field.psf)
-    light = torch.einsum("cz,abzhw->abchw", to_depths, field.light)
-    maps = frame_maps(prepared.grid.frame, light.shape[:2], light)
-    reference = prepared.grid.crop(plane_images(light, maps))
-    plane = torch.ones(1, *prepared.grid.frame).to(field.psf)
-    images = [
-        prepared.grid.crop(prepared.light.blur(plane, torch.full_like(plane, depth))[0])
-        for depth in depths.tolist()
-    ]
-    error = (torch.stack(images) - reference).square().mean((1, 2)).max()
-    level = reference.square().mean((1, 2)).max().clamp_min(1e-30)
-    return float(torch.sqrt(error / level))
 
 
 def image_dimming(prepared: Imager) -> float:

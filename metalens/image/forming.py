@@ -255,7 +255,7 @@ def uniform_imager(
         raise SceneError(f"depths {depths_um.tolist()} um: need ascending ones")
     unit = psf / psf.sum((-2, -1), keepdim=True)
     axis, window = torch.zeros(1), Window(grid.window, grid.step_um)
-    plan = ImagingPlan(axis, axis, depths_um, None, window, False)  # type: ignore[arg-type]
+    plan = ImagingPlan(axis, axis, depths_um, None, window)  # type: ignore[arg-type]
     illumination = torch.ones_like(unit[None, None, :, 0, 0]).detach()
     field = PsfField(unit[None, None], illumination, depths_um)
     basis = principal_kernels(field, grid.frame, tolerance=tolerance)

@@ -155,6 +155,8 @@ class LowRankPsfs:
         of every sample; (depths, rank) weights at equal steps of 1/z where all samples
         share them.
     vergence: (nearest, farthest) 1/z of the nodes.
+    plane_error: relative RMS error of uniformly illuminated planes at the worst depth
+        node. Between the nodes planes are splines of those at the nodes.
     """
 
     kernels: Tensor
@@ -162,6 +164,7 @@ class LowRankPsfs:
     shape: tuple[int, int]
     table: Tensor
     vergence: tuple[float, float]
+    plane_error: float = 0.0
 
     def to(self, device: torch.device | str) -> "LowRankPsfs":
         """The same on a device."""
@@ -291,14 +294,15 @@ def low_rank_psfs(
     targets = torch.ones_like(sources[0].movedim(-1, 0))  # of full coverage
     if illuminated:
         targets = plane_images(field.light.detach(), maps).to(sources)
-    factors = [
+    corrected = [
         correct_plane(sources[..., z], kernels.to(sources), target)
         for z, target in enumerate(targets)
     ]
+    factors, errors = zip(*corrected, strict=True)
     values = values * torch.stack(factors, -1)[..., None].to(values)
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
-    return LowRankPsfs(kernels, transfer, shape, table, vergence)
+    return LowRankPsfs(kernels, transfer, shape, table, vergence, max(errors))
 
 
 def depth_table(depths_um: Tensor) -> Tensor:
@@ -331,8 +335,11 @@ def frame_maps(
     ]
 
 
-def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
-    """(y, x) flat-field factor by which a uniformly illuminated plane stays uniform.
+def correct_plane(
+    sources: Tensor, kernels: Tensor, target: Tensor
+) -> tuple[Tensor, float]:
+    """(y, x) flat-field factor by which a uniformly illuminated plane stays uniform, and
+    the relative RMS error that it leaves.
 
     Least squares of the plane's relative error by conjugate gradients (CGLS: Hestenes
     and Stiefel 1952), from a factor of 1, until no sample errs by more than
@@ -376,7 +383,8 @@ def correct_plane(sources: Tensor, kernels: Tensor, target: Tensor) -> Tensor:
         residual = residual - step * change
         gradient = adjoint(residual)
         direction = gradient + gradient.square().sum() / power * direction
-    return factor
+    error = (residual * target).norm() / target[inside].norm().clamp_min(1e-30)
+    return factor, float(error)
 
 
 def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
-from metalens.image.compiled import is_compilable
+from metalens.image.compiled import is_plain_value
 from metalens.image.model_error import (
     JudgedPsfs,
     choose_polarisation,
@@ -114,8 +114,6 @@ class ImagingPlan:
     sample.
     depths_um: ascending, at equal steps of 1/z. waves: wavelengths and weights. window:
     of the PSFs.
-    folds: whether the lens is round and the grid on its axis, so that one eighth of the
-    nodes gives all.
     """
 
     y_um: Tensor
@@ -123,7 +121,6 @@ class ImagingPlan:
     depths_um: Tensor
     waves: SpectralNodes
     window: Window
-    folds: bool
 
     @property
     def places_um(self) -> Tensor:
@@ -139,7 +136,6 @@ def plan_nodes(
     middle_um: tuple[float, float],
     *,
     tolerance: float,
-    folds: bool,
     polarisation: Polarisation = "auto",
 ) -> ImagingPlan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
@@ -156,7 +152,6 @@ def plan_nodes(
         source: spectrum of the source.
         middle_um: (x, y) field point in the middle, um on the sensor.
         tolerance: relative L2 error of the image; each cause takes its share.
-        folds: whether the lens is round and the grid on its axis.
         polarisation: see :func:`metalens.image.imager`.
 
     Raises:
@@ -206,9 +201,7 @@ def plan_nodes(
         * torch.linspace(-1, 1, _along(columns, length / half[1]), dtype=torch.float64)
         for centre, length in zip(middle_um[::-1], half, strict=True)
     )
-    return ImagingPlan(
-        y, x, depth_nodes(grid, depths), waves, window, folds and half[0] == half[1]
-    )
+    return ImagingPlan(y, x, depth_nodes(grid, depths), waves, window)
 
 
 def depth_nodes(grid: Grid, count: int) -> Tensor:
@@ -257,7 +250,7 @@ def sum_over_spectrum(
         for i in range(start, stop):
             images[i + 1] = at_place(others[i])
 
-    if is_compilable(images[0]):
+    if is_plain_value(images[0]):
         run_split_torch(len(others), torch.no_grad()(fill))
     else:  # derivatives, or another device
         fill(0, len(others))

@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import PropagationError
-from metalens.image import compiled
 from metalens.image.rays import (
     OF_ENERGY,
     OF_FLUX,
-    RayPaths,
     Rays,
     landing_offset,
     polarisation_factors,
@@ -81,19 +79,6 @@ class Optics:
     wave: Wave
     layers: Layers
     distance_um: float
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Pupil:
-    """Weight and phase of the rays of a field point; (nodes, nodes) float64.
-
-    given: the light on the aperture. The squares of the weights are less: a node across
-    the rim has the mean field.
-    """
-
-    weight: Tensor
-    phase_rad: Tensor
-    given: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -253,32 +238,18 @@ def _point_psfs(
         for offset, shift in zip(landing, shift_um, strict=True)
     )
     centre_um = landing[0] + shift_um[0], landing[1] + shift_um[1]
-    bundle, pupil = node_rays(optics, place, grid, wavelength_um, centre_um)
+    bundle, light, total = _pupil_fields(
+        optics, place, grid, depths_um, wavelength_um, centre_um
+    )
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    tangents = place / after.reduced_um
-    paths = source_paths(optics.layers, tangents, bundle, depths_um, wavelength_um)
-    light = node_fields(pupil, paths, wavelength_um)
-    tilt = math.atan(math.hypot(*tangents.tolist()))
-    factor = optics.wave.factor(bundle.x_um, bundle.y_um, wavelength_um, tilt)
-    if factor is not None:
-        light = light * factor.to(torch.complex64)
-    total: float | Tensor = pupil.given * grid.size**2 * (1 - grid.dimmed)
-    if optics.layers.stop is not None:
-        depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
-        sides = float(tangents[0]), float(tangents[1])
-        light = light * through_stop(
-            optics.layers, sides, bundle, depths, wavelength_um
-        )
-        # light on the stop over that on the whole lens, of sources on the axis
-        footprints = [optics.layers.footprint_um(d, wavelength_um) for d in depths]
-        taken = (torch.tensor(footprints, device=light.device) / radius) ** 2
-        total = total * taken[:, None, None]
     mixed = None
     if grid.window.components:
+        tangents = place / after.reduced_um
         fields = polarisation_factors(
             bundle, tangents, after.order, flux=grid.window.flux
         )
-        mixed = dominant_components(fields, pupil.weight, grid.window.components)
+        weight = bundle.whole * bundle.passed
+        mixed = dominant_components(fields, weight, grid.window.components)
     slopes: tuple[Tensor, ...] = (bundle.slope,)
     second_order: tuple[Tensor, ...] = ()
     if grid.window.curved:
@@ -296,6 +267,64 @@ def _point_psfs(
         ]
         images.append(moved[0][0] + sum(change for _, change in moved))
     return torch.cat(images) / total
+
+
+def _pupil_fields(
+    optics: Optics,
+    place: Tensor,
+    grid: PupilSampling,
+    depths_um: Tensor,
+    wavelength_um: float,
+    centre_um: tuple[float, float],
+) -> tuple[Rays, Tensor, Tensor]:
+    """Rays from the pupil's nodes, fields on the nodes, and light on the aperture.
+
+    A field is √(spread · power passed) exp(iφ): φ is the lens' carrier plus 2π/λ times
+    the paths from the source and to the window's centre, times the wave's factor and
+    the amplitude behind the stop.
+
+    Args:
+        place: (x, y) field point on the sensor, um.
+        depths_um: (depths,) source depths from the lens, um.
+        centre_um: (x, y) from the field point to where the rays go, um.
+
+    Returns:
+        (rays, (depths, nodes, nodes) complex64 fields, (depths, 1, 1) light). The
+            squares of the weights are less than the light: a node across the rim has
+            the mean field.
+    """
+    wave, layers = optics.wave, optics.layers
+    after = layers.after(optics.distance_um, wavelength_um)
+    x, y = place.tolist()
+    tangents = x / after.reduced_um, y / after.reduced_um
+    bundle = rays(
+        after,
+        wave.radius_um,
+        (x + centre_um[0], y + centre_um[1]),
+        (grid.nodes, grid.step),
+        place.device,
+    )
+    path_um = bundle.away_um + source_paths(
+        layers, tangents, bundle, depths_um, wavelength_um
+    )
+    carrier = wave.carrier_rad(bundle.x_um, bundle.y_um)
+    phase = carrier + 2 * math.pi / wavelength_um * path_um
+    angle = torch.remainder(phase, 2 * math.pi).to(torch.float32)
+    weight = (bundle.whole * bundle.passed).to(torch.float32)
+    light = torch.polar(weight.expand_as(angle), angle)
+    tilt = math.atan(math.hypot(*tangents))
+    factor = wave.factor(bundle.x_um, bundle.y_um, wavelength_um, tilt)
+    if factor is not None:
+        light = light * factor.to(torch.complex64)
+    given = float((bundle.whole * bundle.width_um).sum()) / grid.step
+    taken = torch.ones(len(depths_um), device=light.device)
+    if layers.stop is not None:
+        light = light * through_stop(layers, tangents, bundle, depths_um, wavelength_um)
+        # light on the stop over that on the whole lens, of sources on the axis
+        footprints = [layers.footprint_um(d, wavelength_um) for d in depths_um.tolist()]
+        taken = (torch.tensor(footprints).to(taken) / wave.radius_um) ** 2
+    total = given * grid.size**2 * (1 - grid.dimmed) * taken
+    return bundle, light, total[:, None, None]
 
 
 def _fluxes(
@@ -368,61 +397,6 @@ def _moved(
     plain, by_x = both[..., :width], both[..., width:]
     by_y = rows[..., height:, :] @ along_x.both[:width].mT
     return plain, plain * move[2] + move[0] * by_x + move[1] * by_y
-
-
-def node_rays(
-    optics: Optics,
-    place: Tensor,
-    grid: PupilSampling,
-    wavelength_um: float,
-    beside_um: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Rays, Pupil]:
-    """Rays from the pupil's nodes to a place near the field point, with their weight
-    and phase.
-
-    The phase is the lens' carrier plus 2π/λ times the path to that place, rad.
-
-    Args:
-        optics: wave of the lens, layers and lens-sensor distance.
-        place: (x, y) field point on the sensor, um.
-        grid: number of nodes and their step of p.
-        wavelength_um: vacuum wavelength, um.
-        beside_um: (x, y) from the field point to where the rays go, um.
-    """
-    after = optics.layers.after(optics.distance_um, wavelength_um)
-    target_um = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
-    bundle = rays(
-        after, optics.wave.radius_um, target_um, (grid.nodes, grid.step), place.device
-    )
-    phase = (
-        optics.wave.carrier_rad(bundle.x_um, bundle.y_um)
-        + 2 * math.pi / wavelength_um * bundle.away_um
-    )
-    return bundle, Pupil(
-        bundle.whole * bundle.passed,
-        phase,
-        float((bundle.whole * bundle.width_um).sum()) / grid.step,
-    )
-
-
-def node_fields(pupil: Pupil, paths: RayPaths, wavelength_um: float) -> Tensor:
-    """(depths, *shape) complex64 field weight · exp(iφ) on the pupil's nodes.
-
-    φ is the phase of the pupil plus 2π/λ times the source's path. The wave's factor is
-    not in it. On the processor a compiled loop computes it.
-
-    Args:
-        pupil: weight and phase of the rays of the nodes.
-        paths: optical paths from the sources of all depths to the lens.
-        wavelength_um: vacuum wavelength, um.
-    """
-    turns = pupil.phase_rad / (2 * math.pi)
-    if turns.device.type == "cpu":
-        parts = pupil.weight, turns, paths.few_um / wavelength_um, paths.mix
-        return torch.from_numpy(compiled.phasors(*(part.numpy() for part in parts)))
-    turns = turns + paths.um / wavelength_um
-    angle = ((turns - torch.round(turns)) * (2 * math.pi)).to(torch.float32)
-    return torch.polar(pupil.weight.to(torch.float32).expand_as(angle), angle)
 
 
 @functools.lru_cache(maxsize=64)

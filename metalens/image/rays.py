@@ -16,7 +16,6 @@ from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import VectorPupil, beyond_faces, of_flux, transmitted_polarization
 
 OF_FLUX, OF_ENERGY = 4, 6  # components of the polarisation that leave nothing out
-VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,21 +42,6 @@ class Rays:
     middle: Tensor
     slope: Tensor
     curvature: Tensor
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RayPaths:
-    """Optical paths of many depths as mixtures of a few: mix (depths, few) times few_um
-    (few, *shape), float64.
-    """
-
-    few_um: Tensor
-    mix: Tensor
-
-    @property
-    def um(self) -> Tensor:
-        """(depths, *shape) paths."""
-        return (self.mix @ self.few_um.flatten(1)).reshape(-1, *self.few_um.shape[1:])
 
 
 @functools.lru_cache(maxsize=4)  # a few MB each
@@ -115,12 +99,11 @@ def rays(
     )
 
 
-@functools.lru_cache(maxsize=4)  # a few MB each
 def through_stop(
     layers: Layers,
     tangents: tuple[float, float],
     bundle: Rays,
-    depths_um: tuple[float, ...],
+    depths_um: Tensor,
     wavelength_um: float,
 ) -> Tensor:
     """(depths, *shape) complex64 amplitude behind the stop over that without it.
@@ -131,7 +114,7 @@ def through_stop(
         layers: films and stop of the lens.
         tangents: tangents of the field angles along x and y.
         bundle: rays of the nodes.
-        depths_um: source depths from the lens, um.
+        depths_um: (depths,) source depths from the lens, um.
         wavelength_um: vacuum wavelength, um.
     """
     inside_rim = bundle.whole.cpu().numpy() > 0
@@ -140,7 +123,7 @@ def through_stop(
         for part in (bundle.x_um, bundle.y_um, bundle.width_um)
     )
     shades = np.zeros((len(depths_um), *inside_rim.shape), np.complex64)
-    for shade, depth in zip(shades, depths_um, strict=True):
+    for shade, depth in zip(shades, depths_um.tolist(), strict=True):
         shade[inside_rim] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
     return torch.from_numpy(shades).to(bundle.x_um.device)
 
@@ -178,10 +161,8 @@ def landing_offset(
         carrier_rad(bundle.x_um, bundle.y_um) * (wavelength_um / (2 * math.pi))
         + bundle.away_um
     )
-    before = source_paths(
-        layers, torch.tensor(tangents), bundle, depths_um, wavelength_um
-    )
-    paths = lens_path + before.um
+    before = source_paths(layers, tangents, bundle, depths_um, wavelength_um)
+    paths = lens_path + before
     sums = torch.zeros(3, dtype=torch.float64)
     for depth, path in zip(depths_um.tolist(), paths, strict=True):
         light = bundle.whole**2 * layers.stop_share(
@@ -236,92 +217,37 @@ def _turning(after: Media, p: Tensor) -> Tensor:
 
 def source_paths(
     layers: Layers,
-    tangents: Tensor,
+    tangents: tuple[float, float],
     bundle: Rays,
     depths_um: Tensor,
     wavelength_um: float,
-) -> RayPaths:
-    """Optical path from each source to the lens at (x, y), less that to its middle, um.
-
-    More depths than ``VERGENCES`` are interpolated between that many Chebyshev points
-    of 1/z. The path is smooth in 1/z but for a source that touches the lens.
-
-    Args:
-        layers: films and stop of the lens.
-        tangents: tangents of the field angles along x and y.
-        bundle: rays of the nodes.
-        depths_um: source depths from the lens, um.
-        wavelength_um: vacuum wavelength, um.
-    """
-    wave = (
-        wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None
-    )
-    return _source_paths(
-        layers, tuple(tangents.tolist()), bundle, tuple(depths_um.tolist()), wave
-    )
-
-
-@functools.lru_cache(maxsize=4)  # a few MB each
-def _source_paths(
-    layers: Layers,
-    tangents: tuple[float, float],
-    bundle: Rays,
-    depths_um: tuple[float, ...],
-    wavelength_um: float | None,
-) -> RayPaths:
-    """As :func:`source_paths`; without films in front no wavelength is needed."""
-    shared = layers, tangents, bundle
-    if len(depths_um) <= VERGENCES:
-        few = _paths_by_depth(*shared, depths_um, wavelength_um)
-        return RayPaths(
-            few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device)
-        )
-    inverse = 1 / np.array(depths_um)
-    least, largest = float(inverse.min()), float(inverse.max())
-    unit_nodes = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
-    nodes = (least + largest) / 2 + (largest - least) / 2 * unit_nodes
-    basis = np.polynomial.chebyshev.chebvander(unit_nodes, VERGENCES - 1)
-    unit_depths = (2 * inverse - least - largest) / (largest - least)
-    mix = np.polynomial.chebyshev.chebvander(
-        unit_depths, VERGENCES - 1
-    ) @ np.linalg.inv(basis)
-    few = _paths_by_depth(*shared, tuple((1 / nodes).tolist()), wavelength_um)
-    return RayPaths(few, torch.from_numpy(mix).to(few))
-
-
-def _paths_by_depth(
-    layers: Layers,
-    tangents: tuple[float, float],
-    bundle: Rays,
-    depths_um: tuple[float, ...],
-    wavelength_um: float | None,
 ) -> Tensor:
-    """(depths, *shape) optical paths from each source, less that to the middle, um.
+    """(depths, *shape) optical paths from each source to the lens, less that to its
+    middle, um.
 
     In a single medium, √(z² + ρ²) less the same at the middle. Through films, a
     Chebyshev interpolant of the squared reach, which is clamped at the rim of the lens.
 
     Args:
+        layers: films and stop of the lens.
         tangents: (x, y) slopes of the ray to the lens' middle.
+        bundle: rays of the nodes.
+        depths_um: (depths,) source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
     """
     x, y = bundle.x_um, bundle.y_um
     slope = math.hypot(*tangents)
-    p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
+    sine = slope / math.hypot(1, slope)
     out = []
-    for depth in depths_um:
+    for depth in depths_um.tolist():
         if math.isinf(depth):
             out.append((tangents[0] * x + tangents[1] * y) / math.hypot(1, slope))
             continue
-        before = (
-            Media((1.0,), (depth,))
-            if wavelength_um is None
-            else layers.before(depth, wavelength_um)
-        )
+        before = layers.before(depth, wavelength_um)
         distance = before.reduced_um
         if slope > 0:
-            distance = float(media.lateral_reach(before, p)) / slope
-        sx = -distance * tangents[0]
-        sy = -distance * tangents[1]
+            distance = media.lateral_reach(before, sine) / slope
+        sx, sy = (-distance * tangent for tangent in tangents)
         if len(before.layers) == 1:  # a difference of roots without cancellation
             extra = x * x + y * y - 2 * (x * sx + y * sy)
             chief = math.sqrt(depth**2 + sx**2 + sy**2)

@@ -92,7 +92,6 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         depths,
         SpectralNodes(np.array([0.85]), np.ones(1), 0.0),
         window,
-        folds=False,
     )
     found = normalise_psfs(light[None], optics, plan)[1][0, :, 0]
     want = [_relative(t, depth_um, thick_um, n) for t in (0.01, slope)]
