@@ -17,7 +17,7 @@ from metalens.design import Focus
 from metalens.image import compiled
 from metalens.image.compiled import is_plain_value
 from metalens.lens import Lens, response
-from metalens.optics import Layers, Media, interpolant, media
+from metalens.optics import Layers, interpolant
 from metalens.psf import neighbour_coupling
 
 # largest width over which pillars are averaged: below a zone of the lens, many pitches
@@ -371,25 +371,9 @@ def focusing_phase(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
         x_um: places along x, um.
         y_um: places along y, um.
     """
-    r2 = x_um * x_um + y_um * y_um
-    d = focus.sensor_distance_um
-    s = focus.source_distance_um
-    films = focus.layers
-    total = _longer(films.after(d, focus.wavelength_um), r2)
-    if math.isfinite(s):
-        total = total + _longer(films.before(s, focus.wavelength_um), r2)
-    return -2 * math.pi / focus.wavelength_um * total
-
-
-def _longer(between: Media, r2: Tensor) -> Tensor:
-    """Optical path of the ray of squared reach r² less that along the normal, um."""
-    if len(between.layers) > 1:
-        extra: Tensor = interpolant.chebyshev_interpolant(
-            lambda u: media.path_difference(between.layers, 0.0, 0.0, u)[1], r2
-        )
-        return extra
-    n, thickness = between.layers[0]
-    return n * r2 / (torch.sqrt(r2 + thickness * thickness) + thickness)
+    r2 = (x_um * x_um + y_um * y_um).cpu().numpy()
+    path = interpolant.chebyshev_interpolant(focus.path_um, r2)
+    return torch.from_numpy(-2 * math.pi / focus.wavelength_um * path).to(x_um.device)
 
 
 def cell_um(

@@ -12,7 +12,6 @@ from metalens import psf
 from metalens.core import report, store
 from metalens.core.arrays import Array
 from metalens.library import axes
-from metalens.view import pillar_drawing
 from metalens.view.panels import (
     ClassMapPanel,
     CurvePanel,
@@ -138,13 +137,15 @@ def axes_panels(path: Path) -> list[Panel]:
 def lens_panels(path: Path) -> list[Panel]:
     """A map of every pillar with its phase and |T|, and the phase along the middle row.
 
+    Of turned pillars, of two sizes, or on another lattice the phase alone.
+
     Args:
         path: of the lens.
     """
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
-        return [pillar_drawing.draw_pillars(lens), _section(diameter, lens)]
+        return [_section(lens)]
     index, sizes = classes_of(diameter)
     return [
         ClassMapPanel(
@@ -161,22 +162,19 @@ def lens_panels(path: Path) -> list[Panel]:
                 "|T|": lens.proxy.transmission(sizes, lens.wavelength_um),
             },
         ),
-        _section(lens.diameters.diameter_um, lens),
+        _section(lens),
     ]
 
 
-def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
+def _section(lens: lenses.Lens) -> CurvePanel:
     """Phase modulo one turn along the middle row of pillars."""
-    middle = diameter[len(diameter) // 2]
-    pillars = middle > 0
-    phase = lens.phase_rad()[len(diameter) // 2]
-    x = lens.diameters.x_um[pillars]
-    wrapped = (phase[pillars] / (2 * math.pi)) % 1
+    row = len(lens.diameters.diameter_um) // 2
+    pillars = lens.diameters.diameter_um[row] > 0
     return CurvePanel(
         "Phase along the middle row",
-        x,
+        lens.diameters.x_um[pillars],
         "x / µm",
-        {"phase modulo a turn": wrapped},
+        {"phase modulo a turn": (lens.phase_rad()[row][pillars] / (2 * math.pi)) % 1},
         "turns",
     )
 

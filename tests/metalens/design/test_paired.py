@@ -15,7 +15,6 @@ from metalens.core.errors import ConfigError, DomainError, LensError, Propagatio
 from metalens.design import Focus, Limits
 from metalens.library import Sweep
 from metalens.library.axes import AxesLibrary
-from metalens.view import pillar_drawing
 
 X = np.linspace(0.1, 0.3, 81)
 Y = np.linspace(0.12, 0.28, 65)
@@ -210,13 +209,6 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
         again.proxy.phase_rad(np.array([0.2]), WAVELENGTH)
     with pytest.raises(LensError, match="two sizes"):
         dataclasses.replace(again, pairs=None)
-    drawing = pillar_drawing.draw_pillars(again)
-    sides = {
-        tuple(np.rint(np.ptp(o.corners, axis=0)).astype(int)) for o in drawing.outlines
-    }
-    assert sides == {
-        (o.notes["size / nm"], o.notes["length / nm"]) for o in drawing.outlines
-    }
 
 
 def test_targets_are_checked():
