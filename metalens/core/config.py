@@ -71,17 +71,14 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
                 f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})"
             )
         text = reading.decode_text(content)
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: no such file; need a TOML config ({record.__name__})"
-        ) from None
     except UnicodeDecodeError:
         raise ConfigError(
             f"{path}: not a text file; need TOML ({record.__name__}) that names files of data"
         ) from None
     except OSError as error:
+        reason = str(error.strerror).lower()
         raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); need a TOML config"
+            f"{path}: {reason}; need a TOML config ({record.__name__})"
         ) from None
     except ValueError as error:
         if isinstance(error, ConfigError):
@@ -197,9 +194,9 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     try:
         built = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
-        raise ConfigError(
-            f"{where}: {_culprit(record, values, prefix, str(error))}"
-        ) from error
+        message = str(error) if len(str(error)) <= 500 else f"{str(error)[:500]} ..."
+        table = f"[{prefix[:-1]}] " if prefix else ""
+        raise ConfigError(f"{where}: {table}{message}") from error
     for key, value in values.items():  # signs that the record itself accepts
         _check_sign(fields[key], value, where, prefix + key)
     return built
@@ -210,41 +207,6 @@ def _required(field: dataclasses.Field[Any]) -> bool:
         field.default is dataclasses.MISSING
         and field.default_factory is dataclasses.MISSING
     )
-
-
-def _culprit(record: Any, values: dict[str, Any], prefix: str, message: str) -> str:
-    """Message of a record's refusal, led by the keys without which the record would be
-    accepted, unless it names them.
-
-    Args:
-        record: dataclass that refuses the values.
-        values: by key.
-        prefix: of the keys in errors.
-        message: text of the refusal.
-    """
-    required = {entry.name for entry in dataclasses.fields(record) if _required(entry)}
-    message = message if len(message) <= 500 else message[:500] + " ..."
-    culprits = [
-        k
-        for k in values
-        if k not in required
-        and _is_accepted(
-            record, {name: value for name, value in values.items() if name != k}
-        )
-    ]
-    if any(key in message for key in culprits):
-        return f"[{prefix[:-1]}] {message}" if prefix else message
-    named = [f"{prefix}{key} is {_shown(values[key])}" for key in culprits[:3]]
-    return f"{' or '.join(named) or prefix[:-1] or 'top level'}: {message}"
-
-
-def _is_accepted(record: Any, values: dict[str, Any]) -> bool:
-    """Whether a record accepts the values."""
-    try:
-        record(**values)
-    except (ValueError, TypeError, ArithmeticError):
-        return False
-    return True
 
 
 def _check_range(

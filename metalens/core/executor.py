@@ -15,10 +15,7 @@ from metalens.core.errors import ConfigError, WorkerError
 Common = TypeVar("Common")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Done = Iterator[tuple[int, Any]]
-# runs (work, common, tasks), and yields (index, result)
-Place = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Done]
-_PLACE: ContextVar[Place | None] = ContextVar("_PLACE", default=None)
+_POOL: ContextVar[Any] = ContextVar("_POOL", default=None)
 _VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -56,12 +53,12 @@ def run_on(processes: int | None = None) -> Iterator[None]:
         return
     if not 1 <= processes <= 1024:
         raise ConfigError(f"{processes} workers: need 1 to 1024")
-    with _pool(processes) as pool:
-        token = _PLACE.set(functools.partial(_run_in_pool, pool))
+    with _worker_pool(processes) as pool:
+        token = _POOL.set(pool)
         try:
             yield
         finally:
-            _PLACE.reset(token)
+            _POOL.reset(token)
 
 
 def run_parallel(
@@ -78,12 +75,12 @@ def run_parallel(
     """
     if not tasks:
         return
-    place = _PLACE.get()
-    if place is not None:
-        yield from place(_plain, work, tasks)
+    pool = _POOL.get()
+    if pool is not None:
+        yield from _run_in_pool(pool, work, tasks)
         return
-    with _pool(min(usable_cores(), len(tasks))) as pool:
-        yield from _run_in_pool(pool, _plain, work, tasks)
+    with _worker_pool(min(usable_cores(), len(tasks))) as pool:
+        yield from _run_in_pool(pool, work, tasks)
 
 
 def gather_parallel(
@@ -101,56 +98,40 @@ def gather_parallel(
     Raises:
         WorkerError: as :func:`run_parallel`. Whatever ``work`` raises.
     """
-    place = _PLACE.get()
-    if place is not None and tasks:
-        results: dict[int, Result] = dict(place(work, common, tasks))
+    work_on = functools.partial(work, common)
+    pool = _POOL.get()
+    if pool is not None:
+        results = dict(_run_in_pool(pool, work_on, tasks))
         return [results[i] for i in range(len(tasks))]
     with threads.one_blas_thread():
-        return threads.run_each(functools.partial(work, common), tasks)
-
-
-def _plain(work: Callable[[Task], Result], task: Task) -> Result:
-    """``work`` of a task without a common argument, in the signature with one."""
-    return work(task)
+        return threads.run_each(work_on, tasks)
 
 
 @contextlib.contextmanager
-def _pool(count: int) -> Iterator[Any]:
+def _worker_pool(count: int) -> Iterator[Any]:
     """Context of worker processes, which start with the first task."""
     from loky import ProcessPoolExecutor
 
-    with _environment():  # of loky's own helper too, which is started like a worker
-        pool = ProcessPoolExecutor(
-            count, initializer=_settle, initargs=(os.getpid(),), env=_ENVIRONMENT
-        )
+    # loky's own helper, too, imports no files of the current folder
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
+    pool = ProcessPoolExecutor(
+        count, initializer=_begin_worker, initargs=(os.getpid(),), env=_ENVIRONMENT
+    )
     try:
         yield pool
     finally:
         pool.shutdown(wait=True, kill_workers=True)
 
 
-@contextlib.contextmanager
-def _environment() -> Iterator[None]:
-    """Context with the workers' environment variables, restored at the end."""
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
 def _run_in_pool(
-    pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]
-) -> Done:
+    pool: Any, work: Callable[[Task], Result], tasks: Sequence[Task]
+) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task as a pool of processes finishes it.
 
     Args:
         pool: of processes.
-        work: called with (common, task).
-        common: first argument.
-        tasks: second arguments.
+        work: called with a task.
+        tasks: arguments.
 
     Raises:
         WorkerError: a worker process died.
@@ -159,10 +140,7 @@ def _run_in_pool(
     from concurrent.futures.process import BrokenProcessPool
 
     try:
-        with _environment():
-            indices = {
-                pool.submit(work, common, task): i for i, task in enumerate(tasks)
-            }
+        indices = {pool.submit(work, task): i for i, task in enumerate(tasks)}
         for future in as_completed(indices):
             yield indices[future], future.result()
     except BrokenProcessPool as error:
@@ -172,19 +150,18 @@ def _run_in_pool(
         ) from None
 
 
-def _settle(parent: int) -> None:
-    """Initialise a worker: its standard output goes to standard error, and it ends when
-    its parent does.
+def _begin_worker(parent: int) -> None:
+    """Send the standard output of a worker to standard error, and end it when its
+    parent ends.
 
     Args:
         parent: process number.
     """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
     os.dup2(2, 1)
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-
-
-def _watch(parent: int) -> None:
-    """End this process when its parent is another one than ``parent``."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()

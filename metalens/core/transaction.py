@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -146,20 +146,18 @@ def claim_long_work(
 
     That folder survives an interruption if it holds a file that matches a pattern of
     ``keep``. With ``resume`` the next run continues in it, or in a copy of the finished
-    folder. The content of ``target`` stays until the end. Files that others put into a
-    folder of ours are carried over, and are not listed as ours.
+    folder. The content of ``target`` stays until the end.
 
     Args:
         target: the folder.
         keep: patterns of files that are worth keeping.
         resume: continue unfinished work.
-        grow: always continue, from a copy of ``target``, and replace the whole; it must
-            have a manifest, or hold nothing but folders that have one.
+        grow: always continue, from a copy of ``target``, and replace the whole.
         terms: what the claim allows.
 
     Raises:
-        OutputError: nothing to resume, or unfinished work that would be lost; see
-            :func:`_refuse`.
+        OutputError: unfinished work that would be lost, or a finished folder with files
+            that no manifest lists; see :func:`_refuse`.
     """
     target = _resolve_link(target)
     with _claim(target, terms, is_folder=True) as scratch:
@@ -333,9 +331,7 @@ def _is_taken(path: Path) -> bool:
 
 def _finish(folder: Path) -> None:
     """Write the manifest of a finished folder, and sync all of its files."""
-    manifest = read_manifest(folder)
-    others = manifest["others"] if manifest else ()
-    write_manifest(folder, store.COMMAND.get(), others=others)
+    write_manifest(folder, store.COMMAND.get())
     sync_files(folder)
 
 
@@ -391,46 +387,47 @@ def _open_work(
         raise OutputError(
             f"{work} is in the way and was not made by metalens; move it or give another name"
         )
-    if manifest is not None and resume:
-        return True
-    if manifest is not None and not terms.force:
-        raise OutputError(
-            f"{work} holds an unfinished run; give --resume to go on, or --force to start over"
-        )
     if manifest is not None:
+        if resume:
+            return True
+        if not terms.force:
+            raise OutputError(
+                f"{work} holds an unfinished run; give --resume to go on, or --force to start over"
+            )
         work.rename(scratch / "given_up")
     fresh = scratch / "work"
     copied = resume and _is_taken(target)
-    others = set[str]()
     if copied:
         others = unlisted_files(target)
-        if others and read_manifest(target) is None:
+        if others:
             raise OutputError(
-                f"{target} holds {min(others)} and no {NAME}: not made by metalens"
+                f"{target} holds {min(others)}, which metalens did not make: move it or give another name"
             )
         if not grow:
             check_manifest(target)
         shutil.copytree(target, fresh, symlinks=True)
     else:
         fresh.mkdir()
-    write_manifest(fresh, store.COMMAND.get(), finished=False, others=others)
+    write_manifest(fresh, store.COMMAND.get(), finished=False)
     fresh.rename(work)
     return copied
 
 
-def write_manifest(
-    folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()
-) -> None:
+def write_manifest(folder: Path, command: str, *, finished: bool = True) -> None:
     """Write the manifest of all files in a folder: SHA-256 and size of each.
 
     Args:
         folder: that is listed.
         command: that made it.
         finished: False while the folder is being filled; no files are listed then.
-        others: files that are not ours, listed by name alone.
     """
-    listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
-              for name in (sorted({*iterate_files(folder)} - {*others}) if finished else ())}  # fmt: skip
+    listed = {
+        name: {
+            "sha256": store.sha256(folder / name),
+            "bytes": (folder / name).stat().st_size,
+        }
+        for name in (sorted(iterate_files(folder)) if finished else ())
+    }
     manifest = {
         "kind": KIND,
         "version": VERSION,
@@ -438,7 +435,6 @@ def write_manifest(
         "command": command,
         "versions": dict(store.package_versions()),
         "files": listed,
-        "others": sorted(others),
     }
     store.write_text(folder / NAME, json.dumps(manifest, indent=1) + "\n")
 
@@ -464,12 +460,11 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
             str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])}
             for n, e in manifest["files"].items()
         }
-        others = [str(name) for name in manifest.get("others", ())]
-        plain = {
+        stated = {
             "finished": bool(manifest["finished"]),
             "command": str(manifest["command"]),
         }
-        return manifest | plain | {"files": entries, "others": others}
+        return manifest | stated | {"files": entries}
     except (
         OSError,
         ValueError,
@@ -517,27 +512,18 @@ def check_manifest(folder: Path) -> None:
 
 def sync_files(folder: Path) -> None:
     """Flush a folder and all files below it to the disk."""
-    for place, _, names in os.walk(folder):
-        for path in (*(Path(place, name) for name in names), Path(place)):
-            store.sync_file(path)
+    for path in (*folder.rglob("*"), folder):
+        store.sync_file(path)
 
 
 def iterate_files(folder: Path) -> Iterator[str]:
     """Names of all files below a folder, relative to it, without its manifest; links to
     folders are named too.
     """
-    for place, folders, names in os.walk(folder):
-        parent = Path(place).relative_to(folder)
-        yield from (
-            (parent / name).as_posix()
-            for name in names
-            if (parent / name).as_posix() != NAME
-        )
-        yield from (
-            (parent / name).as_posix()
-            for name in folders
-            if os.path.islink(os.path.join(place, name))
-        )
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        if name != NAME and (path.is_symlink() or not path.is_dir()):
+            yield name
 
 
 def empty_folder(folder: Path) -> None:
