@@ -231,25 +231,21 @@ def textured_frames(grid: Grid) -> Frames:
     Args:
         grid: samples, depths and margin of the image.
     """
-    draw = torch.Generator().manual_seed(11)
     y, x = (n + 2 * grid.margin for n in grid.samples)
+    draw = torch.Generator().manual_seed(11)
     fy, fx = torch.fft.fftfreq(y)[:, None], torch.fft.rfftfreq(x)
+    frequency = torch.sqrt(fy**2 + fx**2 + (0.5 / max(x, y)) ** 2)
     white = torch.fft.rfft2(torch.randn(2, y, x, generator=draw))
-    lowest = 0.5 / max(x, y)
-    rough = torch.fft.irfft2(white / torch.sqrt(fy**2 + fx**2 + lowest**2), s=(y, x))
+    rough = torch.fft.irfft2(white / frequency, s=(y, x))
     texture = (1 + CONTRAST * (rough - rough.mean()) / rough.std()).clamp_min(0)
-    down = torch.linspace(-1, 1, y)[:, None].expand(y, x)
-    across = torch.linspace(-1, 1, x).expand(y, x)
-    near = torch.sigmoid((-down - 0.25 + 0.2 * across) * y / 4)
+    sides = torch.linspace(-1, 1, y), torch.linspace(-1, 1, x)
+    down, across = torch.meshgrid(*sides, indexing="ij")
+    near = torch.sigmoid((0.2 * across - down - 0.25) * y / 4)
     cover = torch.stack([near, 1 - near])
     low, high = (1 / d for d in grid.depths_um)
-    depth = 1 / torch.stack(
-        [
-            low + (high - low) * (0.2 + 0.2 * across),
-            low + (high - low) * (0.6 + 0.35 * down),
-        ]
-    )
-    return Frames((cover * texture)[None], cover[None], depth[None])
+    share = torch.stack([0.2 + 0.2 * across, 0.6 + 0.35 * down])
+    depth_um = 1 / (low + (high - low) * share)
+    return Frames((cover * texture)[None], cover[None], depth_um[None])
 
 
 def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:

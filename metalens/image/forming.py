@@ -22,7 +22,7 @@ from metalens.image.low_rank import (
 )
 from metalens.image.plan import KERNELS, Grid, ImagingPlan
 from metalens.image.points import Window
-from metalens.image.scene import Frames
+from metalens.image.scene import Frames, to_device
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import StrayLight, add_stray
 
@@ -198,15 +198,7 @@ class Imager:
 
     def to(self, device: torch.device | str) -> "Imager":
         """This imager on a device, for frames on it; grid and plan are not moved."""
-        return replace(
-            self,
-            stack=self.stack.to(device),
-            energy=self.energy.to(device),
-            basis=self.basis.to(device),
-            light=self.light.to(device),
-            cover=self.cover.to(device),
-            stray=None if self.stray is None else self.stray.to(device),
-        )
+        return to_device(self, device)
 
 
 def build_imager(

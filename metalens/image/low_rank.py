@@ -1,6 +1,6 @@
 """Field-varying PSFs as one low-rank sum over the whole field and all depths."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
+from metalens.image.scene import to_device
 from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
-from metalens.image.texture import scene_spectrum, texture_spectrum
+from metalens.image.texture import scene_spectrum
 
 CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
 SAMPLED = 1024  # node PSFs, drawn at random, of which the kernels are mixtures
@@ -63,8 +64,7 @@ class KernelBasis:
 
     def to(self, device: torch.device | str) -> "KernelBasis":
         """The same on a device."""
-        parts = ("mixture", "sampled", "weights")
-        return replace(self, **{name: getattr(self, name).to(device) for name in parts})
+        return to_device(self, device)
 
 
 def principal_kernels(
@@ -90,7 +90,7 @@ def principal_kernels(
 
     def transform(some: Tensor) -> Tensor:
         if field.uniform:
-            return texture_spectrum(some.double())
+            return scene_spectrum(some.double())
         return scene_spectrum(some.double(), max(tolerance / 0.01, 1.0), band)
 
     draw = torch.Generator().manual_seed(3)
@@ -168,8 +168,7 @@ class LowRankPsfs:
 
     def to(self, device: torch.device | str) -> "LowRankPsfs":
         """The same on a device."""
-        parts = ("kernels", "transfer", "table")
-        return replace(self, **{name: getattr(self, name).to(device) for name in parts})
+        return to_device(self, device)
 
     @property
     def uniform(self) -> bool:

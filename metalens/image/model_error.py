@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens import propagate
 from metalens.image.points import Optics, Window, psfs, sampling
 from metalens.image.texture import texture_error, weigh_by_light
 from metalens.image.waves import PillarPlane
+from metalens.optics import media
 from metalens.psf import Polarisation, SpectralNodes, blur_um, psf_stack
 
 
@@ -231,25 +231,23 @@ def _of_pillars(
     step_um, count, finer = sampled
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place.cpu() / after.reduced_um
-    tilt = math.atan(math.hypot(*tangents.tolist()))
-    t = wave.pillar_transmission(wavelength_um, tilt).cpu()
-    geometry: dict[str, Any] = {
-        "pitch_um": wave.pitch_um,
-        "wavelength_um": wavelength_um,
-        "sensor_distance_um": optics.distance_um,
-        "depths_um": depths_um.tolist(),
-        "angle_rad": torch.atan(tangents).tolist(),
-        "window_um": count * step_um,
-        "samples": count * finer,
-    }
-    case = propagate.make_case(tuple(t.shape), **geometry, layers=optics.layers.open)
-    offset = [float(a) - b for a, b in zip(place, case.centre_um, strict=True)]
+    slope = math.hypot(*tangents.tolist())
+    # the chief ray through films lands off its paraxial place
+    reach = media.reach_per_direction(after.layers, slope**2 / (1 + slope**2))
+    landing = tangents * reach / math.hypot(1, slope)
+    t = wave.pillar_transmission(wavelength_um, math.atan(slope)).cpu()
     stack = psf_stack(
         torch.angle(t),
         t.abs(),
-        **geometry,
+        pitch_um=wave.pitch_um,
+        wavelength_um=wavelength_um,
+        sensor_distance_um=optics.distance_um,
+        depths_um=depths_um.tolist(),
+        angle_rad=torch.atan(tangents).tolist(),
+        window_um=count * step_um,
+        samples=count * finer,
         layers=optics.layers,
-        offset_um=offset,
+        offset_um=(place.cpu() - landing).tolist(),
         integrate=False,
     )
     return torch.as_tensor(stack.intensity).double()

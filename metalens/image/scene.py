@@ -1,11 +1,14 @@
 """Scenes of two sheets, each a surface of varying depth (paper Sec. 3.1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
+
+Record = TypeVar("Record", bound=Any)  # a dataclass
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,7 +43,16 @@ class Frames:
 
     def to(self, device: torch.device | str) -> "Frames":
         """The same on a device."""
-        return Frames(*(getattr(self, name).to(device) for name in Frames.__slots__))
+        return to_device(self, device)
+
+
+def to_device(record: Record, device: torch.device | str) -> Record:
+    """A dataclass with its tensors, and the records that have a method ``to``, on a
+    device; other fields stay.
+    """
+    values = {name: getattr(record, name) for name in record.__dataclass_fields__}
+    moved = {k: v.to(device) for k, v in values.items() if hasattr(v, "to")}
+    return replace(record, **moved)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -3,7 +3,7 @@ weak and wide.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from metalens.core.arrays import Array
 from metalens.image.plan import Grid
 from metalens.image.points import Optics
+from metalens.image.scene import to_device
 from metalens.image.waves import PillarWave
 
 ORDERS = (-1, 0, 2, 3)
@@ -26,27 +27,22 @@ class StrayLight:
     shares: of the light on the aperture in each order.
     transfers: (discs, Y, X // 2 + 1) their transforms, weighted by the shares, of size
         ``shape``.
-    moves: of each disc matrices (rows, columns) that put light where its disc lies;
-        empty where discs lie about the sources' own places.
+    rows, columns: (discs, n, n) matrices that put light where each disc lies; None
+        where discs lie about the sources' own places.
     illumination: (y, x) of the frame, cos⁴ of the field angle, times what the lens
         takes in of the light of the stop.
     """
 
     shares: dict[int, float]
     transfers: Tensor
-    moves: list[tuple[Tensor, Tensor]]
     shape: tuple[int, int]
     illumination: Tensor
+    rows: Tensor | None = None
+    columns: Tensor | None = None
 
     def to(self, device: torch.device | str) -> "StrayLight":
         """The same on a device."""
-        moves = [(rows.to(device), columns.to(device)) for rows, columns in self.moves]
-        return replace(
-            self,
-            transfers=self.transfers.to(device),
-            moves=moves,
-            illumination=self.illumination.to(device),
-        )
+        return to_device(self, device)
 
 
 class _Footprint(NamedTuple):
@@ -91,21 +87,21 @@ def stray_of(
         footprint = _whole_lens(wave.radius_um, grid, d, middle_um)
     else:
         footprint = _behind_stop(optics, grid, depth_um, middle_um)
-    transfers, moves = [], []
+    transfers, scales = [], []
     for m, share in shares.items():
-        scale = 1 + d / depth - m * (1 + d / source)
-        radius = max(footprint.radius_um * abs(scale), grid.step_um)
+        scales.append(1 + d / depth - m * (1 + d / source))
+        radius = max(footprint.radius_um * abs(scales[-1]), grid.step_um)
         disc = torch.from_numpy(share * _disc(radius, grid.step_um, shape)).float()
         transfers.append(torch.fft.rfft2(disc))
-        if footprint.middle_um is not None:
-            rows, columns = (
-                _moved(a * scale / grid.step_um) for a in footprint.middle_um
-            )
-            moves.append((rows, columns))
     discs = torch.stack(transfers)
-    if not moves:
+    if footprint.middle_um is None:
         discs = discs.sum(0, keepdim=True)
-    return StrayLight(shares, discs, moves, shape, footprint.illumination)
+        return StrayLight(shares, discs, shape, footprint.illumination)
+    rows, columns = (
+        torch.stack([_moved(place * scale / grid.step_um) for scale in scales])
+        for place in footprint.middle_um
+    )
+    return StrayLight(shares, discs, shape, footprint.illumination, rows, columns)
 
 
 def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
@@ -226,9 +222,8 @@ def add_stray(image: Tensor, light: Tensor, stray: StrayLight, grid: Grid) -> Te
         grid: samples, step, depths and margin of the image.
     """
     light = light * stray.illumination.to(light)
-    moved = [rows @ light @ columns.mT for rows, columns in stray.moves] or [light]
-    spectrum = sum(
-        torch.fft.rfft2(part, s=stray.shape) * transfer
-        for part, transfer in zip(moved, stray.transfers, strict=True)
-    )
+    parts = light[:, None]
+    if stray.rows is not None and stray.columns is not None:
+        parts = stray.rows @ parts @ stray.columns.mT
+    spectrum = (torch.fft.rfft2(parts, s=stray.shape) * stray.transfers).sum(1)
     return image + grid.crop(torch.fft.irfft2(spectrum, s=stray.shape))

@@ -6,24 +6,11 @@ from torch import Tensor
 CONTRAST = 0.3  # standard deviation over mean of the scene that errors are stated for
 
 
-def texture_spectrum(psf: Tensor) -> Tensor:
-    """(…, features) Fourier transform of PSFs (…, h, w) times the 1/f amplitude.
-
-    Its L2 norm is that of the image of the texture. Frequencies below one period in
-    eight windows count as that one.
-
-    Args:
-        psf: (..., h, w) PSFs.
-    """
-    power, both, _ = _powers(psf)
-    return _weighed(psf, power * both)
-
-
-def scene_spectrum(psf: Tensor, plane: float, band: float) -> Tensor:
+def scene_spectrum(psf: Tensor, plane: float = 0.0, band: float = 0.0) -> Tensor:
     """(…, features) of PSFs (…, h, w): their L2 norm is that of the image of a scene.
 
     The scene is a 1/f texture of standard deviation :data:`CONTRAST` plus a uniformly
-    illuminated plane.
+    illuminated plane. Frequencies below one period in eight windows count as that one.
 
     Args:
         psf: (..., h, w) PSFs.
@@ -35,7 +22,9 @@ def scene_spectrum(psf: Tensor, plane: float, band: float) -> Tensor:
     if band > 0:
         low = torch.exp(-frequency2 / band**2)
         weight = weight + plane**2 * low / (low * both).sum()
-    return _weighed(psf, weight * both)
+    h, w = psf.shape[-2:]
+    spectrum = torch.fft.rfft2(psf, s=(2 * h, 2 * w)) * (weight * both).sqrt()
+    return torch.view_as_real(spectrum).flatten(-3)
 
 
 def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -51,23 +40,16 @@ def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return 1 / (frequency2 + (1 / (8 * max(h, w))) ** 2), both, frequency2
 
 
-def _weighed(psf: Tensor, power: Tensor) -> Tensor:
-    """(…, features) real features: zero-padded rfft2 of PSFs times √power."""
-    h, w = psf.shape[-2:]
-    spectrum = torch.fft.rfft2(psf, s=(2 * h, 2 * w)) * power.sqrt()
-    return torch.view_as_real(spectrum).flatten(-3)
-
-
 def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
     """(…) relative L2 error of the image of a texture through PSFs (…, h, w).
 
     Args:
         psf: (..., h, w) PSFs.
     """
-    a = texture_spectrum(psf.double())
-    b = texture_spectrum(reference.double())
-    error: Tensor = (a - b).norm(dim=-1) / b.norm(dim=-1)
-    return error
+    psf, reference = psf.double(), reference.double()
+    spectra = (scene_spectrum(some) for some in (psf - reference, reference))
+    error, level = (spectrum.norm(dim=-1) for spectrum in spectra)
+    return error / level
 
 
 def scene_error(psf: Tensor, reference: Tensor) -> float:
@@ -78,7 +60,7 @@ def scene_error(psf: Tensor, reference: Tensor) -> float:
     Args:
         psf, reference: (places, depths, h, w), each times its relative illumination.
     """
-    error = scene_spectrum((psf - reference).double(), 0.0, 0.0).square().sum(-1)
+    error = scene_spectrum((psf - reference).double()).square().sum(-1)
     light = reference.double().sum((-1, -2)).square()
     return float(torch.sqrt(error.mean(0).max() / light.mean(0).max().clamp_min(1e-30)))
 
