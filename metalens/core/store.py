@@ -298,17 +298,24 @@ def save(
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    with replace_atomically(path) as scratch, CheckedFile(scratch, "wb+") as file:
-        _write(
-            file,
-            kind,
-            version,
-            attributes or {},
-            arrays,
-            provenance or Provenance(),
-            compress,
-        )
-        file.check()
+    about = provenance or Provenance()
+    header = {"kind": kind, "version": version, "units": _UNITS, **(attributes or {})}
+    groups: dict[str, Mapping[str, Attribute]] = {
+        "/": header,
+        "provenance": {"config": about.config, "seed": about.seed},
+        "provenance/inputs": about.inputs,
+        "provenance/versions": about.versions,
+    }
+    with replace_atomically(path) as scratch, CheckedFile(scratch, "wb+") as checked:
+        with h5py.File(checked, "w", track_order=False, libver=_FORMAT) as file:
+            for name in sorted(arrays):
+                _write_array(file, name, np.asarray(arrays[name]), compress)
+                checked.check()
+            for group_name, values in groups.items():
+                group = file.require_group(group_name)
+                for name, value in sorted(values.items()):
+                    _write_attribute(group, name, value)
+        checked.check()
 
 
 def load(
@@ -387,41 +394,35 @@ def _read(
     Raises:
         StoreError: no header, another kind or version, or sizes that cannot be.
     """
-    stored_kind = _plain(file.attrs.get("kind"))
-    if stored_kind is None:
+    header = {name: _plain(value) for name, value in file.attrs.items()}
+    if "kind" not in header:
         raise StoreError(
             f"{path}: an HDF5 file without 'kind', not made by this toolchain"
         )
-    number = _plain(file.attrs["version"])
+    stored_kind = str(header.pop("kind"))
+    number = header.pop("version")
+    header.pop("units", None)
     if not isinstance(number, int):
         raise StoreError(
             f"{path}: version is {number!r}, need a whole number; damaged: make it again"
         )
-    if kind is not None and (stored_kind != kind or number != version):
+    if kind is not None and (stored_kind, number) != (kind, version):
         raise StoreError(
             f"{path} holds {stored_kind!r} version {number}, need {kind!r} version {version}; "
             "make it again with this release or give another file"
         )
-    arrays: dict[str, Array] = _Entries(path)
-    data_sets = (
-        (name, item)
-        for name, item in _list_data_sets(path, file)
-        if name not in without
+    data_sets = _list_data_sets(path, file)
+    arrays = {name: item[...] for name, item in data_sets if name not in without}
+    stated = file["provenance"].attrs
+    inputs, versions = (
+        {name: str(_plain(text)) for name, text in file[part].attrs.items()}
+        for part in ("provenance/inputs", "provenance/versions")
     )
-    arrays |= {
-        name: item[...]
-        for name, item in data_sets
-        if not name.startswith("provenance/")
-    }
-    attributes: dict[str, Any] = _Entries(path)
-    attributes |= {
-        key: _plain(value)
-        for key, value in file.attrs.items()
-        if key not in ("kind", "version", "units")
-    }
-    return StoredArtefact(
-        str(stored_kind), number, arrays, attributes, _read_provenance(file)
+    provenance = Provenance(
+        str(_plain(stated["config"])), inputs, int(stated["seed"]), versions
     )
+    entries = _Entries(path, arrays), _Entries(path, header)
+    return StoredArtefact(stored_kind, number, *entries, provenance)
 
 
 def _list_data_sets(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
@@ -432,17 +433,13 @@ def _list_data_sets(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset
     Raises:
         StoreError: sizes that cannot be, or arrays above 64 GiB together.
     """
-    data_sets: list[tuple[str, h5py.Dataset]] = []
-
-    def add(name: str, item: h5py.HLObject) -> None:
-        if isinstance(item, h5py.Dataset):
-            data_sets.append((name, item))
-
-    file.visititems(add)
-    claimed = 0
+    names: list[str] = []
+    file.visit(names.append)
+    items = ((name, file[name]) for name in names)
+    data_sets = [pair for pair in items if isinstance(pair[1], h5py.Dataset)]
     for name, item in data_sets:
         check_claim(path, item, name)
-        claimed += item.nbytes
+    claimed = sum(item.nbytes for _, item in data_sets)
     if claimed > _MOST_BYTES:
         raise StoreError(
             f"{path}: its arrays take {claimed / 1e9:.3g} GB, more than {_MOST_BYTES / 1e9:.3g} GB"
@@ -481,49 +478,14 @@ def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
 class _Entries(dict[str, Any]):
     """Entries of a file by name; a missing one raises a StoreError that names both."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__()
+    def __init__(self, path: Path, entries: Mapping[str, Any]) -> None:
+        super().__init__(entries)
         self.path = path
 
     def __missing__(self, name: str) -> Any:
         raise StoreError(
             f"{self.path}: holds no {name!r}; made by another release or damaged: make it again"
         )
-
-
-def _write(
-    checked_file: CheckedFile,
-    kind: str,
-    version: int,
-    attributes: Mapping[str, Attribute],
-    arrays: Mapping[str, Array],
-    provenance: Provenance,
-    compress: bool,
-) -> None:
-    """Write header, arrays in order of name, and provenance; a write error is raised
-    after each array.
-
-    Args:
-        checked_file: stores write errors.
-        kind: of the artefact.
-        version: of the kind.
-        attributes: of the header.
-        arrays: by name.
-        provenance: of the artefact.
-        compress: whether arrays above 64 KiB are compressed.
-    """
-    with h5py.File(checked_file, "w", track_order=False, libver=_FORMAT) as file:
-        header: dict[str, Attribute] = {
-            "kind": kind,
-            "version": version,
-            "units": _UNITS,
-        }
-        for name, value in (header | dict(sorted(attributes.items()))).items():
-            _write_attribute(file, name, value)
-        for name in sorted(arrays):
-            _write_array(file, name, np.asarray(arrays[name]), compress)
-            checked_file.check()
-        _write_provenance(file, provenance)
 
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
@@ -564,29 +526,6 @@ def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
         )
     else:
         item.attrs[name] = value
-
-
-def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
-    """Write the group ``provenance``: config, seed, inputs and versions."""
-    group = file.create_group("provenance")
-    _write_attribute(group, "config", provenance.config)
-    _write_attribute(group, "seed", provenance.seed)
-    for part in ("inputs", "versions"):
-        entries = group.create_group(part)
-        for name, value in sorted(getattr(provenance, part).items()):
-            _write_attribute(entries, name, value)
-
-
-def _read_provenance(file: h5py.File) -> Provenance:
-    """Provenance stored in a file."""
-    group = file["provenance"]
-    inputs, versions = (
-        {name: str(_plain(value)) for name, value in group[part].attrs.items()}
-        for part in ("inputs", "versions")
-    )
-    return Provenance(
-        str(_plain(group.attrs["config"])), inputs, int(group.attrs["seed"]), versions
-    )
 
 
 def _plain(value: Any) -> Any:
