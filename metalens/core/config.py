@@ -195,8 +195,8 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
         built = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
         message = str(error) if len(str(error)) <= 500 else f"{str(error)[:500]} ..."
-        table = f"[{prefix[:-1]}] " if prefix else ""
-        raise ConfigError(f"{where}: {table}{message}") from error
+        section = f"[{prefix[:-1]}] " if prefix else ""
+        raise ConfigError(f"{where}: {section}{message}") from error
     for key, value in values.items():  # signs that the record itself accepts
         _check_sign(fields[key], value, where, prefix + key)
     return built

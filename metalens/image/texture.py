@@ -24,7 +24,8 @@ def scene_spectrum(psf: Tensor, plane: float = 0.0, band: float = 0.0) -> Tensor
         weight = weight + plane**2 * low / (low * both).sum()
     h, w = psf.shape[-2:]
     spectrum = torch.fft.rfft2(psf, s=(2 * h, 2 * w)) * (weight * both).sqrt()
-    return torch.view_as_real(spectrum).flatten(-3)
+    features: Tensor = torch.view_as_real(spectrum).flatten(-3)
+    return features
 
 
 def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
