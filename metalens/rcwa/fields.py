@@ -26,21 +26,15 @@ from metalens.rcwa.permittivity import (
     normals_at,
     permittivity_at,
     permittivity_coefficients,
-    pillar_section,
-    section_operators,
+    section_modes,
 )
-from metalens.rcwa.sidewall import staircase_layers
-from metalens.rcwa.smatrix import (
-    FourierModes,
-    film_modes,
-    match_layers,
-    solve_eigenmodes,
-)
+from metalens.rcwa.smatrix import FourierModes, match_layers
 from metalens.rcwa.solver import (
     CellProblem,
     cell_problem,
     polarization_column,
     safety_factor,
+    stack_sections,
     truncation_sequence,
 )
 
@@ -103,24 +97,15 @@ class NearField:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Slab:
-    """A film (an index alone), a section, or a half-space; height times k0."""
-
-    index: complex
-    section: PillarSection | None
-    height: float
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class _Stack:
     """Substrate, slabs and cover, and where they meet.
 
-    slabs: foot first, with both half-spaces. ends: (slabs - 1,) interfaces times k0, 0
-        at the pillar's foot.
+    slabs: foot first, with both half-spaces, and heights times k0.
+    ends: (slabs - 1,) interfaces times k0, 0 at the pillar's foot.
     """
 
     problem: CellProblem
-    slabs: list[_Slab]
+    slabs: list[tuple[PillarSection, float]]
     ends: Array
 
     @property
@@ -143,14 +128,13 @@ class _Stack:
         """
         cell = self.problem.cell
         y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
-        tables: list[tuple[Array, Array | None]] = []
-        for slab in self.slabs:
-            if slab.section is None:
-                tables.append((np.full(x.shape, slab.index**2, complex), None))
-                continue
-            normal = normals_at(slab.section.outlines, cell, x, y)
-            tables.append((permittivity_at(slab.section, cell, x, y), normal))
-        return tables
+        return [
+            (
+                permittivity_at(section, cell, x, y),
+                normals_at(section.outlines, cell, x, y) if section.outlines else None,
+            )
+            for section, _ in self.slabs
+        ]
 
 
 def _stack(problem: CellProblem, steps: int) -> _Stack:
@@ -161,28 +145,10 @@ def _stack(problem: CellProblem, steps: int) -> _Stack:
         problem: cell and light.
         steps: of the staircase of a tilted wall.
     """
-    cell, wavelength_um = problem.cell, problem.light.wavelength_um
-    k0, media = 2 * math.pi / wavelength_um, problem.media
-    sections = [
-        _Slab(
-            0j,
-            pillar_section(cell, layer, problem.size_um, wavelength_um),
-            k0 * layer.height_um,
-        )
-        for layer in staircase_layers(cell, steps)
-    ]
-    below, above = (
-        [_Slab(index, None, height) for index, height in films]
-        for films in (
-            ((media.substrate, 0.0), *media.under),
-            (*media.over, (media.cover, 0.0)),
-        )
-    )
-    slabs = [*below, *sections, *above]
-    foot = sum(slab.height for slab in below)
-    return _Stack(
-        problem, slabs, np.cumsum([slab.height for slab in slabs[:-1]]) - foot
-    )
+    substrate, cover = (PillarSection((), (), n**2) for n in problem.indices)
+    slabs = [(substrate, 0.0), *stack_sections(problem, steps), (cover, 0.0)]
+    ends = np.cumsum([height for _, height in slabs[:-1]])
+    return _Stack(problem, slabs, ends - ends[len(problem.cell.under)])
 
 
 def near_fields(
@@ -425,24 +391,19 @@ def _solve_class(
         incident[zero_order] = sign * _incident_amplitudes(light)[column]
     if not incident.any():
         return None
-    symmetric = cell.outline(problem.size_um).keeps(-1, -1)
-    layers, inverse_z = [], []
-    for slab in stack.slabs:
-        if slab.section is None:
-            layers.append(film_modes(waves, slab.index, symmetric=symmetric))
-            inverse_z.append(np.eye(len(space.ez.m)) / slab.index**2)
-            continue
-        P, Q = section_operators(space, waves, slab.section, cell)
-        layers.append(solve_eigenmodes(P, Q, symmetric=symmetric))
-        eps, _ = permittivity_coefficients(slab.section, cell, space.reach)
-        inverse_z.append(np.linalg.inv(toeplitz_matrix(space, eps, EZ)))
-    substrate, cover = (
-        half_space(waves, index)
-        for index in (problem.media.substrate, problem.media.cover)
+    layers = [
+        section_modes(space, waves, section, cell, height)
+        for section, height in stack.slabs
+    ]
+    tables = (
+        permittivity_coefficients(section, cell, space.reach)[0]
+        for section, _ in stack.slabs
     )
-    heights = tuple(slab.height for slab in stack.slabs[1:-1])
+    inverse_z = [np.linalg.inv(toeplitz_matrix(space, eps, EZ)) for eps in tables]
+    substrate, cover = (half_space(waves, index) for index in problem.indices)
     source = 2 * substrate[0] * substrate[1] * incident
-    fields = match_layers(layers[1:-1], heights, cover, substrate, source)
+    symmetric = cell.outline(problem.size_um).keeps(-1, -1)
+    fields = match_layers(layers[1:-1], cover, substrate, source, symmetric=symmetric)
     # the modes of the half-spaces are plane waves, in another order: W^T W = 1
     upward = substrate[0] * incident
     below, above = layers[0].W.T, layers[-1].W.T

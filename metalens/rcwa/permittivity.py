@@ -22,6 +22,7 @@ from metalens.rcwa.basis import (
     ReducedOrders,
     toeplitz_matrix,
 )
+from metalens.rcwa.smatrix import FourierModes, film_modes, solve_eigenmodes
 
 Flips = tuple[tuple[int, int], ...]
 FLIPS: Flips = ((1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -36,7 +37,7 @@ _TIE = 1e-9  # relative difference of distances that are equal
 class PillarSection:
     """A section that is homogeneous along z.
 
-    outlines: from the inside out. inside: permittivity within each, down to the next
+    outlines: from the inside out; none: a film. inside: permittivity within each, down to the next
     smaller one. outside: permittivity around them.
     """
 
@@ -100,7 +101,7 @@ def permittivity_coefficients(
     inverse = direct.copy()
     centre = 2 * reach[0], 2 * reach[1]
     direct[centre], inverse[centre] = section.outside, 1 / section.outside
-    next_permittivities = (*section.inside[1:], section.outside)
+    next_permittivities = (*section.inside, section.outside)[1:]
     boundaries = zip(section.outlines, section.inside, next_permittivities, strict=True)
     for outline, inner, outer in boundaries:
         factor = outline.fourier(gx[:, None], gy) / area
@@ -424,3 +425,23 @@ def section_operators(
     inverse_z = np.linalg.inv(toeplitz_matrix(space, direct, EZ))
     P[with_ez, with_ez] -= kappa[:, None] * inverse_z * kappa
     return P, Q
+
+
+def section_modes(
+    space: ReducedOrders,
+    waves: PlaneWaves,
+    section: PillarSection,
+    cell: Cell,
+    height: float,
+    normals: tuple[Outline, ...] | None = None,
+) -> FourierModes:
+    """Eigenmodes of a section or film.
+
+    Args:
+        space, waves, section, cell, normals: as for :func:`section_operators`.
+        height: of the section, times k0.
+    """
+    if not section.outlines:
+        return film_modes(waves, complex(np.sqrt(section.outside)), height)
+    P, Q = section_operators(space, waves, section, cell, normals=normals)
+    return solve_eigenmodes(P, Q, height)

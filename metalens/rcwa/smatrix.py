@@ -14,44 +14,27 @@ _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincid
 _FADED = 41.0  # exp(-41) = 1.6e-18: waves that do not reach the other end of a layer
 
 
-@dataclass(frozen=True, slots=True)
-class StackMedia:
-    """Refractive indices and thicknesses at one wavelength (exp(-iwt)); lengths in
-    units of 1/k0.
-
-    under, over: (index, thickness) of the films, in the order that the light meets
-        them. heights: of the patterned layers, foot first.
-    """
-
-    substrate: complex
-    cover: complex
-    under: tuple[tuple[complex, float], ...] = ()
-    over: tuple[tuple[complex, float], ...] = ()
-    heights: tuple[float, ...] = ()
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class FourierModes:
     """Eigenmodes of one layer, u' = i P w, w' = i Q u.
 
-    Q: (n, n). q: (n,) propagation constants over k0, imaginary part >= 0, the
-        longest-lived first.
+    height: of the layer, times k0. Q: (n, n). q: (n,) propagation constants over k0,
+        imaginary part >= 0, the longest-lived first.
     W, V: (n, n) columns u and w of the upward modes (u, -w: downward).
-    symmetric: whether P and Q are.
     """
 
+    height: float
     Q: Array
     q: Array
     W: Array
     V: Array
-    symmetric: bool = True
 
 
-def solve_eigenmodes(P: Array, Q: Array, *, symmetric: bool = True) -> FourierModes:
+def solve_eigenmodes(P: Array, Q: Array, height: float) -> FourierModes:
     """Eigenmodes of a layer: P Q W = W q^2, V = Q W / q.
 
     Args:
-        P, Q: (n, n) operators. symmetric: whether they are symmetric matrices.
+        P, Q: (n, n) operators. height: of the layer, times k0.
     """
     square, W = np.linalg.eig(P @ Q)
     q = np.sqrt(square.astype(complex))
@@ -60,22 +43,19 @@ def solve_eigenmodes(P: Array, Q: Array, *, symmetric: bool = True) -> FourierMo
     q = np.where(np.abs(q) < _TINY, _TINY, q)
     order = np.argsort(q.imag, kind="stable")
     q, W = q[order], W[:, order]
-    return FourierModes(Q, q, W, (Q @ W) / q, symmetric)
+    return FourierModes(height, Q, q, W, (Q @ W) / q)
 
 
-def film_modes(
-    waves: PlaneWaves, index: complex, *, symmetric: bool = True
-) -> FourierModes:
-    """Plane ``waves`` as modes of a homogeneous layer of this ``index``.
-
-    symmetric: whether the operators of all layers of the stack are.
+def film_modes(waves: PlaneWaves, index: complex, height: float) -> FourierModes:
+    """Plane ``waves`` as modes of a homogeneous layer of this ``index`` and ``height``
+    (times k0).
     """
     kz = normal_component(waves.kappa, index)
     kz = np.where(np.abs(kz) < _TINY, _TINY, kz)
     Q = np.where(waves.is_p, index**2, kz**2)
     order = np.argsort(kz.imag, kind="stable")
     W, V = np.eye(len(kz))[:, order], np.diag(Q / kz)[:, order]
-    return FourierModes(np.diag(Q), kz[order], W, V, symmetric)
+    return FourierModes(height, np.diag(Q), kz[order], W, V)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,29 +93,32 @@ class TangentialFields:
 
 
 def scatter_zero_order(
-    waves: PlaneWaves, media: StackMedia, layers: list[FourierModes], zero: int
+    waves: PlaneWaves,
+    indices: tuple[complex, complex],
+    layers: list[FourierModes],
+    zero: int,
+    *,
+    symmetric: bool = True,
 ) -> ScatteredAmplitudes:
     """Transmitted and reflected orders of a stack for the zero order from the
     substrate.
 
     Args:
-        waves: of the basis. media: half-spaces, films and heights.
-        layers: modes of the patterned layers, foot first; none: a stack of films.
-        zero: place of the incident wave.
+        waves: of the basis. indices: of substrate and cover.
+        layers: modes of films and patterned layers, foot first.
+        zero: place of the incident wave. symmetric: as in :func:`match_layers`.
     """
-    below = half_space(waves, media.substrate)
-    above = half_space(waves, media.cover)
-    top, decay_above = _through_films(waves, above, tuple(reversed(media.over)))
-    foot, decay_below = _through_films(waves, below, media.under)
-    source = np.zeros(len(waves.kappa), complex)
-    source[zero] = 2 * below[0][zero] * below[1][zero] * decay_below[zero]
-    fields = match_layers(layers, media.heights, top, foot, source)
-    incident = power_flux(below)[zero]
-    t = outgoing_amplitudes(top, fields.u_top, fields.w_top) * decay_above
-    r = _reflected(waves, media, foot, decay_below, fields, zero)
+    below, above = (half_space(waves, index) for index in indices)
+    incident = np.arange(len(waves.kappa)) == zero
+    source = 2 * below[0] * below[1] * incident
+    fields = match_layers(layers, above, below, source, symmetric=symmetric)
+    t = outgoing_amplitudes(above, fields.u_top, fields.w_top)
+    r = outgoing_amplitudes(
+        below, fields.u - below[0] * incident, below[1] * incident - fields.w
+    )
+    power = power_flux(below)[zero]
     return ScatteredAmplitudes(
-        t * np.sqrt(power_flux(above) / incident),
-        r * np.sqrt(power_flux(below) / incident),
+        t * np.sqrt(power_flux(above) / power), r * np.sqrt(power_flux(below) / power)
     )
 
 
@@ -148,11 +131,7 @@ def outgoing_amplitudes(pair: Pair, u: Array, w: Array) -> Array:
 
 
 def match_layers(
-    layers: list[FourierModes],
-    heights: tuple[float, ...],
-    top: Pair,
-    foot: Pair,
-    source: Array,
+    layers: list[FourierModes], top: Pair, foot: Pair, source: Array, *, symmetric: bool
 ) -> TangentialFields:
     """Fields that radiate into ``top`` above the layers and satisfy foot V u + U w =
     source below.
@@ -161,15 +140,14 @@ def match_layers(
     From the foot up, the amplitudes of the modes follow.
 
     Args:
-        layers: modes, foot first. heights: of the layers.
-        top, foot: diagonal pairs above and below. source: (n,).
+        layers: modes, foot first.
+        top, foot: diagonal pairs (U, V) above and below. source: (n,).
+        symmetric: whether the operators of all layers are.
     """
-    if not layers:
-        a = source / (foot[1] * top[0] + foot[0] * top[1])
-        return TangentialFields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
-    pair, reflections = top, []
-    for modes, height in zip(reversed(layers), reversed(heights), strict=True):
-        reflection, fade = _layer_reflection(modes, height, pair)
+    pair = np.diag(top[0]), np.diag(top[1])
+    reflections = []
+    for modes in reversed(layers):
+        reflection, fade = _layer_reflection(modes, pair, symmetric)
         reflections.append((reflection, fade))
         pair = _foot_pair(modes, reflection, fade)
     a = np.linalg.solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
@@ -190,7 +168,7 @@ def match_layers(
 
 
 def _layer_reflection(
-    modes: FourierModes, height: float, pair: Pair
+    modes: FourierModes, pair: Pair, symmetric: bool
 ) -> tuple[Array, Array]:
     """Reflection matrix from upward amplitudes at the foot of a layer to downward ones
     at its top, and the factors exp(iqh).
@@ -198,21 +176,19 @@ def _layer_reflection(
     Only modes whose amplitude at the top is not negligible have a column.
 
     Args:
-        modes: of the layer. height: of the layer, times k0.
-        pair: (U, V) of outgoing waves above it, diagonal or matrices.
+        modes: of the layer. pair: (U, V) of outgoing waves above it, (n, n) each.
+        symmetric: as in :func:`match_layers`.
     """
-    exponent = modes.q * height
+    exponent = modes.q * modes.height
     reaching = int(np.count_nonzero(exponent.imag < _FADED))
     fade = np.exp(1j * exponent[:reaching])
-    if not modes.symmetric:
+    U, V = pair
+    if not symmetric:
         # up + down = W^-1 U a and up - down = V^-1 V' a of the pair (U, V') above
-        U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
-        total = np.linalg.solve(modes.W, U)
-        difference = np.linalg.solve(modes.V, V)
+        total, difference = np.linalg.solve(modes.W, U), np.linalg.solve(modes.V, V)
         reflection = (total - difference) @ np.linalg.inv(total + difference)
         return reflection[:, :reaching] * fade, fade
-    wv = _transposed_product(pair[0], modes.V)
-    vw = _transposed_product(pair[1], modes.W)
+    wv, vw = U.T @ modes.V, V.T @ modes.W
     return np.linalg.solve(wv + vw, (wv - vw)[:, :reaching] * fade), fade
 
 
@@ -228,73 +204,9 @@ def _foot_pair(modes: FourierModes, reflection: Array, fade: Array) -> Pair:
     return U, V
 
 
-def _through_films(
-    waves: PlaneWaves, pair: Pair, films: tuple[tuple[complex, float], ...]
-) -> tuple[Pair, Array]:
-    """Outgoing pair (u, w) on the other side of films, and the factors exp(i kz d) of
-    its waves through them.
-
-    u and w are scaled by that factor, so that nothing grows.
-
-    Args:
-        waves: of the basis.
-        pair: (n,) u and w at the half-space.
-        films: (index, thickness times k0), from the half-space outwards.
-    """
-    u, w = pair
-    fade = np.ones(len(waves.kappa), complex)
-    for index, thickness in films:
-        kz = normal_component(waves.kappa, index)
-        phase = np.exp(1j * kz * thickness)
-        cosine = (1 + phase**2) / 2
-        safe = np.where(kz == 0, 1, kz)
-        sine = np.where(kz == 0, thickness, np.expm1(2j * kz * thickness) / (2j * safe))
-        alpha = np.where(waves.is_p, index**2, kz**2)
-        beta = np.where(waves.is_p, kz**2 / index**2, 1.0)
-        u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
-        fade = fade * phase
-    return (u, w), fade
-
-
-def _reflected(
-    waves: PlaneWaves,
-    media: StackMedia,
-    foot: Pair,
-    decay: Array,
-    fields: TangentialFields,
-    zero: int,
-) -> Array:
-    """Reflected amplitudes (n,) in the substrate, from the fields above its films.
-
-    Without the pillar the films would transmit the incident wave into a medium like the
-    substrate. The difference of the fields from that wave radiates downwards.
-
-    Args:
-        waves: of the basis. media: half-spaces and films.
-        foot: outgoing pair of the substrate above the lower films.
-        decay: (n,) factors of its waves through the films.
-        fields: at the foot of the pillar. zero: place of the incident wave.
-    """
-    U, V = half_space(waves, media.substrate)
-    (u, w), fade = _through_films(waves, (U, V), tuple(reversed(media.under)))
-    denominator = V[zero] * u[zero] + U[zero] * w[zero]
-    incident = np.zeros(len(U), complex)
-    incident[zero] = fade[zero] * 2 * U[zero] * V[zero] / denominator
-    reflected = decay * outgoing_amplitudes(
-        foot, fields.u - U * incident, V * incident - fields.w
-    )
-    reflected[zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / denominator
-    return np.asarray(reflected)
-
-
 def power_flux(pair: Pair) -> Array:
     """(n,) power along z, Re(u w*), of outgoing waves of unit amplitude with fields
     ``pair`` = (u, w); 0 for waves that decay.
     """
     power = (pair[0] * np.conj(pair[1])).real
     return np.where(power > 1e-12 * np.abs(pair[0] * pair[1]), power, 0.0)
-
-
-def _transposed_product(left: Array, matrix: Array) -> Array:
-    """left^T matrix; a vector ``left`` stands for its diagonal matrix."""
-    return left[:, None] * matrix if left.ndim == 1 else left.T @ matrix

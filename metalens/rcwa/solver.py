@@ -33,9 +33,9 @@ from metalens.rcwa.basis import (
     reduced_orders,
     tangential_wave,
 )
-from metalens.rcwa.permittivity import pillar_section, section_operators
+from metalens.rcwa.permittivity import PillarSection, pillar_section, section_modes
 from metalens.rcwa.sidewall import sections_with_growth, staircase_layers, width_slope
-from metalens.rcwa.smatrix import StackMedia, scatter_zero_order, solve_eigenmodes
+from metalens.rcwa.smatrix import film_modes, scatter_zero_order
 
 _ROUNDING = 1e-13
 _STRAIGHT = 1e-15  # cos or sin of an azimuth in a mirror plane, to rounding
@@ -87,18 +87,18 @@ class JonesResponse:
 
 @dataclass(frozen=True, slots=True)
 class CellProblem:
-    """A cell at one size and light, its media, and the symmetry classes of its
-    polarisations.
+    """A cell at one size and light, and the symmetry classes of its polarisations.
 
+    indices: refractive, of substrate and cover.
     columns: polarisations to solve, 0: x or s, 1: y or p.
-    normals: for each section the outlines of its normal field; none: its own.
+    normals: of each section and film, the outlines of its normal field; none: its own.
     shift: change of width of a cross-section, um, by its diameter; None: none.
     """
 
     cell: Cell
     size_um: float
     light: TangentialWave
-    media: StackMedia
+    indices: tuple[complex, complex]
     classes: tuple[tuple[Operation, ...], ...]
     columns: tuple[int, ...] = (0, 1)
     normals: tuple[tuple[Outline, ...], ...] = ()
@@ -135,30 +135,19 @@ def cell_problem(
         MaterialError: a wavelength outside the range of a material.
     """
     light = tangential_wave(wavelength_um, angle_rad, azimuth_rad)
-    media = stack_media(cell, light)
+    indices = half_space_indices(cell, light)
     check_size(cell, size_um)
     classes = symmetry_classes(cell, size_um, light)
-    return CellProblem(cell, size_um, light, media, classes)
+    return CellProblem(cell, size_um, light, indices, classes)
 
 
-def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
-    """Refractive indices of half-spaces and films, with thicknesses times k0.
+def half_space_indices(cell: Cell, light: TangentialWave) -> tuple[complex, complex]:
+    """Refractive indices of substrate and cover.
 
     Raises:
         CellError: no zero order of the ``light`` in the substrate. MaterialError: a
             wavelength outside the range of a material.
     """
-    k0 = 2 * math.pi / light.wavelength_um
-
-    def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
-        return tuple(
-            (
-                materials.index(film.material, light.wavelength_um),
-                film.thickness_um * k0,
-            )
-            for film in stack
-        )
-
     below, above = (
         materials.index(m, light.wavelength_um) for m in (cell.substrate, cell.cover)
     )
@@ -169,7 +158,37 @@ def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
             "light cannot come from there; need a smaller angle_rad or another "
             "substrate"
         )
-    return StackMedia(below, above, films(cell.under), films(cell.over))
+    return below, above
+
+
+def stack_sections(
+    problem: CellProblem, steps: int
+) -> list[tuple[PillarSection, float]]:
+    """Films and sections of a pillar, foot first, with heights times k0.
+
+    Args:
+        problem: cell and light.
+        steps: upright sections into which each one with a tilted wall is cut.
+    """
+    cell, size_um = problem.cell, problem.size_um
+    wavelength_um = problem.light.wavelength_um
+    k0 = 2 * math.pi / wavelength_um
+
+    def films(stack: tuple[Film, ...]) -> list[tuple[PillarSection, float]]:
+        return [
+            (
+                PillarSection((), (), materials.index(f.material, wavelength_um) ** 2),
+                f.thickness_um * k0,
+            )
+            for f in stack
+        ]
+
+    sections = []
+    for layer in staircase_layers(cell, steps):
+        moved = problem.shift(size_um + layer.grow_um) if problem.shift else 0.0
+        section = pillar_section(cell, layer, size_um, wavelength_um, grow_um=moved)
+        sections.append((section, layer.height_um * k0))
+    return [*films(cell.under), *sections, *films(cell.over)]
 
 
 def check_size(cell: Cell, size_um: float) -> None:
@@ -388,11 +407,8 @@ def solve_truncation(
     """
     problem = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
     if normals_of:
-        other, size = normals_of
-        normals = tuple(
-            pillar_section(other, layer, size, wavelength_um).outlines
-            for layer in other.sections
-        )
+        other = dataclasses.replace(problem, cell=normals_of[0], size_um=normals_of[1])
+        normals = tuple(section.outlines for section, _ in stack_sections(other, 1))
         problem = dataclasses.replace(problem, normals=normals)
     truncation = solve_problem(problem, harmonics)
     return _response(problem, harmonics, truncation, math.inf, False, "one truncation")
@@ -610,21 +626,8 @@ def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
     amplitudes = np.zeros((3, 2, 2), complex)
     square = problem.columns == (0, 1) and _is_square(problem)
     columns = (0,) if square else problem.columns
-    layers = staircase_layers(cell, steps)
-    sections = [
-        pillar_section(
-            cell,
-            layer,
-            size_um,
-            light.wavelength_um,
-            grow_um=problem.shift(size_um + layer.grow_um) if problem.shift else 0.0,
-        )
-        for layer in layers
-    ]
-    normals = problem.normals or [section.outlines for section in sections]
-    k0 = 2 * math.pi / light.wavelength_um
-    heights = tuple(k0 * layer.height_um for layer in layers)
-    media = dataclasses.replace(problem.media, heights=heights)
+    sections = stack_sections(problem, steps)
+    normals = problem.normals or [section.outlines for section, _ in sections]
     symmetric = cell.outline(size_um).keeps(-1, -1)
     for operations in problem.classes:
         space = reduced_orders(reach, lattice_frame(cell, operations))
@@ -632,16 +635,15 @@ def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
         if not set(columns) & set(waves.zero):
             continue
         modes = [
-            solve_eigenmodes(
-                *section_operators(space, waves, section, cell, normals=outlines),
-                symmetric=symmetric,
-            )
-            for section, outlines in zip(sections, normals, strict=True)
+            section_modes(space, waves, section, cell, height, outlines)
+            for (section, height), outlines in zip(sections, normals, strict=True)
         ]
         for column, (incident, sign) in waves.zero.items():
             if column not in columns:
                 continue
-            scattered = scatter_zero_order(waves, media, modes, incident)
+            scattered = scatter_zero_order(
+                waves, problem.indices, modes, incident, symmetric=symmetric
+            )
             amplitudes[2, column, column] = scattered.energy
             for row, (leaving, row_sign) in waves.zero.items():
                 pair = scattered.t[leaving], scattered.r[leaving]
@@ -653,23 +655,20 @@ def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
 
 def _film_response(problem: CellProblem) -> TruncatedSolution:
     """Exact t and r with each section replaced by a film of its surroundings."""
-    cell, media, light = problem.cell, problem.media, problem.light
-    k0 = 2 * math.pi / light.wavelength_um
-    size_um = problem.size_um or cell.pitch_um / 2
-    films = []
-    for layer in cell.sections:
-        section = pillar_section(cell, layer, size_um, light.wavelength_um)
-        films.append((complex(np.sqrt(section.outside)), layer.height_um * k0))
-    media = dataclasses.replace(media, over=(*films, *media.over))
+    cell, light = problem.cell, problem.light
+    sized = dataclasses.replace(problem, size_um=problem.size_um or cell.pitch_um / 2)
     space = reduced_orders(0, lattice_frame(cell, (IDENTITY,)))
     waves = plane_waves(space, cell, light)
+    films = [
+        film_modes(waves, complex(np.sqrt(section.outside)), height)
+        for section, height in stack_sections(sized, 1)
+    ]
     both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
     for column in problem.columns:
         incident, _ = waves.zero[column]
-        scattered = scatter_zero_order(waves, media, [], incident)
-        t, r = scattered.t[incident], scattered.r[incident]
-        both[:, column, column] = t, r
-        energy[column] = abs(t) ** 2 + abs(r) ** 2
+        scattered = scatter_zero_order(waves, problem.indices, films, incident)
+        both[:, column, column] = scattered.t[incident], scattered.r[incident]
+        energy[column] = scattered.energy
     return TruncatedSolution(both, energy)
 
 
@@ -677,18 +676,16 @@ def _is_homogeneous(problem: CellProblem) -> bool:
     """Whether the pillar is negligible: contrast times area share times phase, summed
     over the sections, is below rounding.
     """
-    cell, wavelength_um = problem.cell, problem.light.wavelength_um
     if not problem.size_um:
         return True
-    share = cell.outline(problem.size_um).area_um2 / cell.lattice.area_um2(
-        cell.pitch_um
+    cell = problem.cell
+    area_um2 = cell.lattice.area_um2(cell.pitch_um)
+    share = cell.outline(problem.size_um).area_um2 / area_um2
+    effect = sum(
+        height * max((abs(eps - section.outside) for eps in section.inside), default=0)
+        for section, height in stack_sections(problem, 1)
     )
-    effect = 0.0
-    for layer in cell.sections:
-        section = pillar_section(cell, layer, problem.size_um, wavelength_um)
-        contrast = max(abs(inner - section.outside) for inner in section.inside)
-        effect += share * contrast * 2 * math.pi / wavelength_um * layer.height_um
-    return effect < _ROUNDING
+    return share * effect < _ROUNDING
 
 
 def _response(

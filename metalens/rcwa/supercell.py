@@ -25,7 +25,7 @@ from metalens.rcwa.basis import (
 )
 from metalens.rcwa.permittivity import PillarSection, section_operators
 from metalens.rcwa.smatrix import scatter_zero_order, solve_eigenmodes
-from metalens.rcwa.solver import stack_media
+from metalens.rcwa.solver import half_space_indices
 
 _MIRRORED = ((1, 1), (1, -1))  # rows are mirror symmetric in y
 
@@ -145,19 +145,20 @@ def solve_row(
     )
     waves = plane_waves(space, supercell, light)
     operators = section_operators(space, waves, slab, supercell, flips=_MIRRORED)
-    stack = replace(
-        stack_media(cell, light),
-        heights=(2 * math.pi / wavelength_um * cell.height_um,),
-    )
+    height = 2 * math.pi / wavelength_um * cell.height_um
+    substrate, cover = half_space_indices(cell, light)
     zero, sign = waves.zero["xy".index(polarization)]
     scattered = scatter_zero_order(
-        waves, stack, [solve_eigenmodes(*operators, symmetric=False)], zero
+        waves,
+        (substrate, cover),
+        [solve_eigenmodes(*operators, height)],
+        zero,
+        symmetric=False,
     )
     # in the plane of the row, light along x is p and light along y is s
     along_row = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
     along_row = along_row[np.argsort(waves.m[along_row])]
-    cover = stack.cover.real
-    cosine = normal_component(waves.kappa[along_row], cover).real / cover
+    cosine = normal_component(waves.kappa[along_row], cover.real).real / cover.real
     factor = np.sqrt(cosine if polarization == "x" else _inverse(cosine))
     direction = np.where(waves.m[along_row] == 0, sign, waves.along[0, along_row])
     return RowResponse(
