@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from characterize.model.glass import BenchGeometry, FilmStack
@@ -18,18 +17,18 @@ from characterize.model.pillars import PillarResponse
 from metalens.core import legendre, threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.lens import DiameterMap, Lens
-from metalens.optics import Stop, media
+from metalens.lens import Lens
+from metalens.optics import media
 
 _MOST_NODES = 600
+_TRIAL = 96  # nodes at which the remainder of the kernel is sampled, most it needs
 _CELL = 0.005  # relative width of the cells of distance, each with its coupling terms
 _STEP = 1e-3  # relative step of the distance for derivatives of the terms
-# samples of a window over those of the sampling theorem, and beyond its ends
-_ROOM, _BEYOND = 1.6, 3
 _MIXED = 0.1  # share of the tolerance for the functions of p in the terms
 # the same where terms are left out too: it adds an eighth to their error
 _MIXED_FEW = 0.5
 _OFF_LENS = 0.1  # weight of directions off the lens in the low-rank terms
+Samples = tuple[int, float, float]  # number, first and last place of an axis, um
 _KEPT = 24  # sets of coupling terms: for the windows and distances of several fits
 _TURN = np.float32(2 * np.pi)
 
@@ -54,6 +53,22 @@ class EvenNodes:
         """Nodes that resolve a wave to a relative ``tolerance``."""
         reach = (math.log(1e5 / tolerance) + count / 60) / count
         return cls(count, *span, 1 / math.cosh(reach))
+
+    @classmethod
+    def resolving(
+        cls, phase_rad: float, span: tuple[float, float], tolerance: float
+    ) -> "EvenNodes":
+        """The fewest nodes for waves of ``phase_rad`` over half the span.
+
+        The Legendre series of such a wave falls below ``tolerance`` after
+        phase + 8 + 2 phase^(1/3) terms at 5e-4, and 1.5 more for each factor e below.
+        """
+        terms = phase_rad + 8 + 2 * (phase_rad + 1) ** (1 / 3)
+        terms += 1.5 * max(0.0, math.log(5e-4 / tolerance))
+        for count in itertools.count(12):
+            nodes = cls.of(count, span, tolerance)
+            if count * nodes.density >= terms:
+                return nodes
 
     @property
     def density(self) -> float:
@@ -140,24 +155,6 @@ class SmoothKernel:
         size, r = self.films.amplitude(self.distance_um, reach2)
         return np.asarray(size * (1 / r - 1j * self.k) * np.exp(1j * phase))
 
-    def bands(self, wy: float, wx: float) -> tuple[float, float]:
-        """(along y, along x) highest spatial frequency of the field, rad/um, on a
-        window of half sides (wy, wx): k times the largest slope of F - F_middle.
-        """
-        t = np.linspace(-1, 1, 9)
-        p, q = (map_to_span(span, t) for span in (self.p, self.q))
-        Y, X, q, p = np.meshgrid(wy * t, wx * t, q, p, indexing="ij", sparse=True)
-
-        def path(x: Any, y: Any) -> Array:
-            middle_um = self.path(*self.middle, X + x, Y + y)[0]
-            return np.asarray(self.path(p, q, X + x, Y + y)[0] - middle_um)
-
-        step = 1e-3 * max(wy, wx)
-        here = path(0.0, 0.0)
-        slopes = (path(0.0, step) - here, path(step, 0.0) - here)
-        y, x = (self.k / step * float(np.abs(slope).max()) for slope in slopes)
-        return y, x
-
 
 def map_to_span(span: tuple[float, float], t: Array) -> Array:
     """Places ``t`` on [-1, 1], mapped to a span."""
@@ -166,15 +163,14 @@ def map_to_span(span: tuple[float, float], t: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CouplingTerms:
-    """Low-rank remainder of the kernel for a cell of distances, on coarse samples of a
-    window.
+    """Low-rank remainder of the kernel for a cell of distances, on the samples of a window.
 
     R(Y, X; q, p) = sum over r, b of (window[0] + ε window[1])[Y, r, X] amounts[q, r, b]
     across[b, p], with ε the distance over that of the cell, less 1.
 
-    kernel: of the middle of the cell. axes_um: (y, x) coarse samples. fine: interpolation from them to the window's
-    samples along y and x, real: fields are less the phase of the middle node, which no
-    intensity depends on.
+    kernel: of the middle of the cell. axes_um: (y, x) coarse nodes of the window.
+    fine: interpolation from them to the window's samples along y and x, real: fields
+    are less the phase of the middle node, which no intensity depends on.
     left: (r,) relative size of the terms from each on; mixed: (b,) the same of the
     functions of p.
     """
@@ -193,7 +189,7 @@ class CouplingTerms:
 class WindowOperators:
     """From nodes to a window for one wavelength and distance.
 
-    y: (Y, q) and x: (p, X) phasors on the coarse samples. window: (Y, r, X) of the
+    y: (Y, q) and x: (p, X) phasors on the samples. window: (Y, r, X) of the
     terms at this distance.
     """
 
@@ -203,7 +199,7 @@ class WindowOperators:
     terms: CouplingTerms
 
     def coarse(self, light: Array, tolerance: float = 0.0) -> Array:
-        """(..., Y, X) field on the coarse samples of (..., q, p) ``light`` on the nodes.
+        """(..., Y, X) field on the coarse nodes of (..., q, p) ``light`` on the nodes.
 
         The sum over r, q, b, p of W_r(Y, X) y(Y, q) a_rb(q) L(q, p) g_b(p) x(p, X).
         Terms below the relative ``tolerance`` are left out.
@@ -273,71 +269,9 @@ def wrapped_phasors(phase: Array) -> Array:
     return out
 
 
-@functools.lru_cache(maxsize=32)
-def coarse_samples(
-    first: float, last: float, count: int, band: float
-) -> tuple[Array, Array]:
-    """Even samples of an axis for functions of up to ``band`` rad/um, and their
-    least-squares interpolation weights to its ``count`` fine samples.
-
-    With sinc correlations G among the samples and S to the places: weights S G⁻¹. The
-    error is 3e-5 but for the last places at each end (up to 4e-4), where only blur
-    enters an image. The axis' own samples where coarse ones are no fewer. Cached; treat
-    as read-only.
-
-    Args:
-        first: first of the fine samples, um.
-        last: last of them, um.
-    """
-    at_um = np.linspace(first, last, count)
-    step = np.pi / band / _ROOM
-    number = math.ceil((last - first) / step) + 1 + 2 * _BEYOND
-    if number >= count:
-        return at_um, np.eye(count, dtype=np.float32)
-    coarse = (first + last) / 2 + (np.arange(number) - (number - 1) / 2) * step
-    among, to = (
-        np.sinc(band / np.pi * (axis[:, None] - coarse)) for axis in (coarse, at_um)
-    )
-    weights = np.linalg.lstsq(among, to.T, rcond=1e-10)[0].T
-    return coarse, weights.astype(np.float32)
-
-
-def low_rank_factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
-    """Low-rank factors (m, r) and (r, n) of ``table`` (m, n), to a relative tolerance
-    of the Frobenius norm, by a randomised range finder (Halko, Martinsson and Tropp
-    2011).
-
-    Returns:
-        (columns, rows, (r,) share of the norm that is missing before each term).
-    """
-    rng = np.random.default_rng(0)
-    total = float(np.linalg.norm(table)) ** 2
-    rank = min(24, *table.shape)
-    while True:
-        basis = np.linalg.qr(table @ rng.standard_normal((table.shape[1], rank)))[0]
-        rows = basis.conj().T @ table
-        outside = max(total - float(np.linalg.norm(rows)) ** 2, 0.0)
-        if rank == min(table.shape) or outside < (tolerance / 4) ** 2 * total:
-            break
-        rank = min(2 * rank, *table.shape)
-    u, size, v = np.linalg.svd(rows, full_matrices=False)
-    left = np.sqrt((np.cumsum(size[::-1] ** 2)[::-1] + outside) / total)
-    r = max(1, int((left > tolerance).sum()))
-    return basis @ (u[:, :r] * size[:r]), v[:r], left[:r]
-
-
-def needed_nodes(lines: Any, tolerance: float) -> int:
-    """Legendre nodes for a function on [-1, 1] to a relative tolerance.
-
-    Args:
-        lines: (n,) places to (lines, n) values.
-    """
-    for count in (32, 64, 128, 256):
-        values = lines(legendre.gauss_legendre_nodes(count)[0])
-        needed = legendre.needed_node_count(values, tolerance)
-        if needed <= count:
-            return needed
-    raise FitError("the window is too large for the reduced model; fit a smaller one")
+def relative_tails(size: Array) -> Array:
+    """(r,) norm of the singular values from each on, over that of all."""
+    return np.asarray(np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum()))
 
 
 class CompressedLens:
@@ -380,7 +314,7 @@ class CompressedLens:
         self.site_um2 = lens.diameters.site_um2
         self.radius_um = lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
-        self._terms = dict[tuple[float, ...], CouplingTerms]()
+        self._terms = functools.lru_cache(_KEPT)(self._coupling)
         defocus = np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max()
         self._blur = self.k * float(defocus) * self.radius_um**2 / 2
         self._directions(2 * self._blur)
@@ -423,14 +357,10 @@ class CompressedLens:
         spans = [(float(s.min()), float(s.max())) for s in (x / r, y / r)]
         # phase over half the span of directions: of the window's edge, then in all
         swing = self.k * self.window_um / 2 * max(np.ptp(span) for span in spans) / 2
-        digits = max(0.0, math.log(5e-4 / self.tolerance))
-        phase_rad = swing + beyond_rad + 8 + 2 * (swing + 1) ** (1 / 3) + 1.5 * digits
-        for count in itertools.count(12):
-            self._p, self._q = (
-                EvenNodes.of(count, span, self.tolerance) for span in spans
-            )
-            if count * self._p.density >= phase_rad:
-                break
+        self._p, self._q = (
+            EvenNodes.resolving(swing + beyond_rad, span, self.tolerance)
+            for span in spans
+        )
         if self._p.count > _MOST_NODES:
             raise FitError(
                 f"window of {self.window_um:.0f} um needs {self._p.count} nodes a side; fit a smaller window"
@@ -482,35 +412,30 @@ class CompressedLens:
         nodes = [
             EvenNodes.of(n, (-half, half), self.tolerance) for half in self.half_um
         ]
-        y0, x0 = 0, 0  # first row and column to sum
-        if is_mirror_symmetric(d, self.bench.tangents, lens.layers.stop):
-            y0, x0 = len(y) // 2, len(x) // 2  # one quarter, folded
         along, across = (
-            fold_weights(axis.interpolation(t), first).astype(np.float32)
-            for axis, t, first in zip(nodes, (y, x), (y0, x0), strict=True)
+            axis.interpolation(t).astype(np.float32)
+            for axis, t in zip(nodes, (y, x), strict=True)
         )
-        table = np.ascontiguousarray(pillars.table().astype(np.complex64).T)
-        block = max(1, 100_000 // (len(x) - x0))
-        parts = [slice(start, start + block) for start in range(y0, len(y), block)]
+        table = np.ascontiguousarray(pillars.table().T, np.complex64)
+        block = max(1, 100_000 // len(x))
+        parts = [slice(start, start + block) for start in range(0, len(y), block)]
         sums = np.zeros((len(parts), n, n, 2 * r), np.float32)
 
         def sum_blocks(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
-                filled = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
+                filled = np.flatnonzero((d.diameter_um[rows] > 0).any(0))
                 built = slice(filled[0], filled[-1] + 1) if len(filled) else slice(0)
-                light = gather_light(
-                    table,
-                    pillars.entries(d, rows, built),
-                    self._carrier(lens, rows, built, depth_um),
-                )
-                halves = across[built].T @ light.reshape(len(light), -1)
-                sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
+                light = table[pillars.entries(d, rows, built)]
+                light *= self._carrier(lens, rows, built, depth_um)[..., None]
+                on_x = across[built].T @ light.view(np.float32)
+                on_y = along[rows].T @ on_x.reshape(len(on_x), -1)
+                sums[i] = on_y.reshape(n, n, 2 * r)
 
         with threads.one_blas_thread():
             threads.run_split(len(parts), sum_blocks)
-        whole = sums.sum(0, dtype=float).T
-        return self._to_directions(whole[:r] + 1j * whole[r:], nodes)
+        whole = sums.sum(0, dtype=float).view(complex)
+        return self._to_directions(np.moveaxis(whole, -1, 0), nodes)
 
     def _carrier(
         self, lens: Lens, rows: slice, built: slice, depth_um: float | None
@@ -572,27 +497,9 @@ class CompressedLens:
         Args:
             axes_um: (y, x) samples of the window.
         """
-        nominal_um = self.bench.distance_um
-        number = round(math.log(distance_um / nominal_um) / _CELL)
-        ends = (v for axis in axes_um for v in (len(axis), float(axis[0])))
-        key = (number, *ends)
-        terms = self._terms.get(key)
-        if terms is None:
-            kernel = SmoothKernel(
-                self.k,
-                (self._p.low, self._p.high),
-                (self._q.low, self._q.high),
-                nominal_um,
-                nominal_um * math.exp(_CELL * number),
-                self.bench.tangents,
-                self.films,
-                self._near_um,
-            )
-            terms = self._coupling(kernel, axes_um)
-            if len(self._terms) >= _KEPT:  # a new dictionary: other threads may ask
-                self._terms = {}
-            self._terms[key] = terms
-        return terms
+        number = round(math.log(distance_um / self.bench.distance_um) / _CELL)
+        rows, columns = ((len(a), float(a[0]), float(a[-1])) for a in axes_um)
+        return self._terms(number, rows, columns)
 
     def operators(
         self, terms: CouplingTerms, *, wavelength_um: float, distance_um: float
@@ -622,25 +529,40 @@ class CompressedLens:
             terms,
         )
 
-    def _coupling(
-        self, kernel: SmoothKernel, axes_um: tuple[Array, Array]
-    ) -> CouplingTerms:
+    def _coupling(self, number: int, rows: Samples, columns: Samples) -> CouplingTerms:
         """Low-rank terms of the remainder of a kernel and of its slope by the distance.
 
         Tabulated on Legendre nodes, (2 w², m²), and factored: R = sum over r, b of
         W_r(Y, X) a_rb(q) g_b(p).
 
         Args:
-            kernel: of the middle of a cell of distances.
-            axes_um: (y, x) samples of the window.
+            number: of the cell of distances. rows, columns: of the window's samples.
         """
-        wy, wx = (float(np.abs(axis).max()) for axis in axes_um)
-        samples = [
-            coarse_samples(float(axis[0]), float(axis[-1]), len(axis), band)
-            for axis, band in zip(axes_um, kernel.bands(wy, wx), strict=True)
+        nominal_um = self.bench.distance_um
+        kernel = SmoothKernel(
+            self.k,
+            (self._p.low, self._p.high),
+            (self._q.low, self._q.high),
+            nominal_um,
+            nominal_um * math.exp(_CELL * number),
+            self.bench.tangents,
+            self.films,
+            self._near_um,
+        )
+        wy, wx = (max(-first, last) for _, first, last in (rows, columns))
+        # a wave from the rim of the lens turns by k R / d along the window at most
+        slopes = self.k * self.half_um / self.films.reduced_um(kernel.distance_um)
+        nodes = [
+            EvenNodes.resolving(
+                slope * (last - first) / 2, (first, last), self.tolerance
+            )
+            for slope, (_, first, last) in zip(slopes, (rows, columns), strict=True)
         ]
-        (y, fine_y), (x, fine_x) = samples
-        wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
+        y, x = (axis.places for axis in nodes)
+        fine_y, fine_x = (
+            axis.interpolation(np.linspace(first, last, count)).astype(np.float32)
+            for axis, (count, first, last) in zip(nodes, (rows, columns), strict=True)
+        )
         (w_y, w_x), m = self._counts(kernel, wy, wx)
         Y, X = legendre.mapped_nodes(w_y, -wy, wy), legendre.mapped_nodes(w_x, -wx, wx)
         P = legendre.mapped_nodes(m, *kernel.p)
@@ -656,12 +578,15 @@ class CompressedLens:
         # the slope, times the largest relative offset in the cell
         slope = (tabulate(1 + _STEP) - tabulate(1 - _STEP)) * (_CELL / 4 / _STEP)
         table = np.concatenate([tabulate(1.0), slope])
-        columns, rows, left = low_rank_factors(table, self.tolerance)
+        u, size, rows = np.linalg.svd(table, full_matrices=False)
+        left = relative_tails(size)
+        left = left[left > self.tolerance]
+        columns, rows = u[:, : len(left)] * size[: len(left)], rows[: len(left)]
         # functions of p in the rows: one more singular value decomposition
         mixing, size, across = np.linalg.svd(
             (rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
         )
-        mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+        mixed = relative_tails(size)
         count = int((mixed > _MIXED * self.tolerance).sum())
         amounts = (mixing * size)[:, :count].reshape(-1, m, count).transpose(1, 0, 2)
         to_q, to_p = (
@@ -707,10 +632,14 @@ class CompressedLens:
                 n: g.reshape(-1, 1) for n, g in zip(others, grid, strict=True)
             }
 
-            def lines(t: Array) -> Array:
-                return kernel.remainder(**at, **{name: map_to_span(span, t)})
-
-            return needed_nodes(lines, self.tolerance / 10)
+            t = legendre.gauss_legendre_nodes(_TRIAL)[0]
+            values = kernel.remainder(**at, **{name: map_to_span(span, t)})
+            needed = legendre.needed_node_count(values, self.tolerance / 10)
+            if needed > _TRIAL:
+                raise FitError(
+                    "the window is too large for the reduced model; fit a smaller one"
+                )
+            return needed
 
         window = count("Y", (-wy, wy)), count("X", (-wx, wx))
         return window, max(count("p", kernel.p), count("q", kernel.q))
@@ -719,82 +648,3 @@ class CompressedLens:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self._near_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
-
-
-def is_mirror_symmetric(
-    diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None
-) -> bool:
-    """Whether the light on the lens is symmetric about both axes.
-
-    Then a quarter of the pillars is enough. Compared are the pillars, the direction
-    of the chief ray and the shadow of the stop.
-
-    Args:
-        diameters: the pillars of the lens.
-        tangents: (x, y) of the chief ray.
-        stop: aperture stop in front of the lens; None for none.
-    """
-    d = diameters.diameter_um
-    plain = (
-        diameters.angle_rad is None
-        and diameters.length_um is None
-        and not any(tangents)
-    )
-    return (
-        plain
-        and (stop is None or stop.centred)
-        and np.array_equal(d, d[::-1])
-        and np.array_equal(d, d[:, ::-1])
-    )
-
-
-def fold_weights(weights: Array, first: int) -> Array:
-    """Interpolation weights (n, m) of symmetric places, folded onto one half.
-
-    Places from ``first``, the middle one, on remain in use. To each weight of these
-    the weight of its mirror image is added. As they are where ``first`` is 0.
-    """
-    if not first:
-        return weights
-    out = weights.copy()
-    out[first + len(weights) % 2 :] += weights[:first][::-1]
-    return out
-
-
-def gather_light(table: Array, place: Array, turns: Array) -> Array:
-    """(columns, rows, 2 r) real, then imaginary parts of table[place] times turns.
-
-    The r numbers of a pillar lie next to each other: one look-up each. Columns come
-    first, so that a sum along them is one product of matrices.
-
-    Args:
-        table: (entries, r) complex.
-        place: (rows, columns) entries of the table.
-        turns: (rows, columns) phasors, of the table's type.
-    """
-    out = np.empty((*place.shape[::-1], 2 * table.shape[1]), table.real.dtype)
-    _multiply_phasors(
-        np.ascontiguousarray(table.real),
-        np.ascontiguousarray(table.imag),
-        place,
-        turns,
-        out,
-    )
-    return out
-
-
-@numba.njit(nogil=True, error_model="numpy", cache=True)
-def _multiply_phasors(
-    real: Array, imaginary: Array, place: Array, turns: Array, out: Array
-) -> None:
-    """Fill out[j, i] with (Re, Im) of table[place[i, j]] times turns[i, j]."""
-    count = real.shape[1]
-    for j in range(place.shape[1]):
-        for i in range(place.shape[0]):
-            real_row = real[place[i, j]]
-            imaginary_row = imaginary[place[i, j]]
-            cosine = turns[i, j].real
-            sine = turns[i, j].imag
-            for k in range(count):
-                out[j, i, k] = real_row[k] * cosine - imaginary_row[k] * sine
-                out[j, i, count + k] = real_row[k] * sine + imaginary_row[k] * cosine
