@@ -580,8 +580,9 @@ class CompressedLens:
         table = np.concatenate([tabulate(1.0), slope])
         u, size, rows = np.linalg.svd(table, full_matrices=False)
         left = relative_tails(size)
-        left = left[left > self.tolerance]
-        columns, rows = u[:, : len(left)] * size[: len(left)], rows[: len(left)]
+        # the symmetry of a square window makes pairs of equal size: none is split
+        r = int((size > 0.999 * size[left > self.tolerance][-1]).sum())
+        columns, rows, left = u[:, :r] * size[:r], rows[:r], left[:r]
         # functions of p in the rows: one more singular value decomposition
         mixing, size, across = np.linalg.svd(
             (rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
