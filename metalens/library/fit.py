@@ -2,11 +2,14 @@
 polynomials follow within the tolerances.
 """
 
+import bisect
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +18,7 @@ from numpy.polynomial import chebyshev
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 from metalens.library import polynomial
-from metalens.library.proxy import Proxy
+from metalens.library.proxy import MOST_ERROR, Proxy
 from metalens.library.record import PillarLibrary
 
 TURN = 2 * math.pi
@@ -25,7 +28,6 @@ UNKNOWN = 0.5  # largest error bar of a usable entry, as a share of |t|
 # default tolerances: an absolute deviation, and a share of the entries' error bars
 FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
-TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,28 +51,6 @@ class ProxyTolerances:
     least_transmission: float = 0.7
     least_half_width_um: float = 0.005
     within_um: tuple[float, float] | None = None
-
-    @property
-    def tolerances(self) -> tuple[float, float]:
-        """Tolerances of phase (rad) and |T|; 1e-3 where none is set."""
-        return (
-            self.phase_tolerance_rad or FOLLOWED,
-            self.transmission_tolerance or FOLLOWED,
-        )
-
-    def with_defaults(self, entry_error: float) -> "ProxyTolerances":
-        """Tolerances with missing values filled in: 1e-3, or half the error of the
-        entries where that is more.
-
-        Args:
-            entry_error: root-mean-square error bar of t, relative to |t|.
-        """
-        default = max(FOLLOWED, KNOWN_SHARE * entry_error)
-        phase = self.phase_tolerance_rad or default
-        level = self.transmission_tolerance or default
-        return dataclasses.replace(
-            self, phase_tolerance_rad=phase, transmission_tolerance=level
-        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -350,22 +330,22 @@ def fit(library: PillarLibrary, tolerances: ProxyTolerances | None = None) -> Pr
     """Polynomial proxy of a library, by minimax fits of phase and |T| in
     diameter^power.
 
-    Every other diameter is fitted (least largest deviation, by Lawson's weights); the
-    errors are taken over all of them. The phase is monotone, as the library's is. |T|
-    is scaled until its certified bound lies below 1. Where the entries are too few for
-    the tolerances, ``shortfall`` says so.
+    Half of the diameters is fitted, both ends among them; the errors are taken over all
+    of them. The phase is monotone, as the library's is. |T| is scaled until its
+    certified bound lies below 1. Where the entries are too few for the tolerances,
+    ``shortfall`` says so.
 
     Args:
         tolerances: tolerances and limits of the fit.
 
     Raises:
-        DomainError: no run of diameters without resonance holds enough entries.
+        DomainError: no run of diameters without resonance holds enough entries, or no
+            polynomial follows it.
     """
     limits = tolerances or ProxyTolerances()
     if library.sweep.light == "circular":
         return _fit_branch(library, limits, _converted_branch(library, limits))
-    branch = longest_monotonic_branch(library, limits)
-    one_side = _fit_branch(library, limits, branch)
+    one_side = _fit_branch(library, limits, longest_monotonic_branch(library, limits))
     if any(width < limits.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
             branch = longest_monotonic_branch(library, limits, across_resonances=True)
@@ -376,91 +356,10 @@ def fit(library: PillarLibrary, tolerances: ProxyTolerances | None = None) -> Pr
     return one_side
 
 
-def _fit_branch(
-    library: PillarLibrary, limits: ProxyTolerances, branch: MonotonicBranch
-) -> ProxyFit:
-    """Proxy of the longest domain of a branch.
-
-    Args:
-        library: the swept cell.
-        limits: tolerances and limits of the fit.
-        branch: of the library.
-    """
-    limits = limits.with_defaults(entry_error(library, branch.diameter_um))
-    domain, proxy, terms = _choose_coefficients(branch, limits)
-    low, high = proxy.domain_um
-    proxy = dataclasses.replace(
-        proxy,
-        entry_error=entry_error(library, domain.diameter_um),
-        gaps_um=tuple((a, b) for a, b in branch.gaps_um if low < a and b < high),
-    )
-    notes = branch.notes
-    if branch.monotonic and len(domain.diameter_um) < len(branch.diameter_um):
-        notes += (
-            f"cut at {domain.diameter_um[-1]:.4f} um: up to {branch.diameter_um[-1]:.4f} um the phase is smooth, but "
-            f"{2 * terms} coefficients do not describe it within the tolerances",
-        )
-    turns_back = branch.monotonic and not _is_monotone(proxy)
-    shortfall = TURNS_BACK if turns_back else tolerance_shortfall(proxy, limits)
-    spread = branch.polarization_spread
-    return ProxyFit(proxy, notes, domain.turns, spread, shortfall, branch.turns)
-
-
-def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
-    """Root-mean-square error bar of t, relative to |t|, over the entries at some
-    diameters of a library.
-
-    Args:
-        library: the swept cell.
-        diameter_um: of the entries, um.
-    """
-    selected = np.isin(library.diameter_um, diameter_um)
-    relative = (library.t_error / np.abs(library.t))[..., selected]
-    return float(np.sqrt(np.mean(relative**2)))
-
-
-def _choose_coefficients(
-    branch: MonotonicBranch, limits: ProxyTolerances
-) -> tuple[MonotonicBranch, Proxy, int]:
-    """(domain, proxy, terms): the domain that a proxy follows, and its number of
-    coefficients for phase and for |T| each.
-
-    Starts from half of ``limits.coefficients``. Takes more where a full turn needs
-    them, fewer where the polynomial oscillates between too few entries. Where the
-    tolerances are still missed, cuts the last diameters, next to the fault that ends
-    the branch: at most a tenth of the phase, and none where that is not enough.
-    """
-    terms = more = min(max(2, limits.coefficients // 2), len(branch.diameter_um) // 3)
-    cost, domain, proxy = _longest_domain(branch, limits, terms)
-    while more < 24 and domain.turns < 1 <= branch.turns:
-        more += 2
-        # so many coefficients may take |T| below 0: then the last result stands
-        with contextlib.suppress(DomainError):
-            new_cost, longer, candidate = _longest_domain(branch, limits, more)
-            gain = len(longer.diameter_um) - len(domain.diameter_um)
-            if new_cost <= 1 and gain > 0:
-                cost, domain, proxy, terms = new_cost, longer, candidate, more
-    if cost <= 1 or not branch.monotonic:
-        return domain, proxy, terms
-    for fewer in range(terms - 1, 1, -1):
-        new_cost, fit_of_fewer = _best_power(domain, limits, fewer)
-        if fit_of_fewer is not None and new_cost < cost:
-            cost, proxy, terms = new_cost, fit_of_fewer, fewer
-    for reach in range(len(domain.diameter_um) - 2, LEAST_ENTRIES - 2, -1):
-        shorter = domain.within(reach)
-        if cost <= 1 or shorter.turns < 0.9 * domain.turns:
-            break
-        new_cost, shorter_fit = _best_power(shorter, limits, terms)
-        if shorter_fit is not None and new_cost <= 1:
-            return shorter, shorter_fit, min(terms, (reach + 1) // 3)
-    return domain, proxy, terms
-
-
 def fit_proxy(
     library: PillarLibrary, tolerances: ProxyTolerances | None = None
 ) -> Proxy:
-    """The proxy of a library alone; :func:`fit` gives its table of error against
-    coefficients too.
+    """The proxy of a library alone; :func:`fit` gives its limits and errors too.
 
     Args:
         tolerances: tolerances and limits of the fit.
@@ -477,82 +376,117 @@ def proxy_of(library: PillarLibrary) -> Proxy:
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
-def _longest_domain(
-    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
-) -> tuple[float, MonotonicBranch, Proxy]:
-    """(cost, domain, proxy) of the longest domain on which ``terms`` coefficients meet
-    the tolerances, by bisection in the number of diameters.
+def _fit_branch(
+    library: PillarLibrary, limits: ProxyTolerances, branch: MonotonicBranch
+) -> ProxyFit:
+    """Proxy of the longest domain of a branch that meets the tolerances.
 
-    The shortest has 3 ``terms`` of them; for circular light 12, with fewer terms.
+    Args:
+        library: the swept cell.
+        limits: tolerances and limits of the fit.
+        branch: of the library.
+    """
+    default = max(FOLLOWED, KNOWN_SHARE * _entry_error(library, branch.diameter_um))
+    phase = limits.phase_tolerance_rad or default
+    level = limits.transmission_tolerance or default
+    domain, proxy = _choose_domain(branch, limits.coefficients // 2, (phase, level))
+    low, high = proxy.domain_um
+    proxy = dataclasses.replace(
+        proxy,
+        entry_error=_entry_error(library, domain.diameter_um),
+        gaps_um=tuple((a, b) for a, b in branch.gaps_um if low < a and b < high),
+    )
+    notes = branch.notes
+    if branch.monotonic and len(domain.diameter_um) < len(branch.diameter_um):
+        terms = proxy.phase_coefficients.shape[-1]
+        notes += (
+            f"cut at {high:.4f} um: up to {branch.diameter_um[-1]:.4f} um the phase is smooth, but "
+            f"{2 * terms} coefficients do not describe it within the tolerances",
+        )
+    shortfall = ""
+    if _cost(proxy, (phase, level)) > 1:
+        shortfall = (
+            f"the proxy follows the phase within {proxy.max_phase_error_rad:.3g} rad and |T| within "
+            f"{proxy.max_transmission_error:.3g}, where {phase:.3g} and {level:.3g} are wanted: sweep with more "
+            "samples, or loosen phase_tolerance_rad and transmission_tolerance"
+        )
+    spread = branch.polarization_spread
+    return ProxyFit(proxy, notes, domain.turns, spread, shortfall, branch.turns)
+
+
+def _entry_error(library: PillarLibrary, diameter_um: Array) -> float:
+    """Root-mean-square error bar of t, relative to |t|, over the entries at some
+    diameters of a library.
+    """
+    selected = np.isin(library.diameter_um, diameter_um)
+    relative = (library.t_error / np.abs(library.t))[..., selected]
+    return float(np.sqrt(np.mean(relative**2)))
+
+
+def _choose_domain(
+    branch: MonotonicBranch, terms: int, tolerances: tuple[float, float]
+) -> tuple[MonotonicBranch, Proxy]:
+    """(domain, proxy): the longest domain on which ``terms`` coefficients meet the
+    tolerances, or more of them where a full turn needs them.
+
+    The shortest domain has 3 ``terms`` diameters (for circular light 13). Where its
+    proxy misses the tolerances, it takes the number of coefficients of least error.
 
     Raises:
-        DomainError: no polynomial stays between 0 and 1 even on the shortest domain.
+        DomainError: no polynomial follows the shortest domain within 0.1.
     """
+
+    @functools.cache
+    def attempt(reach: int, count: int) -> tuple[float, Proxy | None]:
+        return _fit_terms(branch.within(reach), count, tolerances)
+
     most = max(branch.middle, len(branch.diameter_um) - 1 - branch.middle)
-    reach = min(most, 3 * terms - 1 if branch.monotonic else LEAST_ENTRIES // 2)
-    domain, too_far = branch.within(reach), most + 1
-    cost, proxy = _best_power(domain, limits, terms)
-    if proxy is None:
+    terms = min(max(2, terms), len(branch.diameter_um) // 3)
+    least = min(most, 3 * terms - 1 if branch.monotonic else LEAST_ENTRIES // 2)
+    longest, best = least - 1, None
+    for count in range(terms, 26, 2):
+        reach = most
+        if attempt(most, count)[0] > 1:
+            cost = lambda tried, count=count: attempt(tried, count)[0]  # noqa: E731
+            reach = least - 1 + bisect.bisect(range(least, most), 1.0, key=cost)
+        if reach > longest:
+            longest, best = reach, attempt(reach, count)[1]
+        if not branch.turns >= 1 or (best and branch.within(longest).turns >= 1):
+            break
+    if best is not None:
+        return branch.within(longest), best
+    shortest = branch.within(least)
+    attempts = [_fit_terms(shortest, n, tolerances) for n in range(2, terms + 1)]
+    _, best = min(attempts, key=itemgetter(0))
+    if best is None or _cost(best, [max(MOST_ERROR, t) for t in tolerances]) > 1:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
-            f"{domain.diameter_um[-1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+            f"{shortest.diameter_um[-1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
         )
-    while too_far - reach > 1:
-        middle = (reach + too_far + (too_far > most)) // 2
-        longer = branch.within(middle)
-        longer_cost, candidate = _best_power(longer, limits, terms)
-        if candidate is not None and longer_cost <= 1:
-            reach, cost, domain, proxy = middle, longer_cost, longer, candidate
-        else:
-            too_far = middle
-    return cost, domain, proxy
+    return shortest, best
 
 
-def tolerance_shortfall(proxy: Proxy, tolerances: ProxyTolerances) -> str:
-    """Message on how far a proxy misses its tolerances; empty where it meets them.
-
-    Args:
-        proxy: phase and |T| over the diameter.
-        tolerances: tolerances and limits of the fit.
-    """
-    if tolerance_ratio(proxy, tolerances) <= 1:
-        return ""
-    phase, level = tolerances.tolerances
-    return (
-        f"the proxy follows the phase within {proxy.max_phase_error_rad:.3g} rad and |T| within "
-        f"{proxy.max_transmission_error:.3g}, where {phase:.3g} and {level:.3g} are wanted: sweep with more samples, "
-        "or loosen phase_tolerance_rad and transmission_tolerance"
-    )
-
-
-def tolerance_ratio(proxy: Proxy, tolerances: ProxyTolerances) -> float:
-    """The larger of phase error and |T| error, each over its tolerance.
-
-    Args:
-        proxy: phase and |T| over the diameter.
-        tolerances: tolerances and limits of the fit.
-    """
-    phase, level = tolerances.tolerances
+def _cost(proxy: Proxy, tolerances: Sequence[float]) -> float:
+    """The larger of phase error and |T| error, each over its tolerance."""
+    phase, level = tolerances
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 
-def _best_power(
-    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
+def _fit_terms(
+    branch: MonotonicBranch, terms: int, tolerances: tuple[float, float]
 ) -> tuple[float, Proxy | None]:
-    """(cost, proxy) in diameter, its square or its cube, whichever has the least error
-    in units of the tolerances; None where each takes |T| below 0 between the entries.
+    """(cost, proxy) of ``terms`` coefficients in diameter, its square or its cube,
+    whichever has the least error in units of the tolerances.
 
-    The cost of a phase that turns back, where the library's does not, is infinite.
+    (inf, None) where each takes |T| below 0 between the entries, or turns the phase
+    back where the library's does not.
     """
     best: tuple[float, Proxy | None] = (math.inf, None)
     for power in (3, 2, 1):
         with contextlib.suppress(DomainError):
-            count = len(branch.diameter_um) // 3
-            proxy = fit_terms(branch, power, min(terms, count))
-            turns_back = branch.monotonic and not _is_monotone(proxy)
-            cost = math.inf if turns_back else tolerance_ratio(proxy, limits)
-            if best[1] is None or cost < best[0]:
-                best = cost, proxy
+            proxy = _fit_power(branch, power, min(terms, len(branch.diameter_um) // 3))
+            if not branch.monotonic or _is_monotone(proxy):
+                best = min(best, (_cost(proxy, tolerances), proxy), key=itemgetter(0))
     return best
 
 
@@ -568,16 +502,16 @@ def _is_monotone(proxy: Proxy) -> bool:
     )
 
 
-def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
+def _fit_power(data: MonotonicBranch, power: int, terms: int) -> Proxy:
     """Proxy with ``terms`` coefficients in diameter^power for the phase, and as many
-    for |T|, by minimax fits to every other diameter.
+    for |T|, by minimax fits to half of the diameters.
 
     Args:
         data: phase and |T| of the entries; the errors are the largest over all of them.
     """
     axes = _axes(data, power)
-    phase = _minimax(axes, data.phase, terms)
-    level = _minimax(axes, data.level, terms)
+    phase = _fit_chebyshev(axes, data.phase, terms)
+    level = _fit_chebyshev(axes, data.level, terms)
     points = 64 if level.size > terms else 512
     _, upper_bound = polynomial.certified_bounds(level, points=points)
     if upper_bound > 1 - HEADROOM:
@@ -620,19 +554,27 @@ def _map_to_unit(values: Array, least: float) -> Array:
     return np.asarray((2 * values - least - values[-1]) / (values[-1] - least))
 
 
-def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
+def _fit_chebyshev(
+    axes: tuple[Array, Array, Array], values: Array, terms: int
+) -> Array:
     """([angle, wavelength, diameter] degree + 1) Chebyshev coefficients of least
     largest deviation in the diameter.
 
-    Each curve is fitted by itself in the diameter, then its coefficients in wavelength
-    and angle: up to five values of those are met exactly, more by least squares.
+    Half of the diameters is fitted, evenly spread, with both ends. The coefficients are
+    then fitted in wavelength and angle: up to five values of those are met exactly,
+    more by least squares.
 
     Args:
         axes: angle, wavelength and diameter in [-1, 1].
-        values: (angle, wavelength, diameter) that are fitted, at every other diameter.
+        values: (angle, wavelength, diameter) that are fitted.
         terms: coefficients in the diameter.
     """
-    curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
+    last = values.shape[-1] - 1
+    half = np.rint(np.linspace(0, last, last // 2 + 1 + last % 2)).astype(int)
+    curves = values[..., half].reshape(-1, len(half)).T
+    curves = _fit_minimax(axes[2][half], curves, terms).T.reshape(
+        *values.shape[:2], terms
+    )
     for axis in (0, 1):
         basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), 5) - 1)
         curves = np.moveaxis(
@@ -641,30 +583,26 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
     return curves
 
 
-def _lawson(basis: Array, values: Array) -> Array:
-    """(..., terms) coefficients of least largest deviation, by Lawson's iteration
-    (1961): weighted least squares, with weights multiplied by the deviations in each
-    round.
+def _fit_minimax(x: Array, values: Array, terms: int) -> Array:
+    """(terms, curves) Chebyshev coefficients of least largest deviation, by Lawson's
+    iteration (1961): weighted least squares, with weights multiplied by the deviations
+    in each round.
 
     Args:
-        basis: (n, terms) basis functions at the points.
-        values: (..., n) that are fitted.
+        x: (n,) places in [-1, 1].
+        values: (n, curves) that are fitted, with common weights.
     """
-    weight = np.ones(values.shape)
-    best = np.zeros((*values.shape[:-1], basis.shape[1]))
-    least_deviation = np.full(values.shape[:-1], np.inf)
+    basis = chebyshev.chebvander(x, terms - 1)
+    weight = np.ones(len(x))
+    best, least = np.zeros((terms, values.shape[1])), math.inf
     for _ in range(40):  # the best of these rounds is returned
-        root = np.sqrt(weight)[..., None]
-        q, r = np.linalg.qr(basis * root)
-        projected = np.swapaxes(q, -1, -2) @ (values[..., None] * root)
-        coefficients = np.linalg.solve(r, projected)[..., 0]
-        deviation = np.abs(np.einsum("nk,...k->...n", basis, coefficients) - values)
-        largest = deviation.max(axis=-1)
-        better = largest < least_deviation
-        best[better] = coefficients[better]
-        least_deviation[better] = largest[better]
-        weight *= deviation / np.maximum(largest, 1e-300)[..., None] + 1e-9
-        weight /= weight.sum(axis=-1, keepdims=True)
+        root = np.sqrt(weight)[:, None]
+        fitted = np.linalg.lstsq(root * basis, root * values, rcond=None)[0]
+        deviation = np.abs(basis @ fitted - values).max(axis=1)
+        if deviation.max() < least:
+            best, least = fitted, deviation.max()
+        weight *= deviation / max(deviation.max(), 1e-300) + 1e-9
+        weight /= weight.sum()
     return best
 
 
