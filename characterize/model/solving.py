@@ -116,8 +116,8 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     All solves share one mesh, so that the curve is smooth.
     """
     span = float(diameters[0]), float(diameters[-1])
-    (solve,) = engines.solvers_at_common_discretization(
-        cell, [Incidence(wavelength_um)], span, tolerance=TOLERANCE / 2, engine="modal"
+    solve = engines.solver_at_common_discretization(
+        cell, Incidence(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
     )
     nodes = curve.sample_adaptively(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
     fit = curve.fit_response_curve(nodes, tolerance=_FIT_SHARE * TOLERANCE)

@@ -314,10 +314,10 @@ class _Nodes:
         sweep: Sweep,
         wavelength_um: float,
         reach: int,
-        run: Callable[[list[Task], str], list[list[SolvedNodes]]],
+        run: Callable[[list[Task], str], list[SolvedNodes]],
     ) -> None:
         self._cell = cell
-        self._light = (Incidence(wavelength_um),)
+        self._light = Incidence(wavelength_um)
         self._reach = reach
         self._run = run
         self.swaps = is_exchange_symmetric(cell, sweep)
@@ -347,7 +347,7 @@ class _Nodes:
             )
             for x, y in new
         ]
-        for key, (nodes,) in zip(new, self._run(tasks, label), strict=True):
+        for key, nodes in zip(new, self._run(tasks, label), strict=True):
             self.known[key] = np.append(nodes.response[:, 0], nodes.error.max())
         rows = np.array([self.known[key] for key in keys])
         swapped = (solved != pairs).any(axis=1)

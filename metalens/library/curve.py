@@ -182,13 +182,7 @@ def starting_diameters(low_um: float, high_um: float) -> list[float]:
 
 
 def sample_adaptively(
-    solve: Solver,
-    low_um: float,
-    high_um: float,
-    *,
-    tolerance: float,
-    most: int = 80,
-    cheaper_um: Array | None = None,
+    solve: Solver, low_um: float, high_um: float, *, tolerance: float, most: int = 80
 ) -> SolvedNodes:
     """Solve diameters one by one, each where rational fits disagree most, until the fit
     predicts new solves within the tolerance.
@@ -202,25 +196,21 @@ def sample_adaptively(
         high_um: largest size, um.
         tolerance: deviation at which predictions are accepted.
         most: solves at most; where they do not suffice ``converged`` is False.
-        cheaper_um: (any,) diameters that cost less. One is taken where the fits
-            disagree at least half as much as at the best diameter.
     """
-    cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
-    cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
     x = starting_diameters(low_um, high_um)
     responses = [solve(v) for v in x]
     earlier_fits: list[RationalFunction] = []
     predicted = 0
     while predicted < CALM and len(x) < most:
         fit, simpler = _fits(np.array(x), _responses(responses), tolerance)
-        place, doubt = _most_doubtful(
-            fit, [simpler, *earlier_fits[-2:]], np.array(x), cheaper
-        )
+        place, doubt = _most_doubtful(fit, [simpler, *earlier_fits[-2:]], np.array(x))
         meets_data = simpler.residual <= FIT_SHARE * tolerance
         has_spare_pole = len(fit.support) > len(simpler.support)
         agreed = meets_data and has_spare_pole and doubt < tolerance / 2
         if agreed and predicted == 0:
-            place = _widest_gap(x, cheaper)
+            ordered = np.sort(x)
+            widest = int(np.argmax(np.diff(ordered)))
+            place = float(ordered[widest] + ordered[widest + 1]) / 2
         response = solve(place)
         error = np.abs(fit(np.array([place]))[0] - (response.t, response.r)).max()
         x.append(place)
@@ -269,20 +259,18 @@ def _fits(
 
 
 def _most_doubtful(
-    fit: RationalFunction, rivals: list[RationalFunction], x: Array, cheaper: Array
+    fit: RationalFunction, rivals: list[RationalFunction], x: Array
 ) -> tuple[float, float]:
     """(diameter in um, disagreement): the best next diameter, and the largest
     disagreement of t between the fits.
 
-    Candidates are 1201 even diameters, the cheaper ones, and points around the poles of
-    the fit on the scale of their width. Those too close to a node are left out.
+    Candidates are 1201 even diameters, and points around the poles of the fit on the
+    scale of their width. Those too close to a node are left out.
 
     Args:
         fit: the present fit.
         rivals: fits that it is compared with.
         x: (n,) diameters of the nodes, um.
-        cheaper: (any,) diameters that cost less, taken at half the disagreement or
-            more.
     """
     low, high = x.min(), x.max()
     poles = fit.poles()
@@ -292,7 +280,7 @@ def _most_doubtful(
         & (np.abs(poles.imag) < 0.1 * (high - low))
     ]
     offsets = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
-    even = np.concatenate([np.linspace(low, high, 1201), cheaper])
+    even = np.linspace(low, high, 1201)
     near_poles = np.concatenate(offsets)
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
     near_poles = near_poles[
@@ -306,28 +294,12 @@ def _most_doubtful(
         [np.abs(rival(candidates)[:, 0] - value) for rival in rivals], axis=0
     )
     worst = int(np.argmax(doubt))
-    cheap = np.flatnonzero(np.isin(candidates, cheaper) & (doubt >= doubt[worst] / 2))
-    chosen = cheap[np.argmax(doubt[cheap])] if len(cheap) else worst
-    return float(candidates[chosen]), float(doubt[worst])
+    return float(candidates[worst]), float(doubt[worst])
 
 
 def _distance(places: Array, x: Array) -> Array:
     """(n,) distance of each place from the closest node."""
     return np.asarray(np.abs(places[:, None] - x).min(axis=1, initial=np.inf))
-
-
-def _widest_gap(x: list[float], cheaper: Array) -> float:
-    """Middle of the widest gap between the nodes, um, or the closest cheaper diameter
-    within a quarter of the gap.
-    """
-    ordered = np.sort(x)
-    widest = int(np.argmax(np.diff(ordered)))
-    middle = (ordered[widest] + ordered[widest + 1]) / 2
-    quarter = (ordered[widest + 1] - ordered[widest]) / 4
-    distance = np.abs(cheaper - middle)
-    if distance.min(initial=np.inf) < quarter:
-        return float(cheaper[np.argmin(distance)])
-    return float(middle)
 
 
 def _responses(responses: list[Response]) -> Array:

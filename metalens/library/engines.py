@@ -56,72 +56,51 @@ def solve_to_tolerance(
     return functools.partial(_solve, engine, cell, light, {"tolerance": tolerance})
 
 
-def solvers_at_common_discretization(
+def solver_at_common_discretization(
     cell: Cell,
-    lights: Sequence[Incidence],
+    light: Incidence,
     span_um: tuple[float, float],
     *,
     tolerance: float,
     engine: str,
-) -> list[Callable[[float], Response]]:
-    """A solver for each light, on the coarsest common discretisation that meets the
-    tolerance at three probe diameters.
+) -> Callable[[float], Response]:
+    """Solver on the coarsest common discretisation that meets the tolerance at three
+    probe diameters; responses are cached.
 
-    A curve over the span solves the probes anyhow, and responses are cached. Elsewhere
-    the error of coupled waves may exceed the tolerance (it is reported), but it has no
-    jumps that a rational fit would take for resonances. Meshes of the modal method need
-    to meet it at two of the probes only. Near a resonance, where the error is many
-    times larger, the next mesh takes over. The jump is then the true error of the
-    coarser mesh, about a tenth of its bar.
+    A curve over the span solves the probes anyhow. Elsewhere the error of coupled waves
+    may exceed the tolerance (it is reported), but it has no jumps that a rational fit
+    would take for resonances. Meshes of the modal method need to meet it at two of the
+    probes only. Near a resonance, where the error is many times larger, the next mesh
+    takes over. The jump is then the true error of the coarser mesh, about a tenth of
+    its bar.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
-        lights: plane waves that come.
+        light: plane wave that comes.
         span_um: (least, largest) size, um.
         tolerance: error of t that is asked for.
-        engine: auto, rcwa or modal.
-    """
-    if cell.height_um == 0 or (
-        engine == "modal" and not has_upright_walls(cell, engine)
-    ):
-        return [
-            functools.cache(
-                solve_to_tolerance(cell, light, tolerance=tolerance, engine=engine)
-            )
-            for light in lights
-        ]
-    by_light = [
-        _modal_levels(cell, light, tolerance)
-        if engine == "modal"
-        else _rcwa_levels(cell, light, span_um[1], tolerance)
-        for light in lights
-    ]
-    levels = [
-        [functools.cache(solver) for solver in level]
-        for level in zip(*by_light, strict=True)
-    ]
-    probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
-    allowed_misses = 1 if engine == "modal" else 0
-    for index, level in enumerate(levels[:-1]):
-        if all(_meets(solver, probes, allowed_misses) for solver in level):
-            chosen = levels[index : index + MESHES] if engine == "modal" else [level]
-            return [_first_converged(meshes) for meshes in zip(*chosen, strict=True)]
-    return list(levels[-1])
-
-
-def has_upright_walls(cell: Cell, engine: str) -> bool:
-    """Whether the modal engine solves a pillar with upright walls: lights of one
-    direction then share modes and a mesh.
-
-    Args:
-        cell: unit cell.
         engine: rcwa or modal.
     """
-    return engine == "modal" and not cell.sidewall_rad
+    modal = engine == "modal"
+    if cell.height_um == 0 or (modal and cell.sidewall_rad):
+        return functools.cache(
+            solve_to_tolerance(cell, light, tolerance=tolerance, engine=engine)
+        )
+    levels = (
+        _modal_levels(cell, light, tolerance)
+        if modal
+        else _rcwa_levels(cell, light, span_um[1], tolerance)
+    )
+    levels = [functools.cache(solve) for solve in levels]
+    probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
+    for index, solve in enumerate(levels[:-1]):
+        if _meets(solve, probes, allowed=1 if modal else 0):
+            return _first_converged(levels[index : index + (MESHES if modal else 1)])
+    return levels[-1]
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`solvers_at_common_discretization` took the finest one: a
+    """Whether :func:`solver_at_common_discretization` took the finest one: a
     single solve of a pillar is then no better.
 
     Args:

@@ -18,7 +18,7 @@ from metalens.library.curve import ResponseCurve
 from metalens.library.fit import find_faults, find_runs
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
-from metalens.library.workers import SweepJournal, Task, fit_curves
+from metalens.library.workers import SweepJournal, Task, fit_curve
 
 TURN = 2 * math.pi
 
@@ -158,9 +158,9 @@ def run_study(
     ]
     tasks = [
         Task(
-            "curves",
+            "curve",
             cell,
-            (Incidence(wavelength),),
+            Incidence(wavelength),
             _span(study, cell),
             study.tolerance,
             engines.choose_engine(cell),
@@ -171,7 +171,7 @@ def run_study(
     verdicts = []
     solutions = journal.run(tasks, console or CommandConsole(quiet=True), "cells")
     for case, solved in zip(cases, solutions, strict=True):
-        (curve,) = fit_curves(solved, tolerance=study.tolerance)
+        curve = fit_curve(solved, tolerance=study.tolerance)
         verdicts.append(judge_cell(study, *case, curve))
     return verdicts
 

@@ -104,8 +104,8 @@ class _SweepRun:
             rows = self.rows(diameters)
         points = self.points(diameters, rows)
         solved = self.journal.run(points, self.console, "entries one by one")
-        for task, (entries,) in zip(points, solved, strict=True):
-            row = rows[task.lights[0]]
+        for task, entries in zip(points, solved, strict=True):
+            row = rows[task.light]
             index = np.searchsorted(diameters, entries.diameter_um)
             better = entries.error < row[2, index].real
             values = np.concatenate([entries.response.T, entries.error[None]])
@@ -134,25 +134,16 @@ class _SweepRun:
     def solve(self, lights: list[Incidence], label: str) -> None:
         """Solve and store the curves of plane waves.
 
-        Waves of one wavelength and direction share their work in one task where the
-        solver can. Oblique light comes first: it takes several times as long as normal
-        incidence.
+        Oblique light comes first: it takes several times as long as normal incidence.
         """
-        share = engines.has_upright_walls(self.cell, self.engine)
-        groups: dict[object, list[Incidence]] = {}
-        for wave in sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad):
-            key = (wave.wavelength_um, wave.angle_rad) if share else wave
-            groups.setdefault(key, []).append(wave)
-        options = self.sweep.bar, self.engine
+        waves = sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad)
         tasks = [
-            Task("curves", self.cell, tuple(group), self.span, *options)
-            for group in groups.values()
+            Task("curve", self.cell, wave, self.span, self.sweep.bar, self.engine)
+            for wave in waves
         ]
-        for task, solved in zip(
-            tasks, self.journal.run(tasks, self.console, label), strict=True
-        ):
-            curves = workers.fit_curves(solved, tolerance=self.sweep.bar)
-            self.curves |= dict(zip(task.lights, curves, strict=True))
+        solved = self.journal.run(tasks, self.console, label)
+        for wave, nodes in zip(waves, solved, strict=True):
+            self.curves[wave] = workers.fit_curve(nodes, tolerance=self.sweep.bar)
 
     def misses(self, row: Array) -> Array:
         """(diameter,) mask of the entries of a row whose error exceeds the tolerance."""
@@ -204,9 +195,7 @@ class _SweepRun:
             inaccurate = diameters[misses].tolist()
             for start in range(0, len(inaccurate), POINTS):
                 sizes = tuple(inaccurate[start : start + POINTS])
-                tasks.append(
-                    Task("points", self.cell, (light,), sizes, bar, self.engine)
-                )
+                tasks.append(Task("points", self.cell, light, sizes, bar, self.engine))
         return tasks
 
     def record(self, diameters: Array, rows: Rows, solves: int) -> PillarLibrary:

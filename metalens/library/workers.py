@@ -25,83 +25,65 @@ SOLVE_SHARE, FIT_SHARE = 0.5, 0.4
 class Task:
     """Exact solves of one cell.
 
-    kind: ``curves``: one curve t(D) a light over a range of sizes, at sizes that are
-        chosen adaptively (:func:`metalens.library.curve.sample_adaptively`); lights of
-        one wavelength and direction share the mesh, and the homogeneous modes of equal
-        sizes. ``points``: the sizes themselves, each refined to the tolerance.
-        ``jones``: both polarisations of one size at a fixed truncation; its rows are
-        xx, xy, yx, yy (the polarisation that leaves, then that comes).
-    lights: plane waves that come.
-    sizes_um: (least, largest) of curves; else the sizes.
+    kind: ``curve``: t(D) over a range of sizes, at sizes that are chosen adaptively
+        (:func:`metalens.library.curve.sample_adaptively`). ``points``: the sizes
+        themselves, each refined to the tolerance. ``jones``: both polarisations of one
+        size at a fixed truncation; its rows are xx, xy, yx, yy (the polarisation that
+        leaves, then that comes).
+    light: plane wave that comes.
+    sizes_um: (least, largest) of a curve; else the sizes.
     tolerance: of t.
     engine: rcwa or modal.
     harmonics: largest diffraction order along an axis, of ``jones``.
     """
 
-    kind: Literal["curves", "points", "jones"]
+    kind: Literal["curve", "points", "jones"]
     cell: Cell
-    lights: tuple[Incidence, ...]
+    light: Incidence
     sizes_um: tuple[float, ...]
     tolerance: float
     engine: str = "rcwa"
     harmonics: int = 0
 
 
-def run_task(task: Task) -> list[SolvedNodes]:
-    """Solve a task: one set of nodes per light of ``curves``, else a single set.
-
-    ``jones`` gives four rows of t and r. ``points`` gives a row per size. ``curves``
-    are sampled adaptively; later lights prefer diameters of earlier ones, which cost
-    less.
-    """
-    cell, light = task.cell, task.lights[0]
-    options: dict[str, Any] = {"tolerance": task.tolerance, "engine": task.engine}
+def run_task(task: Task) -> SolvedNodes:
+    """Solve a task: four rows of t and r of ``jones``, else a row per size."""
+    cell, light = task.cell, task.light
     if task.kind == "jones":
         from metalens.rcwa import jones
 
         size = task.sizes_um[0]
         solution = jones(cell, size, light.wavelength_um, harmonics=task.harmonics)
         response = np.stack([solution.t.ravel(), solution.r.ravel()], 1)
-        return [SolvedNodes(np.full(4, size), response, np.full(4, solution.t_error))]
+        return SolvedNodes(np.full(4, size), response, np.full(4, solution.t_error))
     if task.kind == "points":
-        solve = engines.solve_to_tolerance(cell, light, **options)
+        solve = engines.solve_to_tolerance(
+            cell, light, tolerance=task.tolerance, engine=task.engine
+        )
         responses = [solve(d) for d in task.sizes_um]
         response = np.array([(item.t, item.r) for item in responses])
         error = np.array([item.t_error for item in responses])
-        return [SolvedNodes(np.array(task.sizes_um), response, error)]
+        return SolvedNodes(np.array(task.sizes_um), response, error)
     low, high = task.sizes_um
-    options["tolerance"] *= SOLVE_SHARE
-    solves = engines.solvers_at_common_discretization(
-        cell, task.lights, (low, high), **options
+    solve = engines.solver_at_common_discretization(
+        cell,
+        light,
+        (low, high),
+        tolerance=SOLVE_SHARE * task.tolerance,
+        engine=task.engine,
     )
-    for diameter in curve.starting_diameters(low, high):
-        for solve in solves:  # lights in turn at one diameter share its modes
-            solve(diameter)
-    curves: list[SolvedNodes] = []
-    for solve in solves:
-        solved_um = np.concatenate(
-            [np.empty(0), *(earlier.diameter_um for earlier in curves)]
-        )
-        tolerance = FIT_SHARE * task.tolerance
-        curves.append(
-            curve.sample_adaptively(
-                solve, low, high, tolerance=tolerance, cheaper_um=solved_um
-            )
-        )
-    return curves
+    tolerance = FIT_SHARE * task.tolerance
+    return curve.sample_adaptively(solve, low, high, tolerance=tolerance)
 
 
-def fit_curves(solved: list[SolvedNodes], *, tolerance: float) -> list[ResponseCurve]:
-    """Rational curves t(D) through the solves of a task of curves, one per light.
+def fit_curve(solved: SolvedNodes, *, tolerance: float) -> ResponseCurve:
+    """Rational curve t(D) through the solves of a task of kind ``curve``.
 
     Args:
         solved: of the task.
         tolerance: that the task had.
     """
-    return [
-        curve.fit_response_curve(nodes, tolerance=FIT_SHARE * tolerance)
-        for nodes in solved
-    ]
+    return curve.fit_response_curve(solved, tolerance=FIT_SHARE * tolerance)
 
 
 def material_files(of: object) -> Iterator[Path]:
@@ -139,7 +121,7 @@ class SweepJournal:
 
     def __init__(self, path: Path | None, *about: Any) -> None:
         self._path = path
-        self._known: dict[str, list[SolvedNodes]] = {}
+        self._known: dict[str, SolvedNodes] = {}
         self._read = {str(file): store.sha256(file) for file in material_files(about)}
         if path is not None:
             title = json.dumps([__version__, *map(config.dumps, about), self._read])
@@ -149,14 +131,14 @@ class SweepJournal:
     def _know(self, line: str) -> None:
         """Store the solves of a journal line; a damaged line is ignored."""
         try:
-            task, rows = json.loads(line)
-            self._known[str(task)] = [SolvedNodes.from_json(row) for row in rows]
+            task, row = json.loads(line)
+            self._known[str(task)] = SolvedNodes.from_json(row)
         except (ValueError, TypeError, KeyError, RecursionError):
             return
 
     def run(
         self, tasks: list[Task], console: CommandConsole, label: str
-    ) -> list[list[SolvedNodes]]:
+    ) -> list[SolvedNodes]:
         """Solves of the tasks in order; those in the journal are not computed again.
 
         Args:
@@ -180,7 +162,7 @@ class SweepJournal:
                     raise StoreError(f"{file} was changed or replaced: run again")
             self._known[keys[pending[i]]] = solved
             if self._path is not None:
-                row = [keys[pending[i]], [nodes.to_json() for nodes in solved]]
+                row = [keys[pending[i]], solved.to_json()]
                 store.append_line(self._path, json.dumps(row))
         return [self._known[key] for key in keys]
 

@@ -149,8 +149,7 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
 
 
 @pytest.mark.parametrize(
-    ("height_um", "pitch_um", "wavelength_nm"),
-    [(None, None, 850.0), (1.1, 0.4, 940.0)],
+    ("height_um", "pitch_um", "wavelength_nm"), [(None, None, 850.0), (1.1, 0.4, 940.0)]
 )
 def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have(
     height_um, pitch_um, wavelength_nm
@@ -180,8 +179,8 @@ def test_the_phases_that_training_takes_are_those_of_the_solver():
     at, both ends among them.
     """
     low, high = SETTINGS.proxy.domain_um
-    (solve,) = engines.solvers_at_common_discretization(
-        DEFAULT_CELL, [Incidence(0.85)], (low, high), tolerance=1e-3, engine="modal"
+    solve = engines.solver_at_common_discretization(
+        DEFAULT_CELL, Incidence(0.85), (low, high), tolerance=1e-3, engine="modal"
     )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
     told = np.exp(1j * np.asarray(SETTINGS.proxy.phase_rad(diameter, 0.85)))

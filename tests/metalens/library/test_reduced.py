@@ -65,27 +65,6 @@ def test_estimate_holds_on_ten_thousand_held_out_diameters(tolerance):
     assert error < tolerance
 
 
-def test_cheaper_diameters_are_taken_where_they_serve_and_the_estimate_holds_as_well():
-    """Of 25 that lie anywhere, and of those that another search found: fewer others are
-    solved than without.
-    """
-    plain = explored(1e-3).nodes.diameter_um
-    for cheaper in (np.random.default_rng(13).uniform(*SPAN, 25), plain + 1e-5):
-        nodes = reduced.sample_adaptively(
-            exact, *SPAN, tolerance=1e-3, cheaper_um=cheaper
-        )
-        assert nodes.converged
-        taken = np.isin(nodes.diameter_um, cheaper)
-        assert taken.sum() >= 8
-        assert (~taken).sum() <= len(plain) - 8
-        silent = reduced.SolvedNodes(nodes.diameter_um, nodes.response, 0 * nodes.error)
-        wrong, error, _ = violations(
-            reduced.fit_response_curve(silent, tolerance=1e-3), 400
-        )
-        assert wrong == 0
-        assert error < 1e-3
-
-
 def test_resonances_are_the_poles():
     found = explored(1e-4).resonances()
     sharpest = found[np.argmin(found[:, 1])]
