@@ -1,5 +1,5 @@
-"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table,
-JSON and a figure.
+"""Cell study: which pitch and height cover a full turn of phase smoothly, as JSON
+and a figure.
 
 Cells that are solved are kept beside the output (NAME.resume): after an interruption
 the same command goes on.
@@ -29,9 +29,8 @@ class Options(DistributedOptions):
         process: PROCESS.toml whose printable pillars and gaps, the strictest of all
             pitches and heights, take the place
             of min_diameter_um and min_gap_um (worked out for round pillars).
-        output: folder for README.md, cell_study.json and cell_study.png; NAME.resume
-            beside it keeps solved cells until
-            it is complete.
+        output: folder for cell_study.json and cell_study.png; NAME.resume beside it
+            keeps solved cells until it is complete.
     """
 
     config: tyro.conf.Positional[Path | None] = None
@@ -46,20 +45,16 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     study = CellStudy()
-    arguments = ""
     if options.config is not None:
         study = config.load(options.config, CellStudy, empty=False)
-        arguments = f" {options.config.name}"
     if options.process is not None:
         study = _printable(options.process, study)
-        arguments += f" --process {options.process.name}"
-    command = f"metalens study{arguments} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.shared():
         journal = SweepJournal(
             options.output.with_name(options.output.name + ".resume"), study
         )
         verdicts = cell_study.run_study(study, options.console, journal=journal)
-        plots.write_study(draft.path, study, verdicts, command=command)
+        plots.write_study(draft.path, study, verdicts)
     journal.finish()
     best = cell_study.best_cell(study, verdicts)
     return options.console.report(

@@ -13,7 +13,7 @@ from scipy import ndimage
 from metalens.core import reading, store
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError, nearest_name_hint
-from metalens.design.foreign_arrays import read_matlab, read_npz
+from metalens.core.foreign_arrays import read_matlab, read_npz
 from metalens.design.profiles import PhaseMap
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
@@ -46,7 +46,7 @@ class PhaseSamples:
 def read_phase_map(shape: PhaseMap) -> PhaseSamples:
     """Phase map of a file in radians; by the ending of its name.
 
-    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the named one;
+    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 5 to 7.3), the only matrix or the named one;
     ``.dat`` (Zemax grid phase, with its own spacing); anything else is text. Text is a
     matrix of numbers, or three columns x (um), y (um, down) and phase. Columns are
     separated by commas, or by semicolons, tabs or blanks with decimal commas; lines

@@ -1,21 +1,14 @@
-"""A picture of a lens: phase across the aperture, and a corner of it down to single
-pillars.
-"""
-
-from typing import Any
+"""A picture of a lens: the phase across its aperture."""
 
 import numpy as np
 
-from metalens.cell.shapes import rotate_corners
 from metalens.core import report
 from metalens.core.arrays import Array
 from metalens.lens.record import Lens
-from metalens.library.axes import cell_of_sizes
 
 
 def lens_picture(lens: Lens) -> bytes:
-    """PNG of the wrapped phase at the design wavelength, and of single pillars halfway
-    to the rim.
+    """PNG of the wrapped phase at the design wavelength, and of the aperture stop.
 
     A pixel has the phase of the mean of exp(iφ) over its sites and fades where the
     phase turns within it, so that undersampling draws no false zones.
@@ -23,19 +16,12 @@ def lens_picture(lens: Lens) -> bytes:
     Args:
         lens: the lens.
     """
-    figure, (left, right) = report.make_figure(1, 2, size=(9.6, 4.4))
-    _phase(figure, left, lens)
-    _pillars(figure, right, lens)
-    return report.figure_png(figure)
-
-
-def _phase(figure: Any, axes: Any, lens: Lens) -> None:
-    """Draw the wrapped phase, and the aperture stop where there is one."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Circle
 
+    figure, axes = report.make_figure(1, 1, size=(5.2, 4.4))
     d = lens.diameters
     # a hexagonal lattice leaves every other site of the map empty
     least = 2 if d.lattice.centred else 1
@@ -67,6 +53,7 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
         ylabel="y / µm",
     )
     axes.grid(visible=False)
+    return report.figure_png(figure)
 
 
 def mean_field(lens: Lens, sites: int) -> Array:
@@ -92,43 +79,3 @@ def mean_field(lens: Lens, sites: int) -> Array:
         field[: len(rows), : rows.shape[1]] = phasor * (2 if centred else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean
-
-
-def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
-    """Draw 28 by 28 pillars halfway to the rim, coloured by size or turn."""
-    from matplotlib.collections import PolyCollection
-
-    d = lens.diameters
-    ny, nx = d.diameter_um.shape
-    side = 28  # pillars along the side of the picture
-    row = ny // 2 - side // 2
-    column = min(nx * 3 // 4, max(nx - side, 0))
-    rows = slice(max(row, 0), row + side)
-    columns = slice(column, column + side)
-    x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
-    has_pillar = d.diameter_um[rows, columns] > 0
-    size, length, turn = (
-        np.zeros(np.count_nonzero(has_pillar))
-        if values is None
-        else values[rows, columns][has_pillar]
-        for values in (d.diameter_um, d.length_um, d.angle_rad)
-    )
-    outlines = []
-    pillars = np.column_stack([size, length, turn, x[has_pillar], y[has_pillar]])
-    for along_x, along_y, turn_rad, *place_um in pillars.tolist():
-        cell = cell_of_sizes(lens.cell, along_x, along_y) if along_y else lens.cell
-        corners = rotate_corners(cell.outline(along_x).line(32), turn_rad)
-        outlines.append(corners + place_um)
-    collection = PolyCollection(outlines, cmap="viridis")
-    collection.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
-    axes.add_collection(collection)
-    half = d.pitch_um / 2
-    axes.set(
-        xlim=(x.min() - half, x.max() + half),
-        ylim=(y.max() + half, y.min() - half),
-        aspect="equal",
-    )
-    axes.set(title="single pillars", xlabel="x / µm", ylabel="y / µm")
-    label = "size along x / nm" if d.angle_rad is None else "turn / deg"
-    figure.colorbar(collection, ax=axes, label=label, shrink=0.85)
-    axes.grid(visible=False)

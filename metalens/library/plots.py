@@ -3,19 +3,13 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from metalens.core import report, store
-from metalens.core.arrays import Array
 from metalens.core.store import write_bytes
-from metalens.library.study import (
-    CellStudy,
-    CellVerdict,
-    round_to_tolerance,
-    study_markdown,
-)
+from metalens.library.study import CellStudy, CellVerdict, round_to_tolerance
 
 if TYPE_CHECKING:
     from metalens.library.axes import AxesLibrary
@@ -25,25 +19,18 @@ if TYPE_CHECKING:
 DEG, NM = 180 / np.pi, 1e3
 
 
-def write_study(
-    folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
-) -> None:
-    """Write cell_study.json, README.md and cell_study.png to ``folder``, which must
-    exist.
+def write_study(folder: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
+    """Write cell_study.json and cell_study.png to ``folder``, which must exist.
 
     Args:
         folder: that is written to.
         study: what is compared.
         verdicts: of all its cells.
-        command: that wrote the page, shown in it.
     """
     values = {"study": asdict(study), "verdicts": [asdict(v) for v in verdicts]}
     store.write_text(
         folder / "cell_study.json",
         json.dumps(round_to_tolerance(values), indent=1) + "\n",
-    )
-    store.write_text(
-        folder / "README.md", study_markdown(study, verdicts, command=command)
     )
     study_figure(folder / "cell_study.png", study, verdicts)
 
@@ -82,16 +69,16 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
 def library_figure(
     path: Path, library: "PillarLibrary", proxy_fit: "ProxyFit | None"
 ) -> None:
-    """PNG of a library over the diameter: phase, |t|, error bars with the tolerance,
-    and the residuals of the proxy.
+    """PNG of a library over the diameter: phase, |t| with its error bars, and those
+    bars with the tolerance; the domain of the proxy is shaded.
 
     Args:
         path: of the PNG.
         library: the swept cell.
         proxy_fit: the fit of its proxy; None where there is none.
     """
-    figure, panels = report.make_figure(4, 1, size=(7.5, 8.5), sharex=True)
-    phase, level, bars, residuals = panels
+    figure, panels = report.make_figure(3, 1, size=(7.5, 7), sharex=True)
+    phase, level, bars = panels
     d = NM * library.diameter_um
     for i, j, k in np.ndindex(*library.t.shape[:3]):
         t, error = library.t[i, j, k], library.t_error[i, j, k]
@@ -111,72 +98,39 @@ def library_figure(
         ylabel="phase (turns)",
     )
     level.set(ylabel="|t|", ylim=(0, 1.05))
-    bars.set_ylabel("error bar of t")
+    bars.set(xlabel="diameter (nm)", ylabel="error bar of t")
     if proxy_fit is not None:
-        _residuals(residuals, library, proxy_fit)
+        domain_nm = [NM * v for v in proxy_fit.proxy.domain_um]
         for panel in (phase, level):
-            panel.axvspan(
-                *(NM * v for v in proxy_fit.proxy.domain_um), color="0.92", zorder=0
-            )
-    residuals.set(xlabel="diameter (nm)", ylabel="proxy - library")
+            panel.axvspan(*domain_nm, color="0.92", zorder=0)
     write_bytes(path, report.figure_png(figure))
 
 
-def _residuals(panel: Any, library: "PillarLibrary", fit: "ProxyFit") -> None:
-    """Plot the deviation of the proxy from the entries of its domain, phase (rad) and
-    |T|, averaged over the polarisations.
-    """
-    proxy = fit.proxy
-    low, high = proxy.domain_um
-    inside = (library.diameter_um >= low - 1e-9) & (library.diameter_um <= high + 1e-9)
-    d = library.diameter_um[inside]
-    mean = library.t[..., inside].mean(axis=0)
-    for j, k in np.ndindex(*mean.shape[:2]):
-        light = (float(library.wavelength_um[k]), float(library.angle_rad[j]))
-        t = mean[j, k]
-        phase_error = np.angle(np.exp(1j * proxy.phase_rad(d, *light)) / t)
-        panel.plot(NM * d, phase_error, "C0.", ms=2)
-        panel.plot(NM * d, proxy.transmission(d, *light) - np.abs(t), "C1.", ms=2)
-    panel.legend(["phase (rad)", "|T|"])
-
-
 def axes_library_figure(path: Path, library: "AxesLibrary") -> None:
-    """PNG of a library over two sizes at its first wavelength: phase, |t|, error bars
-    and held-out pairs.
-
-    Pairs of sizes above the tolerance are blank.
+    """PNG of a library over two sizes at its first wavelength: phase and |t| of light
+    along x and along y. Pairs of sizes above the tolerance are blank.
 
     Args:
         path: of the PNG.
         library: over two sizes.
     """
-    canvas, panels = report.make_figure(2, 3, size=(11, 6.6))
-    t, usable = library.t[0], library.usable[0]
+    canvas, panels = report.make_figure(2, 2, size=(8, 6.6))
     extent_nm = NM * np.ravel([axis[[0, -1]] for axis in (library.x_um, library.y_um)])
-
-    def draw(panel: Any, values: Array, title: str, label: str, colours: str) -> None:
-        image = panel.imshow(
-            values.T, origin="lower", extent=extent_nm, aspect="equal", cmap=colours
-        )
-        panel.set(title=title, xlabel="along x / nm", ylabel="along y / nm")
-        panel.grid(visible=False)
-        canvas.colorbar(image, ax=panel, label=label, shrink=0.8)
-
     for row, name in enumerate("xy"):
-        own_t = np.where(usable, t[..., row, row], np.nan)
-        title = f"{name}-polarised, {NM * library.wavelength_um[0]:g} nm"
+        own_t = np.where(library.usable[0], library.t[0, ..., row, row], np.nan)
         turns = np.angle(own_t) / (2 * np.pi) % 1
-        draw(panels[row][0], turns, title, "phase / turns", "twilight")
-        draw(panels[row][1], np.abs(own_t), title, "|t|", "viridis")
-    bar = np.log10(np.maximum(library.t_error[0], 1e-6))
-    draw(panels[0][2], bar, "error bar", "log10 |t - exact|", "magma")
-    held_out = panels[1][2]
-    error, bar = library.held_out[:, 3], library.held_out[:, 4]
-    held_out.loglog(bar, np.maximum(error, 1e-6), ".")
-    held_out.axline((bar.max(), bar.max()), (bar.max() / 2, bar.max() / 2))
-    held_out.set(
-        title="pairs held out",
-        xlabel="error bar of the entry",
-        ylabel="error of the interpolation",
-    )
+        for panel, values, label, colours in (
+            (panels[row][0], turns, "phase / turns", "twilight"),
+            (panels[row][1], np.abs(own_t), "|t|", "viridis"),
+        ):
+            image = panel.imshow(
+                values.T, origin="lower", extent=extent_nm, aspect="equal", cmap=colours
+            )
+            panel.set(
+                title=f"{name}-polarised, {NM * library.wavelength_um[0]:g} nm",
+                xlabel="along x / nm",
+                ylabel="along y / nm",
+            )
+            panel.grid(visible=False)
+            canvas.colorbar(image, ax=panel, label=label, shrink=0.8)
     write_bytes(path, report.figure_png(canvas))

@@ -96,8 +96,7 @@ def evaluate_curve(p: ChebyshevCurve, diameter: Values) -> Values:
     Args:
         p: the curve.
         diameter: number, NumPy array or torch tensor, um; tensors carry derivatives of
-            every order by backward, forward and vmap, and are all that is kept for
-            them.
+            every order by backward, and are all that is kept for them.
 
     Accuracy: a few roundings of the dtype times the sum of |monomials|.
 
@@ -161,7 +160,9 @@ def _torch_curve() -> Callable[[Any, ChebyshevCurve], Any]:
 
     class Curve(torch.autograd.Function):
         @staticmethod
-        def forward(diameter: Any, p: ChebyshevCurve) -> Any:
+        def forward(ctx: Any, diameter: Any, p: ChebyshevCurve) -> Any:
+            ctx.curve = p
+            ctx.save_for_backward(diameter)
             if diameter.device.type == "cpu":
                 value = np.asarray(evaluate_curve(p, diameter.detach().numpy()))
                 return torch.from_numpy(value)
@@ -169,22 +170,8 @@ def _torch_curve() -> Callable[[Any, ChebyshevCurve], Any]:
             return _sum_powers(p, diameter)
 
         @staticmethod
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            diameter, ctx.curve = inputs
-            ctx.save_for_backward(diameter)
-            ctx.save_for_forward(diameter)
-
-        @staticmethod
         def backward(ctx: Any, *gradients: Any) -> Any:
             return gradients[0] * evaluate_slope(ctx.curve, *ctx.saved_tensors), None
-
-        @staticmethod
-        def jvp(ctx: Any, *tangents: Any) -> Any:
-            return tangents[0] * evaluate_slope(ctx.curve, *ctx.saved_tensors)
-
-        @staticmethod
-        def vmap(info: Any, dims: Any, diameter: Any, p: ChebyshevCurve) -> Any:
-            return apply(diameter, p), dims[0]
 
     apply: Callable[[Any, ChebyshevCurve], Any] = Curve.apply
     return apply

@@ -41,7 +41,7 @@ class Sweep:
         where one is not 0.
     diameters_um: (least, largest); without it from 0.06 (or a fifth of a smaller pitch)
         to the pitch less 0.05.
-    samples: evenly spaced diameters; more are added around resonances.
+    samples: evenly spaced diameters.
     tolerance: error bar that is asked of every entry's t; left out, what the solver of
         such cells reaches but near resonances (:data:`USUAL`).
     engine: auto, rcwa or modal.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from metalens.cell import Blend, Cell, Incidence, Material, index
+from metalens.cell import Cell, Incidence, Material, index
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import CommandConsole
@@ -269,46 +269,6 @@ def _mean_over_phase(phase: Array, power: Array) -> float:
     return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
 
 
-def study_markdown(
-    study: CellStudy, verdicts: list[CellVerdict], *, command: str
-) -> str:
-    """The study as a Markdown page with one table per wavelength: turns covered (mean
-    |t|²), pitch across, height down.
-
-    Args:
-        verdicts: of all its cells.
-        command: that wrote the page, shown in it.
-    """
-    cell = study.at(study.pitches_um[0], study.heights_um[0])
-    pillar, substrate, cover = map(
-        material_name, (cell.pillar, cell.substrate, cell.cover)
-    )
-    lines = [
-        "# Cell study",
-        "",
-        f"Pillars of {pillar} on {substrate} under {cover}: {cell.described}. Printable: nothing solid narrower than "
-        f"{1e3 * study.min_diameter_um:.4g} nm, no gap, hole or hollow narrower than {1e3 * study.min_gap_um:.4g} nm. "
-        "Each entry is the phase, in turns, "
-        "that the longest stretch of diameters covers on which the phase rises, |t| >= "
-        f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
-        "in brackets the mean |t|² over it. **Bold**: a full turn.",
-        "",
-        f"Made by `{command}`; numbers with diameters and reasons in `cell_study.json`.",
-        "",
-        "![coverage](cell_study.png)",
-    ]
-    for wavelength in study.wavelengths_um:
-        lines += [
-            "",
-            f"## {1e3 * wavelength:g} nm",
-            "",
-            *_table(study, [v for v in verdicts if v.wavelength_um == wavelength]),
-        ]
-    uncertain = uncertain_entries(study, verdicts)
-    lines += ["", uncertain[0].upper() + uncertain[1:] + "."] if uncertain else []
-    return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
-
-
 def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
     """Sentence on how many runs have an error bar of t above the tolerance, with the
     largest; empty where none has.
@@ -327,39 +287,6 @@ def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
         f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
         f"largest of {worst.error:.2g} ({place})"
     )
-
-
-def material_name(material: Material) -> str:
-    """A material in words."""
-    if isinstance(material, Blend):
-        mixed = f" with {material.share:.0%} {material.other}" if material.other else ""
-        return f"{material.base}{mixed} {material.n_offset:+g} {material.k_offset:+g}i"
-    return (
-        material
-        if isinstance(material, str)
-        else f"n = {material.n:g} + {material.k:g}i"
-    )
-
-
-def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
-    """Markdown lines of one wavelength: turns (mean |t|²), pitch across, height down."""
-    by_cell = {(v.height_um, v.pitch_um): v for v in verdicts}
-    head = (
-        "| height \\ pitch (nm) | "
-        + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um)
-        + " |"
-    )
-    lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
-    for height in study.heights_um:
-        cells = [by_cell[height, pitch] for pitch in study.pitches_um]
-        texts = [
-            f"**{v.turns:.2f}** ({v.mean_power:.2f})"
-            if v.turns >= 1
-            else f"{v.turns:.2f} ({v.mean_power:.2f})"
-            for v in cells
-        ]
-        lines.append(f"| {1e3 * height:g} | " + " | ".join(texts) + " |")
-    return lines
 
 
 def best_cell(
@@ -388,30 +315,6 @@ def best_cell(
         key=lambda cell: worst_turns[cell],
     )
     return best[1], best[0]
-
-
-def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
-    """Markdown lines on the best cell at each wavelength."""
-    waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
-    best = best_cell(study, verdicts)
-    if best is None:
-        return [f"No cell covers a full turn at {waves} nm."]
-    chosen = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
-    lines = [
-        "## Choice",
-        "",
-        f"The lowest pillars that cover a full turn at {waves} nm with one cell are {1e3 * best[1]:g} nm high; among "
-        f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
-        "",
-    ]
-    for v in chosen:
-        lines.append(
-            f"- {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
-            f"{1e3 * v.to_um:.0f} nm "
-            f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
-            f"order up to {v.max_angle_deg:.0f} deg"
-        )
-    return lines
 
 
 def round_to_tolerance(value: object) -> object:

@@ -92,7 +92,7 @@ class _SweepRun:
             ],
             "curves",
         )
-        diameters = _diameters(self.span, sweep.samples, list(self.curves.values()))
+        diameters = np.linspace(*self.span, sweep.samples)
         rows = self.rows(diameters)
         inaccurate = [  # 20 entries: a curve takes about as many solves
             light
@@ -237,32 +237,6 @@ class _SweepRun:
             solves,
             provenance=Provenance(config=text),
         )
-
-
-def _diameters(
-    span: tuple[float, float], samples: int, curves: list[ResponseCurve]
-) -> Array:
-    """(n,) evenly spaced diameters, um, and up to 400 more around resonances, at 0.3, 1
-    and 3 half-widths on either side.
-
-    Args:
-        span: (least, largest) diameter, um.
-        samples: evenly spaced diameters.
-        curves: whose resonances count.
-    """
-    low, high = span
-    most = 400  # diameters that are added
-    even = np.linspace(low, high, samples)
-    poles = np.concatenate([curve.resonances() for curve in curves])
-    widest = 3 * (even[1] - even[0])  # well sampled by the even diameters
-    # resonances narrower than 0.1 nm cannot be printed, and are not sampled
-    poles = poles[(poles[:, 1] > 1e-4) & (poles[:, 1] < widest)]
-    offsets = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])
-    added = (poles[:, :1] + offsets * poles[:, 1:]).ravel()
-    added = np.unique(np.round(added[(added > low) & (added < high)], 6))
-    return np.unique(
-        np.concatenate([even, added[:: max(1, math.ceil(len(added) / most))]])
-    )
 
 
 def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:

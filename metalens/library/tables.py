@@ -12,6 +12,8 @@ from scipy.interpolate import CubicSpline
 from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
+from metalens.core.foreign_arrays import read_matlab, read_npz
+from metalens.core.reading import read_text
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PillarLibrary, Sweep
 
@@ -167,22 +169,15 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
         columns: names in place of the header of a text file.
 
     Raises:
-        DomainError: not readable, empty, or rows that are not numbers.
+        DomainError, LensError: not readable, empty, or rows that are not numbers.
     """
+    ending = path.suffix.lower()
+    if ending in (".npz", ".mat"):
+        return dict(read_npz(path) if ending == ".npz" else read_matlab(path))
     try:
-        if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as content:
-                return {name: content[name] for name in content.files}
-        if path.suffix.lower() == ".mat":
-            from scipy.io import loadmat
-
-            content = loadmat(path)
-            return {k: v for k, v in content.items() if not k.startswith("__")}
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError, NotImplementedError) as error:
-        raise DomainError(
-            f"{path}: not read ({error}); give CSV, TSV, NPZ or MAT of version 5"
-        ) from None
+        text = read_text(path)
+    except (OSError, ValueError) as error:
+        raise DomainError(f"{path}: not read ({error})") from None
     filled = [line for line in text.splitlines() if line.strip()]
     lines = [line for line in filled if line[0] not in "#%"]
     if not lines:

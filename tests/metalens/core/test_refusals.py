@@ -16,7 +16,7 @@ from metalens import cli, psf
 from metalens.commands import design
 from metalens.core import config, store
 from metalens.core.errors import ConfigError, LensError, StoreError
-from metalens.design.foreign_arrays import read_matlab
+from metalens.core.foreign_arrays import read_matlab
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The cell study: known coverages, the choice, and the page."""
+"""The cell study: known coverages, the choice, and the files."""
 
 import dataclasses
 import json
@@ -6,7 +6,6 @@ import json
 import pytest
 
 from metalens.cell import Cell, Index, Layer
-from metalens.cell.shapes import Cross
 from metalens.core.errors import CellError, ConfigError
 from metalens.library import plots
 from metalens.library import study as cell_study
@@ -44,25 +43,14 @@ def test_choice_takes_the_lowest_then_the_most(verdicts):
     assert cell_study.best_cell(SMALL, [wide]) is None
 
 
-def test_page_json_and_figure(verdicts, tmp_path):
-    plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
-    page = (tmp_path / "README.md").read_text()
-    assert f"| 700 | **{verdicts[0].turns:.2f}**" in page
-    assert "pitch of 300 nm" in page
-    assert "Made by `metalens study`" in page
+def test_json_and_figure(verdicts, tmp_path):
+    plots.write_study(tmp_path, SMALL, verdicts)
     values = json.loads((tmp_path / "cell_study.json").read_text())
     assert values["verdicts"][1]["pitch_um"] == 0.4
     assert (tmp_path / "cell_study.png").read_bytes().startswith(b"\x89PNG")
     first = (tmp_path / "cell_study.png").read_bytes()
-    plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
+    plots.write_study(tmp_path, SMALL, verdicts)
     assert (tmp_path / "cell_study.png").read_bytes() == first
-
-
-def test_no_cell_is_said_plainly(verdicts):
-    only = dataclasses.replace(SMALL, pitches_um=(0.40,))
-    assert "No cell covers a full turn at 850 nm" in cell_study.study_markdown(
-        only, verdicts[1:2], command="x"
-    )
 
 
 def test_pitch_without_room_is_refused():
@@ -94,22 +82,3 @@ def test_heights_of_layered_pillars_are_made_of_their_own_material():
         CellError, match=r"0\.1 um of it of other films: need a larger height"
     ):
         study.at(0.33, 0.09)
-
-
-def test_the_page_says_what_is_printable_of_any_shape():
-    crosses = CellStudy(
-        pitches_um=(0.3,),
-        heights_um=(0.7,),
-        wavelengths_um=(0.85,),
-        cell=Cell(0.3, shape=Cross(0.4)),
-    )
-    verdict = cell_study.CellVerdict(
-        0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3
-    )
-    page = cell_study.study_markdown(
-        dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x"
-    )
-    assert (
-        "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm"
-        in page
-    )

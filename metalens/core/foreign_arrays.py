@@ -1,6 +1,5 @@
-"""Numeric arrays of MATLAB files (levels 4, 5 and 7.3) and NumPy archives."""
+"""Numeric arrays of MATLAB files (levels 5 and 7.3) and NumPy archives."""
 
-import io
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -18,14 +17,13 @@ _COMPRESSED = 15  # type of a compressed element of level 5
 _COMPLEX = 0x800  # flag of a complex matrix of level 5
 _STORED = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
 _CLASSES = dict(zip(range(6, 16), "dfbBhHiIqQ", strict=True))
-_LEVEL_4 = "dfihHB"  # types by the tens digit of a matrix's type number
 _REFUSED = (*DAMAGE, EOFError, IndexError, zlib.error, zipfile.BadZipFile)
 
 
 def read_matlab(path: Path) -> dict[str, Array]:
     """Numeric arrays of a MATLAB file by name; text, cells and structures are left out.
 
-    scipy.io.loadmat ends the process on some damaged files of levels 4 and 5. Here
+    scipy.io.loadmat ends the process on some damaged files of level 5. Here
     every size is compared with the bytes that are there before it is used. Source:
     MAT-File Format (The MathWorks), chapter 1.
 
@@ -40,10 +38,10 @@ def read_matlab(path: Path) -> dict[str, Array]:
         if b"\x89HDF\r\n\x1a\n" in content[:4096]:
             with h5py.File(path, "r") as file:
                 return _level_7(path, file)
-        order = {b"IM": "<", b"MI": ">"}.get(content[126:128], "")
-        if order and 0 not in content[:4]:
-            return dict(_level_5(content[128:], order))
-        return dict(_level_4(content))
+        order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+        if order is None:
+            raise ValueError("need level 5 or 7.3 (save -v7)")
+        return dict(_level_5(content[128:], order))
     except _REFUSED as error:
         raise LensError(f"{path}: not a MATLAB file: {error}") from error
 
@@ -55,11 +53,9 @@ def read_npz(path: Path) -> dict[str, Array]:
         path: of the file.
 
     Raises:
-        LensError: damaged, no such file, or larger than 2 GB when unpacked.
+        LensError: damaged, or no such file.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            _check_size(sum(entry.file_size for entry in archive.infolist()))
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (*_REFUSED, SyntaxError, RecursionError) as error:
@@ -130,25 +126,6 @@ def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
         ]
         matrix = values[0] + 1j * values[1] if flags & _COMPLEX else values[0]
         yield parts[2][1].decode("latin-1"), matrix.reshape(shape, order="F")
-
-
-def _level_4(content: bytes) -> Iterator[tuple[str, Array]]:
-    """Name and array of every full numeric matrix of a MATLAB file of level 4."""
-    order = "<" if int.from_bytes(content[:4], "little") < 5000 else ">"
-    file = io.BytesIO(content)
-    while head := file.read(20):
-        kind, rows, columns, imaginary, length = np.frombuffer(
-            head, f"{order}i4"
-        ).tolist()
-        name = file.read(length).rstrip(b"\0").decode("latin-1")
-        dtype = np.dtype(order + _LEVEL_4[kind // 10 % 10])
-        parts = [
-            np.frombuffer(file.read(rows * columns * dtype.itemsize), dtype)
-            for _ in range(1 + bool(imaginary))
-        ]
-        if kind % 10 == 0:  # neither text nor sparse
-            matrix = parts[0] + 1j * parts[1] if imaginary else parts[0]
-            yield name, matrix.reshape(rows, columns, order="F")
 
 
 def _level_7(path: Path, file: h5py.File) -> dict[str, Array]:
