@@ -294,7 +294,7 @@ def find_faults(
 
 
 def find_runs(good: Array) -> list[slice]:
-    """Slices of the runs of consecutive True values."""
+    """Slices of the runs of consecutive True values in ``good``."""
     edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0))
     return [slice(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 

@@ -329,12 +329,12 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
         table: (m, 3, diameter) rows at the nodes.
         x: position of the new row.
     """
-    weights = lagrange_weights(nodes, x)
+    weights = _lagrange_weights(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
 
     def without(*left_out: int) -> Array:
         kept = np.delete(np.arange(len(nodes)), left_out)
-        return np.asarray(lagrange_weights(nodes[kept], x) @ table[kept, 0])
+        return np.asarray(_lagrange_weights(nodes[kept], x) @ table[kept, 0])
 
     first_change = np.zeros(table.shape[2])
     second_change = np.zeros(table.shape[2])
@@ -351,7 +351,7 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     return row
 
 
-def lagrange_weights(nodes: Array, x: float) -> Array:
+def _lagrange_weights(nodes: Array, x: float) -> Array:
     """(m,) Lagrange weights at ``x``: w_i = product over j != i of (x - x_j) / (x_i -
     x_j).
     """
