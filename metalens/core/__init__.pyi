@@ -2,6 +2,7 @@ from . import arrays as arrays
 from . import config as config
 from . import errors as errors
 from . import executor as executor
+from . import foreign_arrays as foreign_arrays
 from . import legendre as legendre
 from . import reading as reading
 from . import report as report
