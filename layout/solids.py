@@ -2,7 +2,6 @@
 
 import math
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -365,76 +364,42 @@ def _facets(mesh: TriangleMesh) -> Array:
 def write_step(path: str | Path, pillars: SolidTile) -> None:
     """Write STEP (AP214): an assembly of tapered pillars on a slab of substrate.
 
-    Each class of pillars is stored once and placed. Modelled in um, where the tolerance
-    of the kernel (1e-7) is far below a pillar, and written in mm.
+    Each class is stored once, as a cylinder, cone, extrusion or ruled loft, and placed
+    at its sites; pillars are um.
 
     Args:
         path: of the file.
-        pillars: of a window.
+        pillars: at most 10,000.
 
     Raises:
-        ProcessError: too many pillars, or the kernel cannot write. OSError: the target
-            cannot be written.
+        ProcessError: too many pillars.
     """
     check_count(pillars, "STEP")
-    from build123d import Solid
-    from OCP.TDocStd import TDocStd_Document
-    from OCP.XCAFApp import XCAFApp_Application
-    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+    import copy
 
-    document = TDocStd_Document(_text("XmlOcaf"))
-    XCAFApp_Application.GetApplication_s().NewDocument(_text("MDTV-XCAF"), document)
-    XCAFDoc_DocumentTool.SetLengthUnit_s(document, 1e-6)
-    shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
-    shapes.SetAutoNaming_s(False)
-    colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
-    root = shapes.NewShape()
-    _set_name(root, "metalens tile")
+    from build123d import Color, Compound, Location, Solid, Unit, export_step
+
     x = pillars.x_um
     y = pillars.y_um
     margin = pillars.pitch_um
     size = float(np.ptp(x)) + margin, float(np.ptp(y)) + margin, 1.0
     corner = float(x.min()) - margin / 2, float(y.min()) - margin / 2, -1.0
-    slab = Solid.make_box(*size).wrapped
-    parts = [("substrate", slab, _SUBSTRATE_COLOUR, [corner])]
+    parts = [("substrate", Solid.make_box(*size), _SUBSTRATE_COLOUR, [corner])]
     for kind, section in enumerate(pillars.sections):
         members = pillars.kind == kind
         places = [(*p, 0.0) for p in np.column_stack([x[members], y[members]]).tolist()]
         body = _body(section, pillars.height_um)
         parts.append((section.name, body, _PILLAR_COLOUR, places))
-    for part in parts:
-        _add_part(shapes, colours, root, *part)
-    shapes.UpdateAssemblies()
+    solids = []
+    for label, body, colour, places in parts:
+        body.label, body.color = label, Color(*colour)
+        for place in places:
+            solid = copy.copy(body)  # shares the geometry
+            solid.location = Location(place)
+            solids.append(solid)
+    tile = Compound(label="metalens tile", children=solids)
     with store.replace_atomically(path) as file:
-        if not _write_document(document, file):
-            raise ProcessError(
-                f"{path}: the CAD kernel could not write the STEP file; is the disk full?"
-            )
-
-
-def _add_part(
-    shapes: Any,
-    colours: Any,
-    root: Any,
-    label: str,
-    body: Any,
-    colour: tuple[float, float, float],
-    places: Sequence[tuple[float, float, float]],
-) -> None:
-    """Store a solid with label and colour, and place it below the root."""
-    from OCP.gp import gp_Trsf, gp_Vec
-    from OCP.Quantity import Quantity_Color, Quantity_TypeOfColor
-    from OCP.TopLoc import TopLoc_Location
-    from OCP.XCAFDoc import XCAFDoc_ColorType
-
-    stored = shapes.AddShape(body, False)
-    _set_name(stored, label)
-    shade = Quantity_Color(*colour, Quantity_TypeOfColor.Quantity_TOC_sRGB)
-    colours.SetColor(stored, shade, XCAFDoc_ColorType.XCAFDoc_ColorGen)
-    for place in places:
-        move = gp_Trsf()
-        move.SetTranslation(gp_Vec(*place))
-        shapes.AddComponent(root, stored, TopLoc_Location(move))
+        export_step(tile, file, unit=Unit.MC, timestamp=_STEP_TIME)
 
 
 def _body(section: SolidSection, height_um: float) -> Any:
@@ -446,7 +411,7 @@ def _body(section: SolidSection, height_um: float) -> Any:
     )
     for hole in holes:
         solid = (solid - hole).solid()
-    return solid.wrapped
+    return solid
 
 
 def _loft(
@@ -480,35 +445,3 @@ def _wire(part: EllipseArc | PolygonLoop, z_um: float) -> Any:
         return ellipse.moved(Location((0, 0, z_um), turn))
     corners = [(x, y, z_um) for x, y in part.vertices(0).tolist()]
     return Wire.make_polygon(corners, close=True)
-
-
-def _text(text: str) -> Any:
-    from OCP.TCollection import TCollection_ExtendedString
-
-    return TCollection_ExtendedString(text)
-
-
-def _set_name(label: Any, name: str) -> None:
-    from OCP.TDataStd import TDataStd_Name
-
-    TDataStd_Name.Set_s(label, _text(name))
-
-
-def _write_document(document: Any, path: Path) -> bool:
-    """Whether the kernel could write the document as STEP."""
-    from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
-    from OCP.IFSelect import IFSelect_ReturnStatus
-    from OCP.Message import Message, Message_Gravity
-    from OCP.STEPCAFControl import STEPCAFControl_Writer
-    from OCP.STEPControl import STEPControl_StepModelType
-    from OCP.TCollection import TCollection_HAsciiString
-
-    for printer in Message.DefaultMessenger_s().Printers():
-        printer.SetTraceLevel(Message_Gravity.Message_Fail)  # else it prints statistics
-    writer = STEPCAFControl_Writer()
-    writer.SetNameMode(True)
-    writer.SetColorMode(True)
-    writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
-    header = APIHeaderSection_MakeHeader(writer.Writer().Model())
-    header.SetTimeStamp(TCollection_HAsciiString(_STEP_TIME))
-    return bool(writer.Write(str(path)) == IFSelect_ReturnStatus.IFSelect_RetDone)

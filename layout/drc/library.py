@@ -243,7 +243,7 @@ class _LayerCheck:
         Returns:
             [((corners, 2) polygon with its lowest corner at 0, (n, 2) its places)].
         """
-        layers = self.content.cells[cell].drawn().items()
+        layers = self.content.cells[cell].polygons.items()
         polygons = [
             polygon
             for layer, drawn in layers

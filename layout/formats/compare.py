@@ -102,12 +102,11 @@ def _difference(planned: Sum, read: Sum) -> str:
     )
     if turned != read_turned:
         return f"{read_turned} copies are turned, planned {turned}"
-    if abs(count - read_count) == 1:
-        sign, text = (
-            (1, "one is missing") if count > read_count else (-1, "one too many")
-        )
-        return f"{text}, at ({sign * (x - read_x)}, {sign * (y - read_y)})"
-    if count != read_count:
+    missing = count - read_count
+    if abs(missing) == 1:
+        text = "one is missing" if missing > 0 else "one too many"
+        return f"{text}, at ({missing * (x - read_x)}, {missing * (y - read_y)})"
+    if missing:
         return f"{read_count} copies, planned {count}"
     return f"{count} copies, not all at their places"
 
@@ -122,7 +121,7 @@ def _shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
     expected, actual = (
         Counter(
             (layer, _canonical_corners(points))
-            for layer, shapes in cell.drawn().items()
+            for layer, shapes in cell.polygons.items()
             for points in shapes
         )
         for cell in (planned, read)
@@ -153,25 +152,21 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
     """Sums over the instances of each child and orientation.
 
     Args:
-        cell: with placements.
-        merged: all orientations together, as a reader sums them.
+        cell: as planned, or as read.
+        merged: all orientations of a child together, as sums are kept while reading.
     """
     if cell.sums is not None:
-        rows = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
-        return {(child, None): tuple(sums) for child, *sums in rows}
+        rows = map(tuple, cell.sums.tolist())
+        return dict(zip(((c, None) for c in cell.placed.children), rows, strict=True))
     digests: dict[Who, RunningDigest] = {}
     for child, turn, x, y in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)
         digest = digests.setdefault((child, None if merged else who), RunningDigest())
-        zeros = np.zeros(len(x), np.int64)
         index = QUARTERS.index(who) if who in QUARTERS else len(QUARTERS)
-        turned = np.full(len(zeros), index if merged else 0, np.uint8)
-        digest.take(zeros, x, y, turned)
+        turned = np.full(len(x), index if merged else 0, np.uint8)
+        digest.take(np.zeros(len(x), np.int64), x, y, turned)
     zero = np.zeros(1, np.int64)
-    sums = {
-        who: tuple(int(value[0]) for value in digest.of(zero))
-        for who, digest in digests.items()
-    }
+    sums = {who: tuple(digest.of(zero)[0].tolist()) for who, digest in digests.items()}
     if cell.pillars is not None:
         key = None if merged else QUARTERS[0]
         sums |= {(child, key): v for child, v in cell.pillars.sums().items()}

@@ -2,9 +2,6 @@
 average, and a hash of all places.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
 
 from layout.process.jit import compile_loop
@@ -19,25 +16,6 @@ _FIRST, _SECOND, _THIRD = (
 _ROOM = 256
 _MOST = 1 << 24  # children
 _OTHER = 8  # turns from here on are no quarter turns: equal in the hash
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PlacementDigest:
-    """Of the placements of each child. count, x, y, turned: (children,) int64; hashed:
-    (children,) uint64.
-
-    x, y: sums of the places. turned: placements that are turned, mirrored or scaled.
-    """
-
-    count: Array
-    x: Array
-    y: Array
-    turned: Array
-    hashed: Array
-
-    def __iter__(self) -> Iterator[Array]:
-        """count, x, y, turned, hashed."""
-        return iter((self.count, self.x, self.y, self.turned, self.hashed))
 
 
 class RunningDigest:
@@ -74,12 +52,11 @@ class RunningDigest:
         slot = np.flatnonzero(self._sums[:, 0])
         return np.where(slot % 2 == 0, slot // 2, -(slot + 1) // 2)
 
-    def of(self, children: Array) -> PlacementDigest:
-        """Sums of some children, by number."""
+    def of(self, children: Array) -> Array:
+        """(children, 5) count, sums of x and y, number turned, and hash, by number."""
         slot = np.where(children >= 0, 2 * children, -2 * children - 1)
         self._grow(int(slot.max(initial=0)) + 1)
-        count, x, y, turned = self._sums[slot].T
-        return PlacementDigest(count, x, y, turned, self._hashes[slot])
+        return np.column_stack([self._sums[slot], self._hashes[slot].view(np.int64)])
 
     def _grow(self, size: int) -> None:
         """Make room for ``size`` slots; refuse more than 2^24."""

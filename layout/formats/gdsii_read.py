@@ -153,7 +153,6 @@ class _Reader:
             self.references(cell)
             kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
             if kind == gds.ENDSTR:
-                cell.texts = cell.skipped.pop(gds.NAMES[gds.TEXT], 0)
                 return cell.close(name, self.names)
             if kind in (gds.SREF, gds.AREF):
                 self.reference(cell, kind)
@@ -164,7 +163,7 @@ class _Reader:
                 else:
                     cell.skipped[f"{gds.NAMES[kind]} without area"] += 1
             elif kind != gds.STRCLASS:  # TEXT, NODE
-                cell.skipped[gds.NAMES[kind]] += 1
+                cell.skipped["text" if kind == gds.TEXT else gds.NAMES[kind]] += 1
                 while self.next()[0] != gds.ENDEL:
                     self.refuse_outside_element()
 

@@ -43,7 +43,7 @@ def write_gdsii(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     """Write a mask as GDSII; the file appears whole or not at all.
 
     Args:
-        mask: plan of a die, or cells; true circles become polygons of 64 corners.
+        mask: plan of a die, or cells.
         path: of the file.
 
     Raises:
@@ -96,7 +96,7 @@ def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
         )
         shapes = [
             boundary_element(layer, points)
-            for layer, polygons in cell.drawn().items()
+            for layer, polygons in cell.polygons.items()
             for points in polygons
         ]
         copies = [_copies(one) for one in cell.references]

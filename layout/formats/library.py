@@ -13,14 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.formats.digest import PlacementDigest, RunningDigest
+from layout.formats.digest import RunningDigest
 from layout.mask.plan import MaskPlan, PillarArray
 from layout.process.process import LayerNumber
 from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
-CIRCLE_CORNERS = 64  # of the polygon that stands for a true circle
 MAX_DEPTH = 64  # of nested references
 _AT_ONCE = 1 << 22  # placements that are sorted by cell at once
 
@@ -185,9 +184,8 @@ class PillarSites:
         for first, block in array.blocks():
             y = array.y0 - first * array.down
             digest.sites(block, array.x0, y, (array.pitch, array.down))
-        digests = digest.of(np.arange(1, len(self.children) + 1))
-        rows = (tuple(int(v[k]) for v in digests) for k in range(len(self.children)))
-        pairs = zip(self.children, rows, strict=True)
+        rows = digest.of(np.arange(1, len(self.children) + 1)).tolist()
+        pairs = zip(self.children, map(tuple, rows), strict=True)
         return {child: sums for child, sums in pairs if sums[0]}
 
 
@@ -196,24 +194,18 @@ class MaskCell:
     """One cell.
 
     polygons: {(layer, datatype): (n, 2) corners each}.
-    circles: {(layer, datatype): x, y, radius each}.
     placed: placements of other cells.
-    texts: number of texts.
     sums: of the placements of each of ``placed.children``, where there are more than
         are kept; ``placed`` then holds none.
-    skipped: other elements of the file that draw nothing.
+    skipped: elements of the file that draw nothing, by kind.
     references: placements and arrays beside ``placed``.
     pillars: a lattice of cells beside these.
     """
 
     name: str
     polygons: Mapping[LayerNumber, list[Array]] = field(default_factory=dict)
-    circles: Mapping[LayerNumber, list[tuple[int, int, int]]] = field(
-        default_factory=dict
-    )
     placed: CellPlacements = NOTHING
-    texts: int = 0
-    sums: PlacementDigest | None = None
+    sums: Array | None = None
     skipped: Counter[str] = field(default_factory=Counter)
     references: tuple[CellReference, ...] = ()
     pillars: PillarSites | None = None
@@ -243,7 +235,7 @@ class MaskCell:
         counts: Counter[tuple[str, Orientation]] = Counter()
         if self.sums is not None:
             for child, count in zip(
-                self.placed.children, self.sums.count.tolist(), strict=True
+                self.placed.children, self.sums[:, 0].tolist(), strict=True
             ):
                 counts[child, QUARTERS[0]] += count
         total = np.zeros(len(self.placed.children) * len(self.placed.turns), np.int64)
@@ -297,26 +289,15 @@ class MaskCell:
                 if name in among:
                     yield name, QUARTERS[0], x, y
 
-    def drawn(self) -> dict[LayerNumber, list[Array]]:
-        """Polygons of each layer, true circles as polygons of 64 corners."""
-        polygons = {layer: list(shapes) for layer, shapes in self.polygons.items()}
-        for layer, circles in self.circles.items():
-            polygons.setdefault(layer, []).extend(
-                circle_polygon(*circle) for circle in circles
-            )
-        return polygons
-
     @property
     def layers(self) -> set[LayerNumber]:
         """Layers of its own shapes."""
-        return {*self.polygons, *self.circles}
+        return set(self.polygons)
 
     @property
     def shapes(self) -> int:
         """Number of its own shapes; 1 for a cell that holds nothing at all."""
-        own = sum(map(len, self.polygons.values()))
-        own += sum(map(len, self.circles.values()))
-        return own or int(not self.children)
+        return sum(map(len, self.polygons.values())) or int(not self.children)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -352,9 +333,7 @@ class MaskLibrary:
     @property
     def skipped(self) -> Counter[str]:
         """Elements of the cells that draw nothing: {kind: number}, texts among them."""
-        skipped = sum((cell.skipped for cell in self.cells.values()), Counter())
-        texts = sum(cell.texts for cell in self.cells.values())
-        return skipped + Counter(text=texts)
+        return sum((cell.skipped for cell in self.cells.values()), Counter())
 
     def cell(self, name: str) -> MaskCell:
         """The cell of a name.
@@ -496,10 +475,7 @@ class MaskLibrary:
         counts: Counter[LayerNumber] = Counter()
         for name, times in self.drawn_counts().items():
             cell = self.cells[name]
-            for shapes in (cell.polygons, cell.circles):
-                counts.update(
-                    {layer: times * len(listed) for layer, listed in shapes.items()}
-                )
+            counts.update({k: times * len(v) for k, v in cell.polygons.items()})
         return counts
 
     def areas_um2(self) -> dict[LayerNumber, float]:
@@ -513,9 +489,6 @@ class MaskLibrary:
                 weight[child] += weight[name] * count * turn.scale**2
             for layer, shapes in cell.polygons.items():
                 area = sum(abs(polygon.twice_area(p)) / 2 for p in shapes)
-                areas[layer] = areas.get(layer, 0.0) + weight[name] * area
-            for layer, circles in cell.circles.items():
-                area = sum(math.pi * radius**2 for *_, radius in circles)
                 areas[layer] = areas.get(layer, 0.0) + weight[name] * area
         return areas
 
@@ -592,17 +565,6 @@ def stable_order(numbers: Array) -> Array:
     return order
 
 
-def circle_polygon(x: int, y: int, radius: int) -> Array:
-    """(64, 2) corners of a polygon of the area of a circle, on whole units.
-
-    Args:
-        x: of the centre.
-        y: of the centre.
-        radius: database units.
-    """
-    return polygon.disc_polygon(radius, (x, y), CIRCLE_CORNERS)
-
-
 # flat shapes
 
 
@@ -622,7 +584,7 @@ class PolygonStack:
 
 
 def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
-    """Every polygon below a cell; true circles as polygons of 64 corners.
+    """Every polygon below a cell.
 
     Args:
         library: of the cells.
@@ -632,7 +594,7 @@ def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
         MaskFileError: as :meth:`MaskLibrary.walk`.
     """
     for name, turn, x, y in library.walk(top):
-        for layer, polygons in library.cell(name).drawn().items():
+        for layer, polygons in library.cell(name).polygons.items():
             corners = np.array([len(points) for points in polygons])
             for _, members in group_equal(corners):
                 points = np.stack([polygons[n] for n in members.tolist()])

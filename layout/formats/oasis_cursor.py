@@ -3,7 +3,6 @@ Errors name the byte offset.
 """
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,16 +14,6 @@ from metalens.core.errors import MaskFileError
 MOST_BYTES = 9  # of one integer
 MOST_COPIES = 1 << 24  # of one regular repetition, which take memory at once
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RepetitionOffsets:
-    """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32
-    bits.
-    """
-
-    x: Array
-    y: Array
 
 
 class ByteCursor:
@@ -101,6 +90,10 @@ class ByteCursor:
         """A signed integer that must fit 32 bits."""
         return self.within(self.signed())
 
+    def extent(self) -> int:
+        """An unsigned integer that must fit 32 bits."""
+        return self.within(self.unsigned())
+
     def within(self, value: int) -> int:
         """``value``, refused beyond 32 bits."""
         if abs(value) > FARTHEST:
@@ -148,106 +141,76 @@ class ByteCursor:
             raise self.fail(f"point list of type {form}, need 0 to 5")
         if not 0 < count <= self.left:
             raise self.fail(f"point list of {count} points with {self.left} bytes left")
-        steps = [self._step(form, n) for n in range(count)]
+        steps = np.array([self._step(form, n) for n in range(count)], object)
         if form == 5:
-            steps = list(
-                zip(
-                    *(np.cumsum(axis).tolist() for axis in np.array(steps, object).T),
-                    strict=True,
-                )
-            )
-        x, y = [0], [0]
-        for dx, dy in steps:
-            x.append(self.within(x[-1] + dx))
-            y.append(self.within(y[-1] + dy))
-        if closed and form in (
-            0,
-            1,
-        ):  # the last corner of a rectilinear polygon is implied
-            along = (form + count) % 2 == 0
-            x.append(x[-1] if not along else 0)
-            y.append(0 if not along else y[-1])
-        return np.array([x, y], np.int64).T
+            steps = np.cumsum(steps, axis=0)
+        corners = np.vstack([np.zeros((1, 2), object), np.cumsum(steps, axis=0)])
+        self.within(int(np.abs(corners).max()))
+        points = corners.astype(np.int64)
+        if closed and form < 2:  # the last corner of a rectilinear polygon is implied
+            last = points[-1:].copy()
+            last[0, (form + count) % 2] = 0
+            points = np.vstack([points, last])
+        return points
 
     def _step(self, form: int, n: int) -> tuple[int, int]:
         """Step of a point list: along one axis, in 4 or 8 directions, or any."""
         if form < 2:
             size = self.signed()
             return (size, 0) if n % 2 == form else (0, size)
-        if form in (2, 3):
-            word = self.unsigned()
-            bits = form
-            dx, dy = DIRECTIONS[word & (1 << bits) - 1]
-            return dx * (word >> bits), dy * (word >> bits)
-        return self.delta()
+        if form > 3:
+            return self.delta()
+        word = self.unsigned()
+        dx, dy = DIRECTIONS[word & (1 << form) - 1]
+        return dx * (word >> form), dy * (word >> form)
 
     def repetition(
-        self, last: RepetitionOffsets | None, limit: int
-    ) -> RepetitionOffsets:
-        """A repetition of any type; at most ``limit`` copies."""
+        self, last: tuple[Array, Array] | None, limit: int
+    ) -> tuple[Array, Array]:
+        """A repetition of any type: x and y (n,) of all copies from the first.
+
+        Args:
+            last: the repetition before, which type 0 repeats.
+            limit: number of copies.
+
+        Raises:
+            MaskFileError: more copies, or copies beyond 32 bits.
+        """
         form = self.unsigned()
-        if form == 0:
-            if last is None:
-                raise self.fail(
-                    "a repetition that repeats an earlier one, and there is none"
-                )
+        if form == 0 and last is not None:
             return last
-        if form in (1, 2, 3):
-            return self._matrix(form, limit)
-        if form in (4, 5, 6, 7):
-            count = self._count(limit)
-            grid = self.unsigned() if form % 2 else 1
-            steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
-            offsets = self._sums(steps)
-            return (
-                RepetitionOffsets(offsets, 0 * offsets)
-                if form < 6
-                else RepetitionOffsets(0 * offsets, offsets)
+        if form in (1, 2, 3, 8, 9):
+            columns = self.unsigned() + 2 if form != 3 else 1
+            rows = self.unsigned() + 2 if form in (1, 3, 8) else 1
+            across, up = (0, 0), (0, 0)
+            if form >= 8:
+                across = self.delta()
+                up = self.delta() if form == 8 else up
+            else:
+                across = (self.unsigned(), 0) if form != 3 else across
+                up = (0, self.unsigned()) if form != 2 else up
+            return self._grid(columns, rows, across, up, limit)
+        if not 4 <= form <= 11:
+            raise self.fail(
+                f"repetition of type {form}, need 1 to 11, or 0 after another"
             )
-        if form in (8, 9):
-            return self._vectors(form, limit)
-        if form in (10, 11):
-            count = self._count(limit)
-            grid = self.unsigned() if form == 11 else 1
-            x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        count = self.unsigned() + 2
+        if count > min(self.left + 1, limit):  # each copy needs a byte
+            raise self.fail(f"repetition of {count} copies with {self.left} bytes left")
+        grid = self.unsigned() if form in (5, 7, 11) else 1
+        x, y = np.zeros((2, count), np.int64)
+        if form >= 10:
             position = sum_deltas(self.data, self.at, self.end, self.within(grid), x, y)
             if position < 0:
                 raise self.fail(
                     f"list of {count - 1} steps that is cut or leaves 32 bits"
                 )
             self.at = position
-            return RepetitionOffsets(x, y)
-        raise self.fail(f"repetition of type {form}, need 0 to 11")
-
-    def _count(self, limit: int) -> int:
-        """Copies of a listed repetition: each needs a byte."""
-        count = self.unsigned() + 2
-        if count > min(self.left + 1, limit):
-            raise self.fail(f"repetition of {count} copies with {self.left} bytes left")
-        return count
-
-    def _sums(self, steps: list[int]) -> Array:
-        """(n,) running sums of steps; refused beyond 32 bits."""
-        if sum(steps) > FARTHEST:
-            raise self.fail("repetition that leaves 32 bits")
-        return np.cumsum(np.array(steps, np.int64))
-
-    def _matrix(self, form: int, limit: int) -> RepetitionOffsets:
-        """Repetition on a lattice along x, along y, or along both."""
-        columns = self.unsigned() + 2 if form != 3 else 1
-        rows = self.unsigned() + 2 if form != 2 else 1
-        step_x = self.unsigned() if form != 3 else 0
-        step_y = self.unsigned() if form != 2 else 0
-        return self._grid(columns, rows, (step_x, 0), (0, step_y), limit)
-
-    def _vectors(self, form: int, limit: int) -> RepetitionOffsets:
-        """Repetition along one or two vectors of any direction."""
-        first = self.unsigned() + 2
-        second = self.unsigned() + 2 if form == 8 else 1
-        along = self.delta()
-        return self._grid(
-            first, second, along, self.delta() if form == 8 else (0, 0), limit
-        )
+            return x, y
+        steps = [self.unsigned() * grid for _ in range(count - 1)]
+        self.within(sum(steps))
+        (x if form < 6 else y)[1:] = np.cumsum(steps)
+        return x, y
 
     def _grid(
         self,
@@ -256,26 +219,23 @@ class ByteCursor:
         step: tuple[int, int],
         row_step: tuple[int, int],
         limit: int,
-    ) -> RepetitionOffsets:
+    ) -> tuple[Array, Array]:
         """Offsets of columns x rows copies, row by row, within 32 bits.
 
         Args:
-            columns, rows: number of copies each way.
-            step: (x, y) from column to column.
-            row_step: (x, y) from row to row.
-            limit: most copies.
+            columns: number of copies along the first vector.
+            rows: along the second.
+            step: first vector.
+            row_step: second vector.
+            limit: number of copies.
         """
-        if columns * rows > min(limit, MOST_COPIES):
-            most = min(limit, MOST_COPIES)
+        most = min(limit, MOST_COPIES)
+        if columns * rows > most:
             raise self.fail(
                 f"repetition of {columns} x {rows} = {columns * rows:,} copies, at most {most:,} more are read"
             )
         for axis in (0, 1):
             self.within(abs(columns * step[axis]) + abs(rows * row_step[axis]))
-        column, row = np.arange(columns), np.arange(rows)[:, None]
-        x, y = (
-            (column * step[axis]).astype(np.int32)
-            + (row * row_step[axis]).astype(np.int32)
-            for axis in (0, 1)
-        )
-        return RepetitionOffsets(x.ravel(), y.ravel())
+        row, column = np.indices((rows, columns), np.int32).reshape(2, -1)
+        x, y = (column * step[axis] + row * row_step[axis] for axis in (0, 1))
+        return x, y

@@ -136,7 +136,7 @@ class _Reader:
             self._block(c)
         elif kind in (oasis.PROPERTY, oasis.PROPERTY_REPEAT):
             self._property(c, kind)
-        elif self.cell is not None and self.cell.record(c, kind):
+        elif self.cell is not None and self.cell.read_record(c, kind):
             return
         elif kind in (oasis.CELLNAME, oasis.CELLNAME_REF):
             self._cell_name(c, kind == oasis.CELLNAME_REF)

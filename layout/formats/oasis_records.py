@@ -50,6 +50,11 @@ MAGIC = b"%SEMI-OASIS\r\n"
     CBLOCK,
 ) = range(26, 35)
 
+NAMES = {
+    value: name
+    for name, value in list(globals().items())
+    if name.isupper() and isinstance(value, int)
+}
 END_SIZE = 256
 
 

@@ -101,8 +101,6 @@ def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
         for layer, polygons in cell.polygons.items():
             shapes = b"".join(polygon_element(layer, points) for points in polygons)
             yield oasis.compressed_block(shapes, _LEVEL)
-        for layer, circles in cell.circles.items():
-            yield b"".join(_circle(layer, *element) for element in circles)
         yield b"".join(
             _copies(element, number[element.child]) for element in cell.references
         )
@@ -142,13 +140,6 @@ def g_delta(dx: int, dy: int) -> bytes:
     return oasis.unsigned_integer(
         abs(dx) << 2 | (dx < 0) << 1 | 1
     ) + oasis.signed_integer(dy)
-
-
-def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
-    """CIRCLE record, in database units."""
-    numbers = b"".join(oasis.unsigned_integer(n) for n in (*layer, radius))
-    place = oasis.signed_integer(x) + oasis.signed_integer(y)
-    return bytes([oasis.CIRCLE, 0b00111011]) + numbers + place
 
 
 def _copies(reference: CellReference, number: int) -> bytes:

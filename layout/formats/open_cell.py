@@ -113,12 +113,10 @@ class OpenCell:
     key: Child
     held: PlacementSums
     polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
-    circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
     names: dict[str, int] = field(default_factory=dict)
     turns: dict[Orientation, int] = field(
         default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
     )
-    texts: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
 
     def number(self, name: str) -> int:
@@ -169,9 +167,7 @@ class OpenCell:
             used, index = _numbered(child)
             turns = tuple(self.turns)
             placed = CellPlacements(named(used), index, x, y, turn, turns)
-        return MaskCell(
-            name, self.polygons, self.circles, placed, self.texts, sums, self.skipped
-        )
+        return MaskCell(name, self.polygons, placed, sums, self.skipped)
 
 
 def _numbered(child: Array) -> tuple[Array, Array]:

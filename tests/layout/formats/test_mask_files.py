@@ -362,7 +362,7 @@ def test_masks_of_klayout_are_read(tmp_path):
         assert sorted(zip(x.tolist(), y.tolist(), strict=True)) == [
             (100 + 400 * i, 200 + 500 * j) for i in range(3) for j in range(2)
         ]
-        assert content.cells["TOP"].texts == 1
+        assert content.cells["TOP"].skipped["text"] == 1
 
 
 def test_reals_and_integers_of_oasis_follow_the_standard():

@@ -125,8 +125,8 @@ def test_point_lists_of_all_types(data, corners):
 
 
 def places(data, last=None, limit=1000):
-    found = cursor(data).repetition(last, limit)
-    return list(zip(found.x.tolist(), found.y.tolist(), strict=True))
+    x, y = cursor(data).repetition(last, limit)
+    return list(zip(x.tolist(), y.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(

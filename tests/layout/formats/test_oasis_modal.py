@@ -196,8 +196,8 @@ def test_elements_are_read_as_the_standard_says(tmp_path, name):
     path = tmp_path / "m.oas"
     path.write_bytes(oasis(CELL_A, records))
     cell = layout.read_oasis(path).cells["A"]
-    assert set(cell.polygons) | set(cell.circles) == {(1, 2)}
-    drawn = cell.polygons.get((1, 2), [])
+    assert set(cell.polygons) == {(1, 2)}
+    drawn = cell.polygons[1, 2]
     if corners is not None:
         assert sorted(map(canonical, drawn)) == sorted(map(canonical, corners))
     db = pytest.importorskip("klayout.db")
@@ -205,12 +205,11 @@ def test_elements_are_read_as_the_standard_says(tmp_path, name):
     own = db.Region()
     for points in drawn:
         own.insert(db.Polygon([db.Point(int(x), int(y)) for x, y in points]))
-    assert len(drawn) + len(cell.circles.get((1, 2), [])) == theirs.count()
-    circles = db.Region()
-    for x, y, radius in cell.circles.get((1, 2), []):
-        circles.insert(db.Box(x - radius, y - radius, x + radius, y + radius))
-    assert ((own ^ theirs) - circles).is_empty()
-    assert cell.circles == {} or circles.count() in (2, 3)
+    assert len(drawn) == theirs.count()
+    if max(map(len, drawn)) < 64:
+        assert (own ^ theirs).is_empty()
+    # circles of 30 to 100 units as polygons of other corners: a unit along the edge
+    assert (own ^ theirs).area() <= own.perimeter()
 
 
 def test_placements_keep_cell_place_and_repetition(tmp_path):
