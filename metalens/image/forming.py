@@ -167,18 +167,17 @@ class Imager:
     ) -> Tensor:
         """Light or coverage (frames, *sheets, y, x) blurred by the PSFs.
 
-        Where PSFs or depths carry a gradient, the nodes' own PSFs give it.
+        Where PSFs carry a gradient, the nodes' own PSFs give it.
         """
         psfs = self.light if illuminated else self.cover
-        total = psfs.blur(content, depth_um.detach())
+        total = psfs.blur(content, depth_um)
         if self.light.uniform:
             return total
-        varies = self.stack.requires_grad or depth_um.requires_grad
-        if varies and torch.is_grad_enabled():
+        if self.stack.requires_grad and torch.is_grad_enabled():
             total = total + by_nodes(
                 self.field,
                 content.detach(),
-                depth_um,
+                depth_um.detach(),
                 illuminated=illuminated,
                 asked=self.asked,
             )

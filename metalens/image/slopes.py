@@ -21,10 +21,10 @@ def by_nodes(
     illuminated: bool = True,
     asked: Set[int] | None = None,
 ) -> Tensor:
-    """Zeros that carry the derivatives of the image through the PSFs of all nodes.
+    """Zeros that carry the derivatives of the image by the PSFs of all nodes.
 
     Added to an image by low-rank kernels, (frames, *sheets, y, x), they give it the
-    exact derivatives by PSFs and by depths.
+    exact derivatives by PSFs.
 
     Args:
         field: PSFs of the nodes and their illumination.
@@ -53,16 +53,14 @@ class _ByNodes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients by PSFs (rows, columns, depths, h, w) and by shares of depth.
+        """Gradient by PSFs (rows, columns, depths, h, w).
 
-        The image is Σ_nodes PSF * (content · spline · share): each gradient is the
-        correlation of the image's gradient with the other factor, by FFT.
+        The image is Σ_nodes PSF * (content · spline · share): the gradient is the
+        correlation of the image's gradient with the other factors, by FFT.
         """
         psf, shares, content = tuple[Tensor, ...](ctx.saved_tensors)
         illumination, illuminated, asked = ctx.about
-        of_psf, of_depth, *_ = ctx.needs_input_grad
         rows, columns, depths, h, w = psf.shape
-        level = illumination[..., None, None] if illuminated else torch.ones(1)
         to_coefficients = spline_coefficients(depths).to(content)
         height, width = content.shape[-2:]
         maps = frame_maps((height, width), psf.shape[:2], content)
@@ -71,32 +69,20 @@ class _ByNodes(torch.autograd.Function):
         padded = torch.nn.functional.pad(gradient, (w // 2, w // 2, h // 2, h // 2))
         spectrum = torch.fft.rfft2(padded, s=shape)
         by_psf = torch.zeros_like(psf)
-        by_share = torch.zeros_like(shares)
-        nodes = range(rows * columns) if of_depth or asked is None else asked
-        for node in nodes:
+        for node in range(rows * columns) if asked is None else asked:
             a, b = divmod(node, columns)
             sources = content * (maps[0][:, a, None] * maps[1][:, b])
-            if of_psf and (asked is None or node in asked):
-                by_coefficient = []
-                for share in shares:
-                    part = torch.fft.rfft2(sources * share, s=shape).conj() * spectrum
-                    whole = torch.fft.irfft2(part.flatten(0, -3).sum(0), s=shape)
-                    by_coefficient.append(whole[:h, :w])
-                by_psf[a, b] = torch.einsum(
-                    "cz,cyx->zyx", to_coefficients, torch.stack(by_coefficient)
-                )
-            if of_depth:
-                light = psf[a, b] * level[a, b] if illuminated else psf[a, b]
-                coefficients = torch.einsum(
-                    "cz,zyx->cyx", to_coefficients, light.to(content)
-                )
-                for k, kernel in enumerate(coefficients):
-                    part = torch.fft.rfft2(kernel, s=shape).conj() * spectrum
-                    whole = torch.fft.irfft2(part, s=shape)
-                    by_share[k] += sources * whole[..., :height, :width]
+            by_coefficient = []
+            for share in shares:
+                part = torch.fft.rfft2(sources * share, s=shape).conj() * spectrum
+                whole = torch.fft.irfft2(part.flatten(0, -3).sum(0), s=shape)
+                by_coefficient.append(whole[:h, :w])
+            by_psf[a, b] = torch.einsum(
+                "cz,cyx->zyx", to_coefficients, torch.stack(by_coefficient)
+            )
         if illuminated:
-            by_psf *= level.to(by_psf)
-        return by_psf if of_psf else None, by_share if of_depth else None, None, None
+            by_psf *= illumination[..., None, None].to(by_psf)
+        return by_psf, None, None, None
 
 
 def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
