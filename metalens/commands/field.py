@@ -280,33 +280,28 @@ def near_field_picture(request: NearFieldRequest, fields: list[NearField]) -> by
         fields: fields on the cuts xz and yz, and on the maps.
     """
     xz, yz, maps = fields
-    columns = max(2, len(request.heights_um))
-    figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
-    top = max(_largest(near) for near in fields)
+    x, y = maps.grid.x_um, maps.grid.y_um
     drawn: list[tuple[Any, ...]] = [
-        (panels[0, 0], "y = 0", "xz", xz.grid.x_um, xz.grid.z_um, xz.e, xz.index),
-        (panels[0, 1], "x = 0", "yz", yz.grid.y_um, yz.grid.z_um, yz.e, yz.index),
+        ("y = 0", "xz", xz.grid.x_um, xz.grid.z_um, xz.e, xz.index),
+        ("x = 0", "yz", yz.grid.y_um, yz.grid.z_um, yz.e, yz.index),
     ]
     for i, height in enumerate(request.heights_um):
-        place = panels[1, i], f"z = {height:.4g} µm", "xy"
-        axes = maps.grid.x_um, maps.grid.y_um
-        drawn.append((*place, *axes, maps.e[:, i], maps.index[i]))
-    for panel in panels.flat:
-        panel.set_axis_off()
-    for panel, at, names, x, y, e, index in drawn:
-        panel.set_axis_on()
+        drawn.append((f"z = {height:.4g} µm", "xy", x, y, maps.e[:, i], maps.index[i]))
+    figure, panels = make_figure(1, len(drawn), size=(3.2 * len(drawn), 3.8))
+    top = max(_largest(near) for near in fields)
+    for panel, (at, names, across, up, e, index) in zip(panels, drawn, strict=True):
         panel.grid(False)
         panel.set(
             title=f"|E| at {at}", xlabel=f"{names[0]} / µm", ylabel=f"{names[1]} / µm"
         )
         magnitude = field_magnitude(e).squeeze()
-        image = panel.pcolormesh(x, y, magnitude, vmin=0, vmax=top, cmap="magma")
+        image = panel.pcolormesh(across, up, magnitude, vmin=0, vmax=top, cmap="magma")
         panel.set_aspect("equal")
         n = index.squeeze().real
         levels = np.unique(n)
         if len(levels) > 1:
             middles = (levels[1:] + levels[:-1]) / 2
-            panel.contour(x, y, n, levels=middles, colors="w", linewidths=0.7)
+            panel.contour(across, up, n, levels=middles, colors="w", linewidths=0.7)
         if names == "xy":
             panel.invert_yaxis()
     figure.colorbar(image, ax=panels, label="|E| of the light that comes", shrink=0.6)

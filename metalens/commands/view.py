@@ -28,8 +28,6 @@ OWN = {
     "axes-library": "axes_panels",
     "lens": "lens_panels",
     "psf": "psf_panels",
-    "far-field": "far_field_panels",
-    "near-field": "near_field_panels",
 }
 
 

@@ -1,4 +1,4 @@
-"""Panels of the artefacts of the optics core: library, lens, PSFs, far and near field."""
+"""Panels of the artefacts of the optics core: library, lens, PSFs."""
 
 import dataclasses
 import math
@@ -9,7 +9,7 @@ import numpy as np
 from metalens import lens as lenses
 from metalens import library as libraries
 from metalens import psf
-from metalens.core import report, store
+from metalens.core import report
 from metalens.core.arrays import Array
 from metalens.library import axes
 from metalens.view.panels import (
@@ -230,109 +230,6 @@ def psf_panels(path: Path) -> list[Panel]:
             "Relative L2 error of the intensity that each cause brings; –: not known for this lens.",
         ),
     ]
-
-
-def far_field_panels(path: Path) -> list[Panel]:
-    """Image of the light over direction cosines, its share within cones, table of
-    beams.
-
-    Args:
-        path: of the far field.
-    """
-    stored = store.load(path, "far-field")
-    arrays, attributes = stored.arrays, stored.attributes
-    share = np.asarray(arrays["share"], float)
-    sine = np.asarray(arrays["sine"])
-    angles = arrays["angles_deg"]
-    step = float(sine[1] - sine[0])
-    sliders = [SliderAxis("light from", [_degrees(pair) for pair in angles])]
-    edges = np.degrees(
-        np.arcsin(np.minimum(1.0, step * np.arange(1, arrays["rings"].shape[-1] + 1)))
-    )
-    beams = [
-        (_degrees(angles[int(i)]), x, y, part)
-        for i, x, y, part in arrays["beams"].tolist()
-    ]
-    words = (
-        f"Direction cosines along x and y of light of {1e3 * float(attributes['wavelength_um']):g} nm, in squares "
-        f"{step:.3g} wide; relative error {float(np.max(arrays['error'])):.1e}."
-    )
-    passed = ", ".join(
-        f"{_degrees(pair)}: {part:.3f}"
-        for pair, part in zip(angles, arrays["transmitted"], strict=True)
-    )
-    cone = {"share": np.cumsum(arrays["rings"], axis=-1)}
-    return [
-        ImagePanel(
-            "Far field",
-            share / share.max(),
-            sliders,
-            step,
-            "of the brightest",
-            words,
-            across="sine",
-        ),
-        CurvePanel(
-            "Light within a cone about the axis",
-            edges,
-            "angle / deg",
-            cone,
-            "share of the light that passes",
-            sliders,
-        ),
-        TablePanel(
-            "Beams",
-            ("light from", "sine x", "sine y", "share"),
-            beams,
-            f"Passes the pillars from {passed}.",
-        ),
-    ]
-
-
-def near_field_panels(path: Path) -> list[Panel]:
-    """Images of |E|, |H|, the components of E and the index, on both cuts and the maps.
-
-    Args:
-        path: of the near field.
-    """
-    stored = store.load(path, "near-field")
-    arrays, attributes = stored.arrays, stored.attributes
-    step = float(attributes["step_um"])
-    heights = SliderAxis("height", (1e3 * arrays["heights_um"]).tolist(), "nm")
-    panels: list[Panel] = []
-    for name, title in (
-        ("xz", "Along x and z"),
-        ("yz", "Along y and z"),
-        ("xy", "Across, along x and y"),
-    ):
-        e, h = np.abs(arrays[f"{name}/e"]), np.abs(arrays[f"{name}/h"])
-        parts_of_field = np.stack(
-            [
-                np.sqrt((e**2).sum(axis=0)),
-                *e,
-                np.sqrt((h**2).sum(axis=0)),
-                arrays[f"{name}/index"].real,
-            ]
-        )
-        upright = parts_of_field if name == "xy" else parts_of_field[..., ::-1, :]
-        parts = SliderAxis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
-        words = (
-            f"For light of {1e3 * float(attributes['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance "
-            f"of vacuum); relative error {float(attributes[f'error_{name}']):.1e} (root mean square)."
-        )
-        if name != "xy":
-            words += f" Light goes upwards; z from {arrays['z_um'][0]:.4g} to {arrays['z_um'][-1]:.4g} um, 0 at the foot."
-        panels.append(
-            ImagePanel(
-                title,
-                upright,
-                [parts, heights] if name == "xy" else [parts],
-                step,
-                "",
-                words,
-            )
-        )
-    return panels
 
 
 def _degrees(pair: Array) -> str:

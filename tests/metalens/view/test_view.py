@@ -17,7 +17,6 @@ import pytest
 from metalens import lens, psf
 from metalens.cell import Cell, Index
 from metalens.commands import view
-from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
 from metalens.design import Focus, make
 from metalens.proxy import Proxy
@@ -153,34 +152,6 @@ def test_the_command_writes_a_page_once(folder, tmp_path):
         view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
     )
     assert _content(target.read_text(encoding="utf-8"))["about"]["made with"]
-
-
-def test_a_far_field_keeps_its_directions(tmp_path):
-    share = np.random.default_rng(2).random((2, 9, 9))
-    arrays = {
-        "share": share,
-        "sine": np.linspace(-0.4, 0.4, 9),
-        "rings": np.array([[0.2, 0.3, 0.1], [0.5, 0.1, 0.2]]),
-        "angles_deg": np.array([[0.0, 0.0], [5.0, -2.0]]),
-        "beams": np.array([[1, 0.11, -0.03, 0.42]]),
-        "transmitted": np.array([0.9, 0.8]),
-        "error": np.array([1e-7, 3e-7]),
-    }
-    about = {"wavelength_um": 0.85}
-    store.save(
-        tmp_path / "f.h5",
-        "far-field",
-        arrays,
-        attributes=about,
-        provenance=store.Provenance(),
-    )
-    light, cones, beams = artefacts.far_field_panels(tmp_path / "f.h5")
-    assert light.step_um == pytest.approx(0.1)
-    assert light.across == "sine"
-    assert np.allclose(light.values, share / share.max())
-    assert cones.x == pytest.approx(np.degrees(np.arcsin([0.1, 0.2, 0.3])))
-    assert cones.lines["share"][1] == pytest.approx([0.5, 0.6, 0.8])
-    assert beams.rows == [("5, -2 deg", 0.11, -0.03, 0.42)]
 
 
 def test_a_page_goes_beside_a_report_of_the_same_name(folder, tmp_path):
