@@ -9,7 +9,13 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
 from metalens.image.scene import to_device
-from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
+from metalens.image.splines import (
+    TAPS,
+    depth_position,
+    spline_coefficients,
+    spline_matrix,
+    spline_taps,
+)
 from metalens.image.texture import scene_spectrum
 
 CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
@@ -211,13 +217,12 @@ class LowRankPsfs:
         depth = depth_um.flatten()
         if where is not None:
             number, depth = number[where], depth[where]
-        nearest, farthest = self.vergence
-        unit = ((nearest - 1 / depth) / max(nearest - farthest, 1e-30)).clamp(0, 1)
+        unit = depth_position(depth, self.vergence)
         if self.uniform:
             code = (unit * (len(self.table) - 1) + 0.5).long()
             return self.table.mT.index_select(1, code)
         high, wide, coefficients, rank = self.table.shape
-        nodes = 1 if nearest == farthest else coefficients - 2
+        nodes = 1 if self.vergence[0] == self.vergence[1] else coefficients - 2
         first, taps = spline_taps(unit, nodes)
         index = (number % (high * wide)) * coefficients + first
         indices = index[:, None] + torch.arange(TAPS, device=depth.device)

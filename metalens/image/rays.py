@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -259,15 +258,10 @@ def source_paths(
         reach2 = (x - sx) ** 2 + (y - sy) ** 2
         reach2 = reach2.clamp(max=float((reach2 * (bundle.whole > 0)).max()))
         path = interpolant.chebyshev_interpolant(
-            functools.partial(_chord, before), reach2
+            lambda u, before=before: media.path_of_reach(before, u**0.5), reach2
         )
         out.append(path - chief)
     return torch.stack(out)
-
-
-def _chord(before: Media, reach2: Any) -> Any:
-    """:func:`metalens.optics.media.path_of_reach` of the squared reach, um."""
-    return media.path_of_reach(before, reach2**0.5)
 
 
 def polarisation_factors(

@@ -10,7 +10,12 @@ from torch.autograd.function import once_differentiable
 from metalens.image.low_rank import PsfField, fast_shape, frame_maps
 from metalens.image.plan import ImagingPlan, sum_over_spectrum
 from metalens.image.points import Optics, psfs
-from metalens.image.splines import TAPS, spline_coefficients, spline_taps
+from metalens.image.splines import (
+    TAPS,
+    depth_position,
+    spline_coefficients,
+    spline_taps,
+)
 
 
 def by_nodes(
@@ -92,17 +97,12 @@ def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
         depth_um: (…) depths of the sources.
         depths_um: (depths,) nodes, at equal steps of 1/z, ascending.
     """
-    near = 1 / float(depths_um[0])
-    far = 1 / float(depths_um[-1])
-    unit = ((near - 1 / depth_um) / max(near - far, 1e-30)).clamp(0, 1)
     nodes = len(depths_um)
-    first, taps = spline_taps(unit, nodes)
+    vergence = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
+    first, taps = spline_taps(depth_position(depth_um, vergence), nodes)
     number = first[..., None] + torch.arange(TAPS, device=first.device)
-    shares = [
-        (taps * (number == coefficient)).sum(-1)
-        for coefficient in range(max(nodes + 2, TAPS))
-    ]
-    return torch.stack(shares)
+    shares = taps.new_zeros(*depth_um.shape, max(nodes + 2, TAPS))
+    return shares.scatter_(-1, number, taps).movedim(-1, 0)
 
 
 def node_light(optics: Optics, plan: ImagingPlan) -> Tensor:

@@ -26,6 +26,18 @@ def spline_taps(unit: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
     return first.long(), torch.stack(values, -1) / 6
 
 
+def depth_position(depth_um: Tensor, vergence: tuple[float, float]) -> Tensor:
+    """(…) places of depths between nodes: 0 at the nearest, 1 at the farthest, linear
+    in 1/z.
+
+    Args:
+        depth_um: (…) depths; those beyond the nodes lie on the outermost.
+        vergence: (nearest, farthest) 1/z of the nodes.
+    """
+    nearest, farthest = vergence
+    return ((nearest - 1 / depth_um) / max(nearest - farthest, 1e-30)).clamp(0, 1)
+
+
 def spline_coefficients(nodes: int) -> Tensor:
     """(coefficients, nodes) B-spline coefficients of the spline through node values."""
     if nodes == 1:

@@ -2,6 +2,7 @@
 rays pass it.
 """
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -227,26 +228,22 @@ def illuminated_radius_um(
     return stop.radius_um / (1 - between.reduced_um / before.reduced_um)
 
 
-LONGEST, STEPS = 5, 32  # of the table, and in a unit of w
+LONGEST, STEPS = 8, 1024  # of the table, and in a unit of w
 
 
-def _table() -> Array:
-    """(w, 4) table of A and A' / STEPS, each real and imaginary, for E(w).
+@functools.cache
+def _edge_wave_table() -> Array:
+    """(w,) complex table of A for E(w), at steps of 1 / ``STEPS``.
 
     A(w) = -e^(iπ/4) ∫ exp(-π t²/2 + iπ e^(iπ/4) w t) dt from 0, by Gauss's rule over t
-    up to 5, and A' = 1 - iπ w A.
+    up to 5.
     """
     node, weight = np.polynomial.legendre.leggauss(80)
     t = 2.5 * (node + 1)
     rotation = np.exp(0.25j * np.pi)
     w = np.arange(LONGEST * STEPS + 2) / STEPS
     exponent = -np.pi / 2 * t * t + 1j * np.pi * rotation * np.outer(w, t)
-    value = -rotation * np.exp(exponent) @ (2.5 * weight)
-    slope = (1 - 1j * np.pi * w * value) / STEPS
-    return np.stack([value.real, value.imag, slope.real, slope.imag], -1)
-
-
-TABLE = _table()
+    return np.asarray(-rotation * np.exp(exponent) @ (2.5 * weight))
 
 
 @numba.njit(cache=True, inline="always")
@@ -254,8 +251,8 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
     """Fresnel edge field E(w), and its integral w E(w) + i/π e^(-iπ/4)/√2 e^(iπw²/2).
 
     E is the complex Fresnel integral from -∞ to w, of limit 1: ±A(|w|) times the edge
-    wave e^(iπw²/2) e^(-iπ/4)/√2, plus 1 for w >= 0. A is a cubic Hermite interpolant of
-    ``table``, and beyond ``LONGEST`` its asymptotic series.
+    wave e^(iπw²/2) e^(-iπ/4)/√2, plus 1 for w >= 0. A is interpolated in ``table``, and
+    beyond ``LONGEST`` its asymptotic series.
     """
     a = abs(w)
     turns = a * a / 4 - 0.125
@@ -263,14 +260,7 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
     wave = complex(np.cos(angle), np.sin(angle)) * np.sqrt(0.5)
     if a < LONGEST:
         i = int(a * STEPS)
-        u = a * STEPS - i
-        low, high = table[i], table[i + 1]
-        p = u * u * (3 - 2 * u)
-        q = u * (1 - u) * (1 - u)
-        r = u * u * (u - 1)
-        re = low[0] + p * (high[0] - low[0]) + q * low[2] + r * high[2]
-        im = low[1] + p * (high[1] - low[1]) + q * low[3] + r * high[3]
-        bent = complex(re, im)
+        bent = table[i] + (a * STEPS - i) * (table[i + 1] - table[i])
     else:
         part = complex(0.0, -1 / (np.pi * a * a))  # 1 / (iπw²)
         bent = a * part * (1 + part * (1 + 3 * part * (1 + 5 * part)))
@@ -290,7 +280,7 @@ def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyp
         ray: unit vector of the plane of incidence.
         lengths: Fresnel lengths in that plane and across it, um.
         hole: radius of the stop and wavelength, um.
-        table: of :func:`_table`.
+        table: of :func:`_edge_wave_table`.
         out: (n,) complex.
     """
     along, across = lengths
@@ -346,7 +336,7 @@ def edge_diffraction_factor(
             ray,
             lengths_um,
             (radius_um, wavelength_um),
-            TABLE,
+            _edge_wave_table(),
             out[a:b],
         )
 
