@@ -5,7 +5,6 @@ and all move alike.
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,9 +12,7 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from codesign.batches.batch import FrameBatch
-from codesign.batches.surface_frames import SingleSurfaceFrames
 from metalens.core.errors import TrainingError
-from metalens.image import Frames
 
 
 def join_processes(device: torch.device | None = None) -> None:
@@ -83,14 +80,11 @@ def batch_share(batch: FrameBatch) -> FrameBatch:
             f"a batch of {len(batch.slip_mm)} frames on {process_count()} processes: need a multiple of them"
         )
     rows = slice(process_rank() * size, (process_rank() + 1) * size)
-    frames: Frames | SingleSurfaceFrames = _rows(batch.frames, rows)
-    pose = None if batch.pose is None else _rows(batch.pose, rows)
-    return replace(
-        batch,
-        frames=frames,
-        mask=batch.mask[rows],
-        slip_mm=batch.slip_mm[rows],
-        pose=pose,
+    return FrameBatch(
+        _rows(batch.frames, rows),
+        batch.mask[rows],
+        batch.slip_mm[rows],
+        None if batch.pose is None else _rows(batch.pose, rows),
     )
 
 
@@ -104,23 +98,13 @@ def _rows(record: Any, rows: slice) -> Any:
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Replace every gradient by its mean over the processes, in place.
 
-    One reduction for each dtype and device, in the same order in every process.
-
     Args:
-        parameters: with gradients.
+        parameters: with gradients, in the same order in every process.
     """
-    if process_count() == 1:
-        return
-    grads = [p.grad for p in parameters if p.grad is not None]
-    for kind in sorted({(g.dtype, g.device) for g in grads}, key=str):
-        same_kind = [g for g in grads if (g.dtype, g.device) == kind]
-        mean = (
-            _sum_in_place(torch.cat([g.flatten() for g in same_kind])) / process_count()
-        )
-        offset = 0
-        for grad in same_kind:
-            grad.copy_(mean[offset : offset + grad.numel()].view_as(grad))
-            offset += grad.numel()
+    for parameter in parameters if process_count() > 1 else ():
+        if parameter.grad is not None:
+            total = _sum_in_place(parameter.grad.contiguous())
+            parameter.grad.copy_(total / process_count())
 
 
 def shared_rows(count: int) -> Tensor:
@@ -148,13 +132,8 @@ def mean_of(values: list[float]) -> list[float]:
     Args:
         values: of this process.
     """
-    if process_count() == 1:
-        return values
-    return [
-        float(v)
-        for v in _sum_in_place(torch.tensor(values, dtype=torch.float64))
-        / process_count()
-    ]
+    total = torch.tensor(values, dtype=torch.float64)
+    return (_sum_in_place(total) / process_count()).tolist()
 
 
 def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
@@ -167,9 +146,7 @@ def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float
     results = torch.zeros(len(items), dtype=torch.float64)
     for i in range(process_rank(), len(items), process_count()):
         results[i] = work(items[i])
-    return [
-        float(v) for v in (_sum_in_place(results) if process_count() > 1 else results)
-    ]
+    return _sum_in_place(results).tolist()
 
 
 def batch_norm(
@@ -212,13 +189,10 @@ def _differentiable_sum(value: Tensor) -> Tensor:
 def _sum_in_place(value: Tensor) -> Tensor:
     """Sum a tensor over processes in place."""
     try:
-        dist.all_reduce(value)
+        if process_count() > 1:
+            dist.all_reduce(value)
     except RuntimeError as error:
-        raise _process_lost(error) from error
+        raise TrainingError(
+            f"another process of this run was lost ({error}); start it again with --resume to go on from the checkpoint"
+        ) from error
     return value
-
-
-def _process_lost(error: RuntimeError) -> TrainingError:
-    return TrainingError(
-        f"another process of this run was lost ({error}); start it again with --resume to go on from the checkpoint"
-    )

@@ -60,33 +60,6 @@ def slip_loss(
     return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
 
 
-def depth_loss(predicted: Tensor, vergence: Tensor) -> Tensor:
-    """Gaussian negative log likelihood of window vergences: mean of e² / (2 σ²) + log
-    σ.
-
-    Args:
-        predicted: (batch, 2, y, x) mean and logarithm of the standard deviation σ.
-        vergence: (batch, y, x) the truth.
-    """
-    error = predicted[:, 0] - vergence
-    return (0.5 * error**2 * torch.exp(-2 * predicted[:, 1]) + predicted[:, 1]).mean()
-
-
-def uncertainty_loss(prediction: Prediction, truth: Tensor) -> Tensor:
-    """Gaussian negative log likelihood e² / (2 σ²) + log σ with detached slippage
-    errors e.
-
-    It trains the uncertainty alone.
-
-    Args:
-        prediction: of the network. truth: (batch, 3) slippage in units of its scale.
-    """
-    error = (prediction.slip - truth).detach()
-    return (
-        0.5 * error**2 * torch.exp(-2 * prediction.slip_log_sd) + prediction.slip_log_sd
-    ).mean()
-
-
 def task_loss(
     prediction: Prediction,
     mask: Tensor,
@@ -114,7 +87,8 @@ def depth_reading_loss(
     *,
     depth_weight: float,
 ) -> Tensor:
-    """lambda_depth L_depth plus the loss of the uncertainty, added to the task loss.
+    """Gaussian negative log likelihoods of window vergences, times lambda_depth, and of
+    the slippage's uncertainty, added to the task loss.
 
     Args:
         prediction: of the network.
@@ -124,8 +98,13 @@ def depth_reading_loss(
             slippage.
         depth_weight: of the depths of windows.
     """
-    depth_term = depth_weight * depth_loss(prediction.depth, vergence)
-    return depth_term + SPREAD_WEIGHT * uncertainty_loss(prediction, slip_mm / scale_mm)
+    mean, log_sd = prediction.depth.unbind(1)
+    depth = F.gaussian_nll_loss(mean, vergence, torch.exp(2 * log_sd))
+    # the uncertainty of the slippage alone is trained
+    error = (prediction.slip - slip_mm / scale_mm).detach()
+    variance = torch.exp(2 * prediction.slip_log_sd)
+    uncertainty = F.gaussian_nll_loss(error, torch.zeros_like(error), variance)
+    return depth_weight * depth + SPREAD_WEIGHT * uncertainty
 
 
 def pose_loss(

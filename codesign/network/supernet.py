@@ -76,7 +76,6 @@ class SlicedNorm(nn.Module):
 
     mean: Tensor
     variance: Tensor
-    batches: Tensor
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -84,14 +83,15 @@ class SlicedNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(channels))
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("variance", torch.ones(channels))
-        self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
         self.measuring = False
+        self.batches = 0  # measured so far
 
     def forward(self, x: Tensor, act: Activation | None = None) -> Tensor:
         """Batch normalisation of the leading channels, then the activation.
 
         In training by the statistics of the batch (of all processes), otherwise by
-        those last measured; while ``measuring`` the running mean is updated too.
+        those last measured. While ``measuring``, these become the mean over batches of
+        equal weight, so that the order of the batches does not matter.
 
         Args:
             x: (batch, channels, y, x) features.
@@ -99,28 +99,19 @@ class SlicedNorm(nn.Module):
         """
         count = x.shape[1]
         weight, bias = self.weight[:count], self.bias[:count]
+        mean: Tensor | None = self.mean[:count]
+        variance: Tensor | None = self.variance[:count]
         if self.measuring:
-            self._measure(x)
-        if self.training and not self.measuring and parallel.process_count() > 1:
+            self.batches += 1
+        elif self.training and parallel.process_count() > 1:
             return apply_activation(parallel.batch_norm(x, weight, bias), act)
-        by_batch = self.training or self.measuring
-        mean = None if by_batch else self.mean[:count]
-        variance = None if by_batch else self.variance[:count]
-        y = F.batch_norm(x, mean, variance, weight, bias, training=by_batch)
+        elif self.training:
+            mean = variance = None
+        y = F.batch_norm(
+            x, mean, variance, weight, bias, self.training or self.measuring,
+            momentum=1 / max(self.batches, 1),
+        )  # fmt: skip
         return apply_activation(y, act)
-
-    @torch.no_grad()
-    def _measure(self, x: Tensor) -> None:
-        """Update the mean over batches of mean and variance; each batch has equal
-        weight.
-
-        So the order of the batches does not matter.
-        """
-        count = x.shape[1]
-        self.batches += 1
-        variance, mean = torch.var_mean(x, dim=(0, 2, 3), unbiased=x.numel() > count)
-        self.mean[:count] += (mean - self.mean[:count]) / self.batches
-        self.variance[:count] += (variance - self.variance[:count]) / self.batches
 
 
 class SlicedConv(nn.Module):
@@ -423,9 +414,7 @@ def recalibrate_batch_norm(
     net.eval()
     norms = [m for m in net.modules() if isinstance(m, SlicedNorm)]
     for norm in norms:
-        norm.mean.zero_()
-        norm.variance.fill_(1)
-        norm.batches.zero_()
+        norm.batches = 0
         norm.measuring = True
     count = 0
     try:

@@ -21,9 +21,11 @@ from metalens.fabrication import DRAWN, Draw, State, effective_indices, response
 from metalens.library import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
-# of the process: the order of rows in a correlation matrix
-_FIRST = ("bias_nm", "height_nm")
-ENTRIES = (*ASSEMBLY, *_FIRST, *(name for name in DRAWN if name not in _FIRST))
+# plain round pillars have no turn, pedestal or cap
+ENTRIES = (
+    *ASSEMBLY,
+    *(n for n in DRAWN if n not in ("turn_deg", "pedestal_nm", "cap_nm")),
+)
 _Entries: Any = dataclasses.make_dataclass(
     "_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True
 )
@@ -37,93 +39,39 @@ class LensErrors(_Entries):  # type: ignore[misc]
     focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted
     lens, waves at the rim.
     astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process
-    spreads, in the names of
-    :class:`metalens.fabrication.Spread`, ``bias_nm`` and ``height_nm`` first.
-    correlation: (k,
-    k) between the first k of them,
-    rows one after the other; empty for none.
+    spreads, in the names of :class:`metalens.fabrication.Spread`.
     bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm: of
     the bias from edge to edge. bow_nm: from axis to rim. index: of the pillars. sidewall_deg: lean of
     their walls.
-    width_nm, length_nm: of all pillars along x and y alone. turn_deg, pedestal_nm,
-    cap_nm: refused, since plain round
-    pillars have none.
+    width_nm, length_nm: of all pillars along x and y alone.
     """
-
-    correlation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if min(self.deviations) < 0:
             raise ConfigError(
                 f"spread {self.deviations}: need standard deviations of 0 or more"
             )
-        for name in ("turn_deg", "pedestal_nm", "cap_nm"):
-            if getattr(self, name):
-                raise ConfigError(
-                    f"spread.{name}: pillars are drawn as plain round ones, which have none; need 0"
-                )
-        if self.correlation:
-            self._check()
 
     @property
     def deviations(self) -> tuple[float, ...]:
         """Standard deviations in order."""
         return tuple(float(getattr(self, name)) for name in ENTRIES)
 
-    @property
-    def covariance(self) -> Array:
-        """(entries, entries) of the errors."""
-        correlation = np.eye(len(ENTRIES))
-        if self.correlation:
-            size = math.isqrt(len(self.correlation))
-            correlation[:size, :size] = np.reshape(self.correlation, (size, size))
-        return np.asarray(correlation * np.outer(self.deviations, self.deviations))
-
     def draw(self, generator: torch.Generator) -> "DrawnLensErrors | None":
-        """Errors of one lens from a normal distribution of this covariance.
+        """Independent normal errors of one lens; None where nothing varies.
 
-        The direction of gradients is uniform over a turn. None where nothing varies.
+        The direction of gradients is uniform over a turn.
 
         Args:
             generator: of the draws.
         """
         if not any(self.deviations):
             return None
-        varying = [
-            n
-            for n, name in enumerate(ENTRIES)
-            if name not in DRAWN or DRAWN[name].sigma or self.deviations[n]
-        ]
-        values, vectors = np.linalg.eigh(self.covariance[np.ix_(varying, varying)])
-        root = vectors * np.sqrt(values.clip(0))
-        normals = torch.randn(
-            len(varying), generator=generator, dtype=torch.float64
-        ).numpy()
-        turn_rad = (
-            2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
-        )
-        names = [ENTRIES[n] for n in varying]
-        amounts = dict(zip(names, (root @ normals).tolist(), strict=True))
-        return DrawnLensErrors(amounts, turn_rad)
-
-    def _check(self) -> None:
-        """Refuse a correlation that is no k x k correlation matrix.
-
-        Raises:
-            ConfigError: wrong size, not symmetric, or not positive semi-definite.
-        """
-        size = math.isqrt(len(self.correlation))
-        if size**2 != len(self.correlation) or size > len(ENTRIES):
-            raise ConfigError(
-                f"correlation has {len(self.correlation)} entries, need k x k for the first k of {', '.join(ENTRIES)}"
-            )
-        matrix = np.reshape(self.correlation, (size, size))
-        if not np.allclose(np.diag(matrix), 1) or not np.allclose(matrix, matrix.T):
-            raise ConfigError("correlation must be symmetric with ones on its diagonal")
-        if np.linalg.eigvalsh(matrix)[0] < -1e-9:
-            raise ConfigError(
-                "correlation is not positive semi-definite: no errors can be correlated like that"
-            )
+        draws = torch.randn(len(ENTRIES), generator=generator, dtype=torch.float64)
+        turn = float(torch.rand(1, generator=generator, dtype=torch.float64))
+        amounts = draws * torch.tensor(self.deviations, dtype=torch.float64)
+        named = zip(ENTRIES, amounts.tolist(), strict=True)
+        return DrawnLensErrors(dict(named), 2 * math.pi * turn)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import torch
 
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
+from codesign.optics.lens_errors import DrawnLensErrors
 from metalens.cell import Incidence, Index
 from metalens.library import DEFAULT_CELL, engines
 
@@ -84,43 +84,6 @@ def test_variance_of_a_bowed_bias_by_plain_quadrature():
     assert lens_errors.variance_rad2(state, SETTINGS.phase_rates) == pytest.approx(
         want, rel=1e-4
     )  # rings: 1 / 400² of the curvature
-
-
-def test_errors_are_correlated_as_they_are_said_to_be():
-    """The first three entries of the five that vary."""
-    said = (1.0, 0.3, -0.6, 0.3, 1.0, 0.2, -0.6, 0.2, 1.0)
-    errors = LensErrors(
-        focus_um=1.7,
-        tilt_waves=0.3,
-        astigmatism_waves=0.08,
-        bias_nm=2.9,
-        index=0.01,
-        correlation=said,
-    )
-    size = np.array([1.7, 0.3, 0.08])
-    found = errors.covariance
-    assert found[:3, :3] == pytest.approx(
-        np.reshape(said, (3, 3)) * size[:, None] * size, rel=1e-12
-    )
-    rest = dict(zip(lens_errors.ENTRIES, np.diag(found), strict=True))
-    assert (rest["bias_nm"], rest["index"]) == pytest.approx((2.9**2, 1e-4))
-    assert np.count_nonzero(found) == 9 + 2
-    generator = torch.Generator().manual_seed(5)
-    drawn = [errors.draw(generator) for _ in range(3000)]
-    values = np.array(
-        [[one.amounts.get(name, 0.0) for name in lens_errors.ENTRIES] for one in drawn]
-    )
-    scale = np.sqrt(np.maximum(np.diag(found), 1e-30))
-    assert (
-        np.abs((np.cov(values.T) - found) / np.outer(scale, scale)).max() < 0.11
-    )  # four sigma of √(2 / 3000)
-    turn = np.array([one.turn_rad for one in drawn])
-    assert turn.min() > 0
-    assert turn.max() < 2 * math.pi
-    assert turn.mean() == pytest.approx(
-        math.pi, abs=0.14
-    )  # four sigma of 2π / √12 / √3000
-    assert turn.std() == pytest.approx(2 * math.pi / math.sqrt(12), rel=0.05)
 
 
 def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():

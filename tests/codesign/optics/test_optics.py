@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
 from codesign.optics.stack import OpticsConfig
@@ -187,38 +186,23 @@ def test_lost_optics_and_impossible_settings_are_refused():
         replace(SMALL, window_samples=16)
 
 
-def test_lens_errors_have_the_covariance_that_was_asked_for():
-    correlation = np.eye(5)
-    correlation[3, 4] = correlation[4, 3] = -0.6
+def test_lens_errors_have_the_deviations_that_were_asked_for():
+    """4000 draws: four sigma of a variance are 0.09 of it; turns are even over a circle."""
     spread = LensErrors(
-        2.0, 0.1, 0.0, 4.0, 8.0, gradient_nm=3.0, correlation=tuple(correlation.ravel())
-    )
-    assert lens_errors.ENTRIES[:5] == (
-        "focus_um",
-        "tilt_waves",
-        "astigmatism_waves",
-        "bias_nm",
-        "height_nm",
+        focus_um=2.0, tilt_waves=0.1, bias_nm=4.0, height_nm=8.0, gradient_nm=3.0
     )
     generator = torch.Generator().manual_seed(0)
-    errors = [spread.draw(generator).amounts for _ in range(4000)]
-    drawn = np.array(
-        [[one.get(name, 0.0) for name in lens_errors.ENTRIES] for one in errors]
-    )
-    scale = np.outer(spread.deviations, spread.deviations) + 1e-12
-    assert (
-        np.abs(
-            (np.cov(drawn.T) - spread.covariance)
-            / np.sqrt(np.outer(*[np.diag(scale)] * 2))
-        ).max()
-        < 0.06
-    )
+    drawn = [spread.draw(generator) for _ in range(4000)]
+    names = ("focus_um", "tilt_waves", "bias_nm", "height_nm", "gradient_nm")
+    values = np.array([[one.amounts[name] for name in names] for one in drawn])
+    unit = np.cov((values / [2.0, 0.1, 4.0, 8.0, 3.0]).T)
+    assert np.abs(unit - np.eye(5)).max() < 0.09
+    assert {one.amounts["index"] for one in drawn} == {0.0}
+    turn = np.array([one.turn_rad for one in drawn])
+    assert 0 < turn.min() < turn.max() < 2 * math.pi
+    assert turn.mean() == pytest.approx(math.pi, abs=0.12)
+    assert turn.std() == pytest.approx(2 * math.pi / math.sqrt(12), rel=0.05)
     assert LensErrors().draw(generator) is None
-    bad = np.full((5, 5), -0.9) + 1.9 * np.eye(5)
-    with pytest.raises(ConfigError, match="positive semi-definite"):
-        LensErrors(correlation=tuple(bad.ravel()))
-    with pytest.raises(ConfigError, match="k x k"):
-        LensErrors(correlation=(1.0, 0.0, 0.0))
 
 
 def test_a_bias_of_the_diameters_sends_light_straight_on():
