@@ -29,6 +29,7 @@ from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image import sensor as camera
 from metalens.image.pupil import psf
 from metalens.image.sensor import Sensor
+from tests.codesign.optics.test_optics import pupil_phase, samples_fine
 
 NONE, BATCH = float("nan"), 32
 SCENES = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
@@ -185,11 +186,11 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
     """The same light from the finely sampled intensity, integrated over samples and
     low-passed by plain sums.
     """
-    fine = OPTICS.fine
+    fine = samples_fine(OPTICS)
     size = OPTICS.window_samples
     step = OPTICS.sample_um
     bright = psf(
-        optics.added_phase(OPTICS, phase), OPTICS.pupil, depths_um=OPTICS.depths_um,
+        pupil_phase(OPTICS, phase), OPTICS.pupil, depths_um=OPTICS.depths_um,
         focus_um=OPTICS.focus_mm * 1e3, sample_um=step / fine, samples=size * fine,
     )  # fmt: skip
     period = OPTICS.pupil.period_um

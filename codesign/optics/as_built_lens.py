@@ -29,14 +29,12 @@ from metalens.image import (
     Optics,
     Pupil,
     SmoothWave,
-    amplitude,
     cell_um,
-    coordinates,
     interpolate_cells,
     view_pupil,
 )
 from metalens.lens import Lens
-from metalens.optics.paths import path_difference, sensor_path, source_path
+from metalens.optics.paths import sensor_path, source_path
 
 OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")
 TABLE_STEP_UM = 1e-5  # of the table of t over the diameter
@@ -229,31 +227,6 @@ class MadeLens:
             self.settings.depths_um,
             Optics(plane, self.design.layers, distance_um),
         )
-
-    def wave(self, x: Array | None = None) -> Array:
-        """(nodes, nodes) complex wave behind the lens relative to its focusing phase.
-
-        On nodes of the design's pupil. A wrong lens-sensor distance adds its defocus.
-        Zero outside the rim.
-
-        Args:
-            x: all parameters of a lens, in the fit's order; None for the design.
-        """
-        parameters = at_rest(parameter_vector() if x is None else x)
-        pupil = self._pupil(self.design.sensor_distance_um)
-        place_um = coordinates(pupil)
-        plane = self.plane(process_state_of(parameters))
-        transmission = plane.factor(*place_um, self.design.wavelength_um, 0.0)
-        radius2 = (place_um[0] ** 2 + place_um[1] ** 2).numpy()
-        distance_um = self.design.sensor_distance_um + float(
-            parameters[PLACE["distance_um"]]
-        )
-        defocus_um = path_difference(radius2, distance_um) - path_difference(
-            radius2, self.design.sensor_distance_um
-        )
-        phase = 2 * math.pi / self.design.wavelength_um * defocus_um
-        factor = transmission * amplitude(pupil)
-        return np.asarray(factor.numpy() * np.exp(1j * phase))
 
     def redrawn(self, lens: Lens) -> "MadeLens":
         """The same settings and response for a lens of other diameters."""

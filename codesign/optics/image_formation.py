@@ -202,15 +202,8 @@ class DifferentiableImager:
         Args:
             settings: of the lens and its image.
             coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
-
-        Raises:
-            ValueError: none were drawn: the light's own gradient is that of all nodes.
         """
-        if self.pairs is None:
-            raise ValueError(
-                "no field points were drawn: a gradient needs live(..., pairs)"
-            )
-        if self.light.grad is None:
+        if self.light.grad is None or self.pairs is None:
             return
         optics = optics_of(settings, coefficients_rad)
         loss = surrogate_loss(optics, self.ready.plan, self.light.grad, self.pairs)

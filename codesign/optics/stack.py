@@ -182,14 +182,6 @@ class OpticsConfig:
             )
 
     @property
-    def fine(self) -> int:
-        """Intensity samples per ``sample_um``, an odd number: spacing at most lambda
-        / (4 NA).
-        """
-        count = math.ceil(self.sample_um / (self.pupil.field_step_um / 2))
-        return count + 1 - count % 2
-
-    @property
     def light(self) -> Source | None:
         """The light that reaches the sensor; None for one wavelength.
 
@@ -316,35 +308,17 @@ def _node_factor(
 
     exp(i phase) of polynomials and error, or the response of the pillars.
     """
+    view = _pupil_view(settings)
     if settings.parameters == "diameters":
-        view = _pupil_view(settings)
         wave = pillar_wave(settings, coefficients_rad)
         angle = math.radians(settings.angle_deg)
         factor = wave.factor(view.x_um, view.y_um, settings.focus.wavelength_um, angle)
         return torch.as_tensor(factor)
-    phase = added_phase(settings, coefficients_rad)
-    if error is not None:
-        phase = phase + _error_phase(settings, error)
+    phase = phase_at(settings, coefficients_rad, view.x_um, view.y_um, error=error)
     return torch.polar(
         torch.ones_like(phase, dtype=torch.float32),
         torch.remainder(phase, 2 * math.pi).float(),
     )
-
-
-def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
-    """(nodes, nodes) phase added to the hyperbolic focus, rad: double helix and
-    polynomials.
-
-    Args:
-        settings: of the lens and its image.
-        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
-    """
-    phase = _start(settings)
-    if settings.polynomials:
-        phase = phase + torch.einsum(
-            "n,nyx->yx", coefficients_rad.double(), _modes(settings)
-        )
-    return phase
 
 
 def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
@@ -517,49 +491,18 @@ def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
 
 
 @functools.lru_cache(maxsize=8)
-def _polynomials(
-    pupil: Pupil, count: int, family: Family = "free"
-) -> tuple[Tensor, Tensor]:
-    """(count, nodes, nodes) orthonormal phase terms, and their (count, count) mix.
+def _orthonormal_mix(pupil: Pupil, count: int, family: Family) -> Tensor:
+    """(count, count) matrix to orthonormal phase terms; row n gives term n as a sum of
+    the plain terms.
 
-    Row n of the mix gives term n as a sum of the plain terms. The terms have unit root
-    mean square over the aperture, by a QR decomposition of the plain ones.
+    The terms have unit root mean square over the aperture, by a QR decomposition of the
+    plain ones.
     """
     x, y = (c / pupil.radius_um for c in coordinates(pupil))
     raw = torch.stack(families.phase_terms(x, y, count, family))
-    inside = radius(pupil) <= pupil.radius_um
-    samples = raw[:, inside]
+    samples = raw[:, radius(pupil) <= pupil.radius_um]
     _, upper = torch.linalg.qr(samples.T)
-    mix = torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
-    return torch.einsum("nm,myx->nyx", mix, raw) * inside, mix
-
-
-@functools.lru_cache(maxsize=8)
-def _modes(settings: OpticsConfig) -> Tensor:
-    """(polynomials, nodes, nodes) phase terms where the rays of the pupil nodes
-    leave.
-    """
-    terms, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
-    if not settings.angle_deg:
-        return terms
-    view = _pupil_view(settings)
-    rim_um = settings.pupil.radius_um
-    raw = torch.stack(
-        families.phase_terms(
-            view.x_um / rim_um, view.y_um / rim_um, len(mix), settings.family
-        )
-    )
-    return torch.einsum("nm,myx->nyx", mix, raw) * (view.weight > 0)
-
-
-@functools.lru_cache(maxsize=8)
-def _start(settings: OpticsConfig) -> Tensor:
-    """(nodes, nodes) phase of the double helix, rad."""
-    view = _pupil_view(settings)
-    rim_um = settings.pupil.radius_um
-    return families.double_helix_phase(
-        view.x_um / rim_um, view.y_um / rim_um, settings.zones
-    )
+    return torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
 
 
 @functools.lru_cache(maxsize=8)
@@ -681,7 +624,7 @@ def phase_at(
     rim_um = settings.aperture_mm * 500
     total = families.double_helix_phase(x_um / rim_um, y_um / rim_um, settings.zones)
     if settings.polynomials:
-        _, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
+        mix = _orthonormal_mix(settings.pupil, settings.polynomials, settings.family)
         weights = mix.mT @ coefficients_rad.double()
         terms = torch.stack(
             families.phase_terms(
@@ -692,13 +635,6 @@ def phase_at(
     if error is None:
         return total
     return total + _wave_front(settings, error, x_um / rim_um, y_um / rim_um)
-
-
-def _error_phase(settings: OpticsConfig, error: DrawnLensErrors) -> Tensor:
-    """(nodes, nodes) phase error of one lens at the pupil nodes, rad."""
-    view = _pupil_view(settings)
-    rim_um = settings.pupil.radius_um
-    return _wave_front(settings, error, view.x_um / rim_um, view.y_um / rim_um)
 
 
 def _wave_front(

@@ -125,7 +125,12 @@ def evolve_population(
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
-    check_budget(space, count, budget)
+    least = count(smallest_architecture(space))
+    if least > budget:
+        raise TrainingError(
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
+            "raise the budget or the pixel pitch"
+        )
     state = start or EvolutionState(
         generator=dict(np.random.default_rng(seed).bit_generator.state)
     )
@@ -164,23 +169,6 @@ def evolve_population(
         yield state
 
 
-def check_budget(space: SearchSpace, count: Count, budget: float) -> None:
-    """Refuse a budget below the smallest network.
-
-    Args:
-        count: multiply-accumulates of an architecture.
-
-    Raises:
-        TrainingError: the smallest network of the space is beyond the budget.
-    """
-    least = count(smallest_architecture(space))
-    if least > budget:
-        raise TrainingError(
-            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
-            "raise the budget or the pixel pitch"
-        )
-
-
 def search(
     space: SearchSpace,
     plan: EvolutionSettings,
@@ -200,12 +188,8 @@ def search(
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
-    state = EvolutionState()
-    for born in evolve_population(
-        space, plan, evaluate, count, budget=budget, seed=seed
-    ):
-        state = born
-    return state.history
+    *_, last = evolve_population(space, plan, evaluate, count, budget=budget, seed=seed)
+    return last.history
 
 
 def _next_candidate(
@@ -392,11 +376,14 @@ def state_to_json(search: EvolutionState) -> str:
     Args:
         search: with its history.
     """
-    history = [
-        {**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs}
-        for c in search.history
-    ]
+    history = [candidate_to_json(c) for c in search.history]
     return json.dumps({"history": history, "generator": search.generator})
+
+
+def candidate_to_json(candidate: EvaluatedCandidate) -> dict[str, Any]:
+    """Sizes of the architecture, error and cost, as the state's JSON has them."""
+    sizes = dataclasses.asdict(candidate.architecture)
+    return {**sizes, "error": candidate.error, "macs": candidate.macs}
 
 
 def state_from_json(text: str, space: SearchSpace) -> EvolutionState:

@@ -1,6 +1,5 @@
 """What a run reached: the network of every budget on test frames, and what they show."""
 
-import json
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +13,7 @@ from codesign.gaze.bench import PeopleFrames
 from codesign.network import blur, losses, recalibrate_batch_norm
 from codesign.train import assess, evolution
 from codesign.train.assess import Predictions, SensorFrames
-from codesign.train.evolution import EvaluatedCandidate, EvolutionState
+from codesign.train.evolution import EvaluatedCandidate
 from codesign.train.run import CodesignRun
 from codesign.train.search import people_of, specialise_candidate
 from codesign.train.trainer import Trainer
@@ -149,8 +148,7 @@ def _evaluate_budget(
     row["depth_response_mm_per_mm"], row["depth_response_error"] = (
         assess.depth_response(answers.slip_mm[: len(shifted_mm), 2], shifted_mm)
     )
-    state = json.loads(evolution.state_to_json(EvolutionState((best,))))
-    row["architecture"] = state["history"][0]
+    row["architecture"] = evolution.candidate_to_json(best)
     return BudgetResult(row, trainer, frames.test, answers, half_width)
 
 

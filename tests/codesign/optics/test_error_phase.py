@@ -13,20 +13,20 @@ from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import DrawnLensErrors
 from metalens.cell import Incidence, Index
+from metalens.image.pupil import coordinates
 from metalens.library import DEFAULT_CELL, engines
 
 SETTINGS = optics.OpticsConfig()
+BARE, NONE = dataclasses.replace(SETTINGS, polynomials=0), torch.zeros(0)
 
 
 def phase(**amounts):
     """Over the lens, with its places in units of its radius."""
-    x, y = (
-        c.double() / SETTINGS.pupil.radius_um
-        for c in (optics._pupil_view(SETTINGS).x_um, optics._pupil_view(SETTINGS).y_um)
-    )
-    inside = torch.hypot(x, y) <= 1
+    x, y = (c.double() / SETTINGS.pupil.radius_um for c in coordinates(SETTINGS.pupil))
+    inside, rim = torch.hypot(x, y) <= 1, SETTINGS.pupil.radius_um
+    error = DrawnLensErrors(amounts)
     return (
-        optics._error_phase(SETTINGS, DrawnLensErrors(amounts))[inside],
+        optics.phase_at(BARE, NONE, x * rim, y * rim, error=error)[inside],
         x[inside],
         y[inside],
     )

@@ -13,7 +13,7 @@ from codesign.optics import stack as optics
 from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.image.pupil import psf
+from metalens.image.pupil import coordinates, psf
 from metalens.psf import psf_stack
 
 SMALL = OpticsConfig(
@@ -36,6 +36,17 @@ def _coefficients(scale=0.5):
     )
 
 
+def samples_fine(settings):
+    """Odd number of fine intensities a sample, at most lambda / (4 NA) apart."""
+    count = math.ceil(2 * settings.sample_um / settings.pupil.field_step_um)
+    return count + 1 - count % 2
+
+
+def pupil_phase(settings, coefficients):
+    """(nodes, nodes) phase beyond the hyperbolic focus on the pupil's nodes, rad."""
+    return optics.phase_at(settings, coefficients, *coordinates(settings.pupil))
+
+
 def _on_samples(fine, settings):
     """Fine intensities integrated over samples and low-passed to the grid of the
     samples, by two plain sums.
@@ -49,7 +60,7 @@ def _on_samples(fine, settings):
     from_x = (
         (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2)
         * step
-        / settings.fine
+        / samples_fine(settings)
     )
     to_x = (
         torch.arange(settings.window_samples) - (settings.window_samples - 1) / 2
@@ -63,12 +74,12 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
     coefficients = _coefficients()
     wide = replace(SMALL, window_samples=31)
     fine = psf(
-        optics.added_phase(wide, coefficients),
+        pupil_phase(wide, coefficients),
         wide.pupil,
         depths_um=wide.depths_um,
         focus_um=20e3,
-        sample_um=wide.sample_um / wide.fine,
-        samples=wide.window_samples * wide.fine,
+        sample_um=wide.sample_um / samples_fine(wide),
+        samples=wide.window_samples * samples_fine(wide),
     )
     want = _on_samples(fine.double(), wide)
     got = optics.lens_psf_stack(wide, coefficients).intensity
@@ -88,7 +99,7 @@ def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     x = (np.arange(n) - (n - 1) / 2) * pitch
     inside = (x[:, None] ** 2 + x**2 <= 100.0**2).astype(float)
     phase = optics.pillar_phase(settings, coefficients)(x, x)
-    fine = settings.fine
+    fine = samples_fine(settings)
     samples = settings.window_samples * fine
     full = psf_stack(
         phase,
