@@ -229,6 +229,7 @@ def bench(p: Pillars, shift: np.ndarray) -> np.ndarray:
     return plain.on_pixels(np.abs(field) ** 2, weight) / apparent[:, None, None] ** 2
 
 
+@cache
 def _true_frames(lens_path: Path) -> np.ndarray:
     """Electrons of the hidden lens, without noise."""
     hidden = small.HIDDEN

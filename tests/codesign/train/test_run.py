@@ -218,20 +218,17 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     )  # taken by slices: not counted
 
 
-@pytest.mark.parametrize(("pitch_um", "said"), [(17.0, 1), (18.0, 0)])
-def test_pixels_finer_than_the_samples_of_the_image_are_told(
-    tmp_path, capsys, pitch_um, said
-):
+def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys):
     text = TINY.replace(
-        "budgets_mmacs = [2.0]", f"budgets_mmacs = [2.0]\npitch_um = {pitch_um}"
+        "budgets_mmacs = [2.0]", "budgets_mmacs = [2.0]\npitch_um = 17.0"
     )
     (tmp_path / "run.toml").write_text(text)
     assert (
         cli.main(["codesign", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")])
         == 0
     )
-    words = f"run.pitch_um = {pitch_um:g} is finer than the samples of the image, optics.sample_um = 18"
-    assert capsys.readouterr().out.count(words) == said
+    words = "run.pitch_um = 17 is finer than the samples of the image, optics.sample_um = 18"
+    assert words in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("pitch_um", [18.3, pytest.param(21.1, marks=pytest.mark.slow)])

@@ -111,6 +111,7 @@ def test_the_engine_meets_the_textbook_at_oblique_incidence(kind):
     assert np.abs(got.t).max() > 0.9
 
 
+@pytest.mark.slow
 def test_silicon_on_silicon_of_the_infrared_is_swept_designed_and_imaged(
     tmp_path, capsys
 ):
