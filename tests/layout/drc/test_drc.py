@@ -250,23 +250,6 @@ def test_summary_says_what_was_found():
     )
 
 
-def test_feet_that_nearly_meet_are_found():
-    plan = plan_of([200, 260], [[1, 2, 0], [0, 1, 1]])
-    feet = np.array([241.0, 305.0])
-    found = check_plan(plan, LOOSE, foot_nm=feet)
-    assert found.minimum_foot_space_nm == pytest.approx(400 - (241 + 305) / 2)
-    assert found.counts["foot"] == 0
-    tight = DesignRules(
-        minimum_feature_nm=1,
-        minimum_gap_nm=1,
-        maximum_density=1,
-        minimum_foot_gap_nm=150,
-    )
-    assert (
-        check_plan(plan, tight, foot_nm=feet).counts["foot"] == 2
-    )  # both pairs of unlike pillars, in x and in y
-
-
 @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_a_gap_across_either_diagonal_is_found(corner):
     """Two pillars 20 nm apart across one diagonal of the lattice, nothing else: sqrt 2

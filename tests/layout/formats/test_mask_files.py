@@ -144,26 +144,6 @@ def test_row_blocks_give_the_same_file_as_the_whole_map(
     assert calls
 
 
-def test_one_pillar(make_plan, tmp_path):
-    for suffix, options in FORMS:
-        plan = make_plan(np.ones((1, 1), np.uint8))
-        assert (
-            layout.compare(
-                plan, READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))
-            ).pillars
-            == 1
-        )
-
-
-def test_all_pillars_alike(make_plan, tmp_path):
-    plan = make_plan(np.full((50, 70), 3, np.uint8))
-    for suffix, options in FORMS:
-        content = READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))
-        assert {k: len(x) for k, (x, _) in content.places("LENS").items()} == {
-            plan.classes[2].name: 3500
-        }
-
-
 @pytest.mark.parametrize("count", [3000, pytest.param(65535, marks=pytest.mark.slow)])
 def test_thousands_of_classes(tmp_path, count):
     outline = np.array(

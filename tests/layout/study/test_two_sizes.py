@@ -2,7 +2,6 @@
 derivatives by differences.
 """
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -10,12 +9,12 @@ import pytest
 
 from layout.mask import fields
 from layout.process.process import Process, WriteField
-from layout.study import focus, page, pillars, stitching, tolerance
+from layout.study import focus, page, stitching, tolerance
 from layout.study.spread_model import reduce_spread, reduction_error
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.report import Table
-from metalens.fabrication import ResponseRates, Spread, State, draw_lenses
+from metalens.fabrication import ResponseRates, Spread, draw_lenses
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from tests.referees import plain_sum
 
@@ -125,32 +124,6 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
         exact = plain_sum.field(lens, np.where(wide > 0, t, 0), where)
         assert abs(seen - exact).max() < 2.5e-3 * abs(exact).max()
     assert reduction_error(model, lenses) < 2e-3
-
-
-def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
-    """Phase and level are polynomials of second order: over 5 nm beyond both ends their
-    curvature is below 1e-3.
-    """
-    lens = two_sizes()
-    corner = dataclasses.replace(told(lens), sizes_um=np.array([[0.3, 0.12]]))
-    corner = dataclasses.replace(corner, rates=np.zeros((3, 1)))
-    few = DiameterMap(
-        np.array([[0.3, 0.3], [0.0, 0.3]]),
-        0.4,
-        length_um=np.array([[0.12, 0.12], [0.0, 0.12]]),
-    )
-    kind, count, made = pillars.classify_pillars(
-        dataclasses.replace(lens, diameters=few), corner
-    )
-    assert kind.tolist() == [[1, 1], [0, 1]]
-    assert count.tolist() == [3]
-    found = made.curve(np.array([-0.005, 0.0, 0.005]), State.of())[:, 0]
-    assert found == pytest.approx(
-        formula(
-            0.3 + np.array([-5e-3, 0, 5e-3]), 0.12 + np.array([-5e-3, 0, 5e-3]), "x"
-        ),
-        abs=1e-3,
-    )
 
 
 def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):

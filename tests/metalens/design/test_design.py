@@ -234,22 +234,6 @@ def test_field_is_limited_by_coma_as_in_third_order_theory():
     assert design.field_angle(focus, radius) == pytest.approx(want, rel=0.1)
 
 
-def test_a_lens_file_comes_back(proxy, tmp_path):
-    made, _ = _make(proxy)
-    lens.save(tmp_path / "lens.h5", made)
-    back = lens.load(tmp_path / "lens.h5")
-    np.testing.assert_array_equal(
-        back.diameters.diameter_um, made.diameters.diameter_um
-    )
-    assert back.cell == made.cell
-    assert (back.wavelength_um, back.sensor_distance_um, back.source_distance_um) == (
-        0.85,
-        2000.0,
-        20_000.0,
-    )
-    np.testing.assert_array_equal(back.phase_rad(), made.phase_rad())
-
-
 @pytest.mark.parametrize(
     ("bad", "place"),
     [(np.nan, "row 2, column 3"), (-0.1, "row 2"), (0.35, "0.35"), (np.inf, "inf")],

@@ -23,11 +23,6 @@ U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
 COUNT = len(perturbations.names_of_kind(ResponseError))
 
 
-def answering(*first):
-    """Amounts of the answering causes, the first of them these and the rest 0."""
-    return np.array([*first, *[0.0] * (COUNT - len(first))])
-
-
 def test_biases_over_the_lens_by_hand():
     """10, -4, 7, 3, 2, -5 nm of: all, x, y, bow, saddle, oblique saddle; in um at three
     places off every axis.
@@ -207,32 +202,6 @@ class Line:
 
     def dtransmission_ddiameter(self, d, wavelength, angle=0.0):
         return np.full_like(d, -1.0)
-
-
-def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
-    d = np.array([0.05, 0.2, 0.36, 1.2, -0.3])
-    phase = (
-        np.array(
-            [
-                7 * 0.1 + 20 * 0.01 - 0.05 * 11,
-                7 * 0.2 + 20 * 0.04,
-                7 * 0.3 + 1.8 + 0.06 * 19,
-            ]
-        )
-        + 0.1
-    )
-    level = np.array([0.85, 0.7, 0.54])
-    got = response.designed_transmission(Line(), d, 0.85, angle_rad=0.1)
-    assert got[:3] == pytest.approx(level * np.exp(1j * phase), rel=1e-12)
-    assert np.abs(got[3:]) == pytest.approx(
-        [1e-3, 1], abs=1e-12
-    )  # held within 0.001 and 1
-    rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
-    response_ = Sensitivity(rows, 0.2)
-    changed = response.perturbed_transmission(
-        Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1
-    )
-    assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():

@@ -71,33 +71,6 @@ def test_a_ray_with_its_series_is_the_sum_of_all_plane_waves(
     assert abs(alone * (1 + 1j / turns) / want - 1) > 1e-5
 
 
-def test_one_medium_needs_no_series():
-    """d/(2πr²)(1/r - ik) exp(ikr) is exact: by the definition, 1 + i/(kL)."""
-    k, behind = 2 * math.pi / 0.85, Media((1.37,), (42.0,))
-    found = saddle_correction(behind, k, 60.0)
-    assert found.at(0.5) == (1.0, 0.0)
-    assert (found.rarest, found.middle + found.half) == pytest.approx(
-        (1.37, 1.37), rel=1e-14
-    )
-    assert found.error(np.array([0.5])) < 1e-27  # exact
-    assert [part.tolist() for part in found.at(np.array([0.5, 0.7]))] == [
-        [1.0, 1.0],
-        [0.0, 0.0],
-    ]
-    w = np.array([0.0, 0.2, 0.9])
-    want = 1 + 1j / (k * 1.37**2 * 42.0 / np.sqrt(1.37**2 - w))
-    assert plane_wave_correction(behind, k, w) == pytest.approx(want, rel=1e-13)
-
-
-def test_faces_between_equal_indices_change_nothing():
-    k, w = 2 * math.pi / 0.85, np.array([0.1, 0.4])
-    one = Media((1.3, 1.6), (10.0, 20.0))
-    other = Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0))
-    assert plane_wave_correction(one, k, w) == pytest.approx(
-        plane_wave_correction(other, k, w), rel=1e-13
-    )
-
-
 def test_the_error_is_told_where_films_are_too_thin_for_it():
     """A steep ray through two um: the error is 1e-6 there and the estimate above it, by
     less than a thousand.

@@ -16,13 +16,7 @@ from metalens import library, modal, rcwa
 from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
-from metalens.core.errors import (
-    CellError,
-    ConfigError,
-    DomainError,
-    MaterialError,
-    StoreError,
-)
+from metalens.core.errors import CellError, ConfigError, DomainError, MaterialError
 from metalens.core.report import CommandConsole
 from metalens.library import engines
 from metalens.library.record import DEFAULT_CELL, PillarLibrary, Sweep
@@ -75,29 +69,6 @@ def test_axes_and_record(made):
         dataclasses.replace(made, t=made.t[..., :-1])
     with pytest.raises(DomainError, match="not finite"):
         dataclasses.replace(made, t_error=made.t_error * math.nan)
-
-
-def test_store_round_trip(made, tmp_path):
-    path = tmp_path / "library.h5"
-    full = dataclasses.replace(
-        made, proxy=library.proxy_of(made), notes=("cut at 0.2 um",)
-    )
-    library.save(path, full)
-    again = library.load(path)
-    for name in ("t", "r", "t_error", "energy", "resonances", "diameter_um"):
-        assert np.array_equal(getattr(again, name), getattr(full, name))
-    assert (again.cell, again.sweep, again.polarization, again.notes) == (
-        full.cell,
-        full.sweep,
-        full.polarization,
-        full.notes,
-    )
-    d = np.linspace(*full.proxy.domain_um, 50)
-    assert np.array_equal(
-        library.proxy_of(again).phase_rad(d, 0.85), full.proxy.phase_rad(d, 0.85)
-    )
-    with pytest.raises(StoreError, match="no such file"):
-        library.load(tmp_path / "other.h5")
 
 
 class Interrupted(CommandConsole):

@@ -8,7 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from metalens.core import store
 from metalens.core.errors import DomainError
 from metalens.library.proxy import Proxy
 
@@ -209,15 +208,3 @@ def test_inverse_refuses_what_has_no_single_answer():
         proxy().diameter_um(np.array([0.0, np.nan]), 0.85)
     with pytest.raises(DomainError, match="range inside"):
         proxy().diameter_um(np.array([0.0]), 0.85, within_um=(0.05, 0.2))
-
-
-def test_store_round_trip():
-    p = proxy(power=3)
-    q = store.build_record(Proxy, *store.flatten_record(p), where="a file")
-    assert (q.domain_um, q.wavelengths_um, q.power) == (
-        p.domain_um,
-        p.wavelengths_um,
-        3,
-    )
-    assert (q.max_phase_error_rad, q.max_transmission_error) == (1e-3, 2e-3)
-    assert np.array_equal(q.phase_rad(D, 0.85), p.phase_rad(D, 0.85))

@@ -222,13 +222,6 @@ def test_the_budget_is_kept_in_the_file(tmp_path):
     assert back.total == pytest.approx(math.hypot(back.numerical, 3e-3, 0.02, 0.001))
 
 
-@pytest.mark.parametrize("tolerance", [0.0, -1e-4, math.nan])
-def test_a_tolerance_that_is_not_above_0_is_refused(tolerance):
-    for engine in (psf.psf_stack, propagate.windowed):
-        with pytest.raises(PropagationError, match="tolerance is"):
-            engine(*lens(90.0), **geometry(90.0) | dict(tolerance=tolerance))
-
-
 def test_energies_of_directions_and_depths_compare_through_the_irradiance_of_a_source():
     about = geometry(
         90.0,
@@ -271,23 +264,6 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
         spectrum.read_measured_spectrum([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
     with pytest.raises(PropagationError, match=r"none\.csv: cannot be read"):
         spectrum.read_measured_spectrum([tmp_path / "none.csv"], within_um=(0.8, 0.9))
-
-
-@pytest.mark.parametrize(
-    ("rows", "named"),
-    [
-        ("840,0\nnan,0.5\n850,1\n860,0\n", "line 3 is 'nan,0.5'"),
-        ("840,0\n845,nan\n860,0\n", "line 3 is '845,nan'"),
-        ("840,0\n850,1\n860,-0.001\n", "line 4 is '860,-0.001'.* set what noise"),
-        ("0.84,0\n0.85,1\n0.86,0\n", "line 2 is '0.84,0'.* convert micrometres"),
-        ("840,0\n850,1\n850,2\n", "850 nm stands twice"),
-        ("850,1\n", "1 rows, need two or more.* wavelengths_nm"),
-    ],
-)
-def test_rows_of_a_spectrum_that_are_none_are_named(tmp_path, rows, named):
-    (tmp_path / "led.csv").write_text("nm,power\n" + rows)
-    with pytest.raises(PropagationError, match=rf"led\.csv: {named}"):
-        spectrum.read_measured_spectrum([tmp_path / "led.csv"], within_um=(0.8, 0.9))
 
 
 def test_light_of_a_diode_beyond_the_library_is_told():

@@ -15,7 +15,6 @@ from metalens.core.errors import PropagationError, StoreError
 from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
-K = 2 * np.pi / 0.85
 GEOMETRY = dict(
     pitch_um=0.4,
     wavelength_um=0.85,
@@ -69,45 +68,6 @@ def test_angles_make_an_axis_and_equal_single_angles():
     assert several.intensity[1] == pytest.approx(
         one.intensity, abs=1e-12
     )  # of sum 1: rounding of angles side by side
-
-
-def test_field_along_x_and_y_are_transposed():
-    phase, level = focus()
-    along_x, along_y = (
-        psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=a).intensity
-        for a in ((0.3, 0), (0, 0.3))
-    )
-    assert np.abs(along_x - along_y.swapaxes(1, 2)).max() < 1e-4 * along_x.max()
-
-
-def test_wavelengths_add_incoherently_with_their_weights():
-    phase, level = focus()
-    waves, weights = [0.84, 0.86], [1.0, 3.0]
-    other = GEOMETRY | dict(wavelength_um=waves)
-    both = psf.psf_stack(
-        np.stack([phase, phase]),
-        level,
-        **other,
-        **WINDOW,
-        weights=weights,
-        tolerance=1e-6,
-    )
-    want = 0
-    for wave, weight in zip(waves, (0.25, 0.75), strict=True):
-        one = psf.psf_stack(
-            phase,
-            level,
-            **GEOMETRY | dict(wavelength_um=wave),
-            **WINDOW,
-            tolerance=1e-6,
-        )
-        want = want + weight * one.intensity * one.energy_um2[:, None, None]
-    want /= want.sum((1, 2), keepdims=True)
-    assert np.abs(both.intensity - want).max() < 1e-8
-    with pytest.raises(PropagationError, match="weight"):
-        psf.psf_stack(np.stack([phase, phase]), level, **other, **WINDOW, weights=[1.0])
-    with pytest.raises(PropagationError, match="wavelength, y, x"):
-        psf.psf_stack(phase, level, **other, **WINDOW)
 
 
 def test_torch_in_torch_out_and_dtype_follows():
