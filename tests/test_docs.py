@@ -90,23 +90,6 @@ def test_the_reference_of_the_checkout_is_that_of_the_code():
         )
 
 
-@pytest.mark.parametrize(
-    ("name", "row"),
-    [
-        (
-            "DESIGN.toml",
-            "| `aperture_mm` | number | `1.0` | diameter of the round aperture, up to 10 |",
-        ),
-        (
-            "PSF.toml",
-            "| `tolerance` | number | `0.0001` | relative L2 error of the PSFs |",
-        ),
-    ],
-)
-def test_a_settings_page_shows_a_key_with_kind_default_and_text(name, row):
-    assert row in _site().settings_page(name).splitlines()
-
-
 def test_every_key_of_every_settings_page_has_a_text():
     for name in _site().SETTINGS:
         page = _site().settings_page(name)
@@ -256,24 +239,3 @@ def test_the_reference_holds_what_the_packages_show():
         assert {
             f"{package}.{one}" for one in dir(importlib.import_module(package))
         } <= named
-
-
-def test_fields_and_roles_of_docstrings_are_set_as_lists_and_links():
-    griffe = pytest.importorskip("griffe")
-    extensions = griffe.load_extensions(str(ROOT / "docs" / "site" / "docstrings.py"))
-    film = griffe.load(
-        "metalens.cell.record", search_paths=[str(ROOT)], extensions=extensions
-    )["Film"]
-    assert "Attributes:\n    material: a name, a file" in film.docstring.value
-    assert film.docstring.value.startswith("A homogeneous layer")
-    maker = griffe.load(
-        "metalens.design.assign", search_paths=[str(ROOT)], extensions=extensions
-    )["make"]
-    assert (
-        "[`phase_of`]" not in maker.docstring.value
-    )  # a bare name is no place of the reference
-    assert ":func:" not in maker.docstring.value
-    stack = griffe.load(
-        "metalens.psf.lens_psfs", search_paths=[str(ROOT)], extensions=extensions
-    )["View"]
-    assert "[`metalens.psf.psf_stack`][metalens.psf.psf_stack]" in stack.docstring.value

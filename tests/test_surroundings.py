@@ -2,7 +2,6 @@
 with its manifest.
 """
 
-import errno
 import json
 import os
 import signal
@@ -13,30 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from metalens import cli
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.core import store, transaction
-from metalens.core.errors import OutputError
+from metalens.core import transaction
 
 ROOT = Path(__file__).parents[1]
-
-
-def test_without_a_place_to_write_compiled_loops_go_to_temporary_files(monkeypatch):
-    """Where neither the installation nor the home can be written; where one can,
-    numba's own choice stands.
-    """
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(cli.os, "access", lambda path, mode: False)
-    assert main(["info", "absent.h5"]) == BAD_INPUT
-    chosen = Path(os.environ["NUMBA_CACHE_DIR"])
-    assert chosen.is_dir()
-    chosen.rmdir()
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    monkeypatch.setattr(
-        cli.os, "access", lambda path, mode: path == os.path.expanduser("~")
-    )
-    main(["info", "absent.h5"])
-    assert "NUMBA_CACHE_DIR" not in os.environ
 
 
 def test_compiled_loops_of_a_read_only_copy_run_without_a_home(tmp_path):
@@ -102,46 +81,6 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing_but_its_journal(tmp_p
     )  # by where it was
 
 
-class _Interrupted:
-    """What Python drops the exceptions of."""
-
-    def __del__(self):
-        raise KeyboardInterrupt
-
-
-def _dropped_and_waiting():
-    _Interrupted()
-    signal.pause()
-
-
-def test_an_interrupt_that_python_drops_comes_again(monkeypatch):
-    """It may come inside a callback of an import, or a finaliser; other dropped
-    exceptions go where they went.
-    """
-    others = []
-    monkeypatch.setattr(sys, "unraisablehook", others.append)
-    before = signal.getsignal(signal.SIGALRM)
-    assert main(["info", "absent.h5"]) == BAD_INPUT
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            _dropped_and_waiting()
-    finally:
-        signal.signal(signal.SIGALRM, before)
-    assert not others
-
-
-def test_an_interrupt_before_the_work_is_one_line_too(monkeypatch, capsys):
-    def interrupted():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "_prepare", interrupted)
-    assert main(["info", "absent.h5"]) == cli.INTERRUPTED == 130
-    assert (
-        capsys.readouterr().err
-        == "metalens: error: interrupted before the work began\n"
-    )
-
-
 WORDS = f"{sys.executable} -m metalens info ."
 
 
@@ -175,20 +114,6 @@ def test_a_standard_stream_that_is_closed_full_or_left_is_no_traceback(
         words, cwd=_made(tmp_path), capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (status, told)
-
-
-def test_a_command_in_a_folder_that_was_removed_is_refused(tmp_path):
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    words = f"rmdir {gone} && {sys.executable} -m metalens info absent.h5"
-    done = subprocess.run(
-        words, shell=True, cwd=gone, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == BAD_INPUT
-    assert (
-        done.stderr
-        == "metalens: error: the current folder does not exist any more; change to another\n"
-    )
 
 
 def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
@@ -249,26 +174,3 @@ def test_a_pipe_in_place_of_an_artefact_is_refused_not_waited_for(
     assert main([*words.split(), "pipe.h5", *output]) == BAD_INPUT
     assert "pipe.h5: no plain file (a pipe or a device)" in capsys.readouterr().err
     assert os.listdir() == ["pipe.h5"]
-
-
-def test_an_output_that_cannot_be_made_is_named_with_the_cause(
-    tmp_path, monkeypatch, capsys
-):
-    """Not the lock beside it: its user never heard of that."""
-    monkeypatch.chdir(tmp_path)
-
-    def refused(target):
-        raise OSError(errno.EROFS, "Read-only file system", str(target))
-
-    (tmp_path / "library.h5").touch()
-    inside = tmp_path / "library.h5" / "out.h5"
-    for target, found in (
-        (
-            tmp_path / "out.h5",
-            "out.h5: its folder cannot be written .Read-only file system.; give another",
-        ),
-        (inside, "out.h5: folder .*library.h5 is a file: give another name"),
-    ):
-        monkeypatch.setattr(store, "hold_lock", refused)
-        with pytest.raises(OutputError, match=found), transaction.claim_file(target):
-            pass
