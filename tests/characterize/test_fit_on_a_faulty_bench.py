@@ -53,6 +53,7 @@ def stating(capture, **about):
     return dataclasses.replace(capture, about={**capture.about, **about})
 
 
+@pytest.mark.slow
 def test_read_noise_of_dark_frames_counts_where_the_gain_is_stated():
     """Chi-square of 1500 pixels scatters by 0.04; with 2 e for 7.3 it would be 1.6."""
     capture = stating(seen(read_noise_e=READ_NOISE_E, peak_e=1500.0), gain_e=3.7)
