@@ -35,7 +35,6 @@ from metalens.fabrication import (
     proxy_sensitivity,
     solved_rates,
 )
-from metalens.fabrication import response as response_module
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.rcwa import jones
@@ -77,7 +76,6 @@ def lens():
 def response(lens):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solved_rates, "_TRUNCATIONS", (5, HARMONICS))
-        patch.setattr(response_module, "_NODES", 6)  # of a polynomial of degree 5
         return proxy_sensitivity(lens)
 
 
