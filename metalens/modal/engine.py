@@ -16,13 +16,7 @@ from metalens.modal.layer import (
     layer_modes,
     layer_pencil,
 )
-from metalens.modal.match import (
-    HalfSpace,
-    few_scattering,
-    half_space,
-    scattering_matrix,
-    zero_order,
-)
+from metalens.modal.match import HalfSpace, half_space, scattering_matrix, zero_order
 from metalens.modal.mesh import MeshPlan, assemble_disc
 from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
 
@@ -123,13 +117,13 @@ def scatter_layer(
         magnetic: the form. loss: as in :func:`solve_on_mesh`.
     """
     medium = LayerMedium(case.k0, case.disc, case.around)
+    layer = None
     if foot.lossless and top.lossless and is_lossless(medium):
         pencil = layer_pencil(b, medium, magnetic=magnetic)
-        modes = few_modes(pencil, case.height, weak=loss)
-        if modes is not None:
-            return few_scattering(pencil, modes, case.height, foot, top), magnetic
-    layer = layer_modes(b, medium, magnetic=magnetic)
-    return scattering_matrix(layer, case.height, foot, top), False
+        layer = few_modes(pencil, case.height, weak=loss)
+    if layer is None:
+        layer = layer_modes(b, medium, case.height, magnetic=magnetic)
+    return scattering_matrix(layer, case.height, foot, top), layer.dual
 
 
 def solve_form(

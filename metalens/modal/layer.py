@@ -10,6 +10,9 @@ import scipy.linalg as sl
 
 from metalens.modal.spaces import HomogeneousBasis
 
+# modes that decay below this over the height cannot change a result of double precision
+CARRY = 1e-13
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerMedium:
@@ -30,15 +33,32 @@ class LayerMedium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerModes:
-    """Fields and partners of the layer modes, with one scale for each column of both.
+    """Modes that carry light over a layer, and the admittance of the layer without end.
 
-    q: (n,) axial wavenumbers, decaying or going up. field: (n, n) w. partner: (n, n)
-    growth w.
+    q: (c,) axial wavenumbers, decaying or going up. field, partner: (n, c) in the
+        coordinates of the layer, partner = growth field.
+    near: (n, n) admittance, with ``near_rate`` (c,) in place of i q for the modes that
+        carry; real where the layer is lossless.
+    turn: (n, n) fields of the coordinates in the homogeneous basis, block-diagonal
+        from ``te_count`` on. dual: whether the unknown is the partner.
     """
 
     q: np.ndarray
     field: np.ndarray
     partner: np.ndarray
+    near: np.ndarray
+    near_rate: np.ndarray
+    turn: np.ndarray
+    te_count: int
+    dual: bool
+
+    def congruence(self, diagonal: np.ndarray) -> np.ndarray:
+        """turnᵀ diagonal turn (n, n) of a ``diagonal`` (n,)."""
+        a = self.te_count
+        blocks = (slice(a), slice(a, None))
+        turns = [(self.turn[block, block], diagonal[block]) for block in blocks]
+        parts = [turn.T @ (d[:, None] * turn) for turn, d in turns]
+        return np.asarray(sl.block_diag(*parts))
 
 
 def axial_wavenumber(square: np.ndarray) -> np.ndarray:
@@ -51,9 +71,10 @@ def axial_wavenumber(square: np.ndarray) -> np.ndarray:
 
 
 def layer_modes(
-    basis: HomogeneousBasis, medium: LayerMedium, *, magnetic: bool
+    basis: HomogeneousBasis, medium: LayerMedium, height: float, *, magnetic: bool
 ) -> LayerModes:
-    """All layer modes, stiffness w = -q^2 growth w, by a dense eigensolver.
+    """All layer modes, stiffness w = -q^2 growth w, by a dense eigensolver; they are
+    the coordinates.
 
     Electric form, u = E_t: growth = diag(1, (1 - scalar_eps^-1 tm / k0^2)^-1), stiffness
     = curl - k0^2 mass_eps. Magnetic form, u = H_t: growth = (mass_(1/eps)^-1 - diag(0,
@@ -62,7 +83,7 @@ def layer_modes(
 
     Args:
         basis: homogeneous modes. medium: wavenumber and permittivities.
-        magnetic: the form.
+        height: in half pitches. magnetic: the form.
     """
     disc, around = medium.permittivities()
     n, a, k2 = basis.size, len(basis.te), medium.k0**2
@@ -90,10 +111,18 @@ def layer_modes(
     value, vectors = np.linalg.eig(
         level[:, None] * np.linalg.solve(balanced, level[:, None] * growth)
     )
+    q = axial_wavenumber(-1 / value)
+    carry = np.flatnonzero(np.abs(np.exp(1j * q * height)) > CARRY)
+    norm = vectors.T @ growth @ vectors
     return LayerModes(
-        axial_wavenumber(-1 / value),
+        q[carry],
+        np.eye(n)[:, carry],
+        norm[:, carry],
+        1j * q * norm,
+        1j * q[carry],
         vectors / scaling[:, None],
-        scaling[:, None] * (growth @ vectors),
+        n,
+        dual=False,
     )
 
 
@@ -126,14 +155,6 @@ class LayerPencil:
     turn: np.ndarray
     te_count: int
     dual: bool
-
-    def congruence(self, diagonal: np.ndarray) -> np.ndarray:
-        """turnᵀ diagonal turn (n, n) of a ``diagonal`` (n,)."""
-        a = self.te_count
-        blocks = (slice(a), slice(a, None))
-        turns = [(self.turn[block, block], diagonal[block]) for block in blocks]
-        parts = [turn.T @ (d[:, None] * turn) for turn, d in turns]
-        return np.asarray(sl.block_diag(*parts))
 
 
 def is_lossless(medium: LayerMedium) -> bool:
@@ -206,22 +227,6 @@ def layer_pencil(
     upper, lower = te_sign[:, None] * coupling, tm_sign[:, None] * coupling.T
     square = np.block([[te_block, upper], [lower, tm_block]])
     return LayerPencil(square, sign, sl.block_diag(te_turn, tm_turn), a, dual=magnetic)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FewModes:
-    """Modes that carry, in the coordinates y of the pencil, and the rest.
-
-    q: (c,) axial wavenumbers. field, partner: (n, c), partner = growth field.
-    near: (n, n) real admittance of the layer without end, with ``near_rate`` in place
-        of i q for the modes that carry.
-    """
-
-    q: np.ndarray
-    field: np.ndarray
-    partner: np.ndarray
-    near: np.ndarray
-    near_rate: float
 
 
 def carrying_modes(
@@ -339,7 +344,7 @@ def matrix_root(
     return np.asarray(correction.take(back, 0).take(back, 1))
 
 
-def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | None:
+def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> LayerModes | None:
     """Modes of a layer that carry light over its height, and the admittance of the
     rest; None where they are not few.
 
@@ -358,10 +363,13 @@ def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | 
     root = matrix_root(others, pencil.sign, common, weak)
     if root is None:
         return None
-    return FewModes(
+    return LayerModes(
         axial_wavenumber(-value),
         field,
         partner,
         -pencil.sign[:, None] * root,
-        -math.sqrt(common),
+        np.full(len(value), -math.sqrt(common)),
+        pencil.turn,
+        pencil.te_count,
+        pencil.dual,
     )

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.modal.case import Films
-from metalens.modal.layer import FewModes, LayerModes, LayerPencil, axial_wavenumber
+from metalens.modal.layer import LayerModes, axial_wavenumber
 from metalens.modal.spaces import HomogeneousBasis
 
 # relative distance of k² from its cutoff within which an order takes its exact
 # wavenumber
 NEAR = 0.4
 KNOWN = 0.02  # relative error of k² up to which a mode of the mesh counts as an order
-# modes that decay below this over the height cannot change a result of double precision
-CARRY = 1e-13
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -160,83 +158,47 @@ class LayerInterface:
     back: np.ndarray
 
 
-def interface_blocks(
-    green: np.ndarray, norm: np.ndarray, rate: np.ndarray, half: HalfSpace
-) -> LayerInterface:
-    """Blocks of an interface from G = columns^T (Y_layer + Y_half)^-1 columns, with the
-    partners of the carrying modes and the ports as columns.
+def layer_interface(layer: LayerModes, half: HalfSpace) -> LayerInterface:
+    """Scattering at a half-space, from G = columns^T (Y_layer + Y_half)^-1 columns, with
+    the partners of the carrying modes and the ports as columns.
+
+    Of a lossless layer a real operator is solved first, with real stand-ins for the
+    travelling waves. The Woodbury identity then replaces them by the complex values.
 
     Args:
-        green: (carry + ports, carry + ports) G. norm: (carry, carry) partners with
-            fields.
-        rate: (carry,) i q. half: the half-space.
+        layer: its modes. half: the half-space.
     """
-    carry_count, transfer = len(rate), half.transfer
-    weight = 2 * np.concatenate([rate, transfer])
-    arriving = np.linalg.solve(norm, green[:carry_count]) * weight
-    leaving = transfer[:, None] * green[carry_count:] * weight
-    return LayerInterface(
-        reflect=arriving[:, :carry_count] - np.eye(carry_count),
-        enter=arriving[:, carry_count:],
-        leave=leaving[:, :carry_count],
-        back=leaving[:, carry_count:] + np.diag(half.reflection),
+    half = half.dual if layer.dual else half
+    ports, rate, norm = half.ports, 1j * layer.q, layer.partner.T @ layer.field
+    admittance = (
+        half.real_admittance(dual=layer.dual)
+        if np.isrealobj(layer.near)
+        else half.admittance
     )
-
-
-def layer_interface(
-    layer: LayerModes, carry: np.ndarray, half: HalfSpace
-) -> LayerInterface:
-    """Scattering at a half-space, from all modes of the layer.
-
-    Args:
-        layer: modes. carry: places of those that travel. half: the half-space.
-    """
-    rate = 1j * layer.q
-    columns = np.concatenate(
-        [layer.partner[:, carry], np.eye(len(half.admittance))[:, half.ports]], 1
-    )
-    inward = np.linalg.solve(
-        layer.partner * rate + half.admittance[:, None] * layer.field, columns
-    )
-    green = columns.T @ (layer.field @ inward)
-    norm = columns[:, : len(carry)].T @ layer.field[:, carry]
-    return interface_blocks(green, norm, rate[carry], half)
-
-
-def few_interface(
-    pencil: LayerPencil, modes: FewModes, half: HalfSpace
-) -> LayerInterface:
-    """Scattering at a half-space, from the carrying modes and a real admittance of all
-    others.
-
-    A real operator is solved first, with real stand-ins for the travelling waves. The
-    Woodbury identity then replaces the stand-ins by the complex values.
-
-    Args:
-        pencil: of the layer. modes: those that carry. half: the half-space.
-    """
-    half = half.dual if pencil.dual else half
-    stand_in, ports = half.real_admittance(dual=pencil.dual), half.ports
-    carry_count = len(modes.q)
-    operator = modes.near + pencil.congruence(stand_in)
-    columns = np.concatenate([modes.partner, pencil.turn[ports].T], 1)
+    columns = np.concatenate([layer.partner, layer.turn[ports].T], 1)
+    operator = layer.near + layer.congruence(admittance)
     green = columns.T @ solve_real(operator, columns)
-    norm = modes.partner.T @ modes.field
-    rate = 1j * modes.q
-    correction = np.zeros((carry_count + len(ports), carry_count + len(ports)), complex)
-    correction[:carry_count, :carry_count] = np.linalg.solve(
-        norm.T, np.diag(rate - modes.near_rate)
+    count = len(rate)
+    correction = np.zeros(green.shape, complex)
+    correction[:count, :count] = np.linalg.solve(
+        norm.T, np.diag(rate - layer.near_rate)
     ).T
-    correction[carry_count:, carry_count:] = np.diag(
-        half.admittance[ports] - stand_in[ports]
+    correction[count:, count:] = np.diag((half.admittance - admittance)[ports])
+    green = green @ np.linalg.inv(np.eye(len(green)) + correction @ green)
+    weight = 2 * np.concatenate([rate, half.transfer])
+    arriving = np.linalg.solve(norm, green[:count]) * weight
+    leaving = half.transfer[:, None] * green[count:] * weight
+    return LayerInterface(
+        reflect=arriving[:, :count] - np.eye(count),
+        enter=arriving[:, count:],
+        leave=leaving[:, :count],
+        back=leaving[:, count:] + np.diag(half.reflection),
     )
-    green = green @ np.linalg.inv(np.eye(carry_count + len(ports)) + correction @ green)
-    return interface_blocks(green, norm, rate, half)
 
 
 def solve_real(operator: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """operator^-1 columns of a real operator, for columns that may be complex."""
-    if not np.iscomplexobj(columns):
+    """operator^-1 columns, in real arithmetic where the operator is real."""
+    if np.iscomplexobj(operator) or np.isrealobj(columns):
         return np.linalg.solve(operator, columns)
     parts = np.linalg.solve(operator, np.concatenate([columns.real, columns.imag], 1))
     count = columns.shape[1]
@@ -246,35 +208,14 @@ def solve_real(operator: np.ndarray, columns: np.ndarray) -> np.ndarray:
 def scattering_matrix(
     layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
 ) -> np.ndarray:
-    """Scattering matrix of a layer between half-spaces, from all its modes, over the
-    ports of both sides, below first: symmetric, and unitary where lossless.
+    """Scattering matrix of a layer between half-spaces, over the ports of both sides,
+    below first: symmetric, and unitary where lossless.
 
     Args:
-        layer: modes. height: of the layer. below, above: half-spaces.
+        layer: its modes. height: of the layer. below, above: half-spaces.
     """
-    travel = np.exp(1j * layer.q * height)
-    carry = np.flatnonzero(np.abs(travel) > CARRY)
-    return join_interfaces(
-        layer_interface(layer, carry, below),
-        layer_interface(layer, carry, above),
-        travel[carry],
-    )
-
-
-def few_scattering(
-    pencil: LayerPencil,
-    modes: FewModes,
-    height: float,
-    below: HalfSpace,
-    above: HalfSpace,
-) -> np.ndarray:
-    """As :func:`scattering_matrix`, from the few modes that carry.
-
-    Args:
-        pencil, modes: of the layer. height: of the layer. below, above: half-spaces.
-    """
-    foot, top = (few_interface(pencil, modes, half) for half in (below, above))
-    return join_interfaces(foot, top, np.exp(1j * modes.q * height))
+    foot, top = (layer_interface(layer, half) for half in (below, above))
+    return join_interfaces(foot, top, np.exp(1j * layer.q * height))
 
 
 def join_interfaces(
