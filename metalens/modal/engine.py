@@ -9,13 +9,7 @@ import numpy as np
 from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
 from metalens.modal.case import ModalCase
-from metalens.modal.layer import (
-    LayerMedium,
-    few_modes,
-    is_lossless,
-    layer_modes,
-    layer_pencil,
-)
+from metalens.modal.layer import few_modes, is_lossless, layer_modes, layer_pencil
 from metalens.modal.match import HalfSpace, half_space, scattering_matrix, zero_order
 from metalens.modal.mesh import MeshPlan, assemble_disc
 from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
@@ -116,13 +110,12 @@ def scatter_layer(
         case: the problem. b: homogeneous modes. foot, top: half-spaces.
         magnetic: the form. loss: as in :func:`solve_on_mesh`.
     """
-    medium = LayerMedium(case.k0, case.disc, case.around)
     layer = None
-    if foot.lossless and top.lossless and is_lossless(medium):
-        pencil = layer_pencil(b, medium, magnetic=magnetic)
+    if foot.lossless and top.lossless and is_lossless(case):
+        pencil = layer_pencil(b, case, magnetic=magnetic)
         layer = few_modes(pencil, case.height, weak=loss)
     if layer is None:
-        layer = layer_modes(b, medium, case.height, magnetic=magnetic)
+        layer = layer_modes(b, case, magnetic=magnetic)
     return scattering_matrix(layer, case.height, foot, top), layer.dual
 
 

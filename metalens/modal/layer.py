@@ -8,27 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
+from metalens.modal.case import ModalCase
 from metalens.modal.spaces import HomogeneousBasis
 
 # modes that decay below this over the height cannot change a result of double precision
 CARRY = 1e-13
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LayerMedium:
-    """Numbers of one case in half pitches: k0 and the permittivities of disc and
-    surroundings.
-    """
-
-    k0: float
-    disc: complex
-    around: complex
-
-    def permittivities(self) -> tuple[complex, complex]:
-        """Both, as real numbers where neither absorbs: the arithmetic stays real."""
-        if self.disc.imag == 0 and self.around.imag == 0:
-            return self.disc.real, self.around.real
-        return self.disc, self.around
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -71,7 +55,7 @@ def axial_wavenumber(square: np.ndarray) -> np.ndarray:
 
 
 def layer_modes(
-    basis: HomogeneousBasis, medium: LayerMedium, height: float, *, magnetic: bool
+    basis: HomogeneousBasis, case: ModalCase, *, magnetic: bool
 ) -> LayerModes:
     """All layer modes, stiffness w = -q^2 growth w, by a dense eigensolver; they are
     the coordinates.
@@ -82,12 +66,14 @@ def layer_modes(
     sqrt(tm).
 
     Args:
-        basis: homogeneous modes. medium: wavenumber and permittivities.
-        height: in half pitches. magnetic: the form.
+        basis: homogeneous modes. case: wavenumber, height and permittivities.
+        magnetic: the form.
     """
-    disc, around = medium.permittivities()
-    n, a, k2 = basis.size, len(basis.te), medium.k0**2
-    scale = medium.k0 / np.sqrt(basis.tm)
+    disc, around = case.disc, case.around
+    if disc.imag == around.imag == 0:  # the arithmetic stays real
+        disc, around = disc.real, around.real
+    n, a, k2 = basis.size, len(basis.te), case.k0**2
+    scale = case.k0 / np.sqrt(basis.tm)
     scaling = np.concatenate([np.ones(a), scale])
     tm = np.arange(a, n)
     if magnetic:
@@ -112,7 +98,7 @@ def layer_modes(
         level[:, None] * np.linalg.solve(balanced, level[:, None] * growth)
     )
     q = axial_wavenumber(-1 / value)
-    carry = np.flatnonzero(np.abs(np.exp(1j * q * height)) > CARRY)
+    carry = np.flatnonzero(np.abs(np.exp(1j * q * case.height)) > CARRY)
     norm = vectors.T @ growth @ vectors
     return LayerModes(
         q[carry],
@@ -132,9 +118,6 @@ LOW = 32.0  # times the contrast: levels above are not diagonalised
 SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
 ROUNDS = 6  # of enlarging the trial space, at most
 STEPS = 80  # of the fixed point, at most
-# change of the slow rows, over that of the last full step, at which the next follows
-RESUMED = 0.03
-SLOW = 8  # the rows of the lowest eighth of the levels go on alone
 # accuracy of a root in single precision, whose errors matter ten times less, and in
 # double
 ROUGH, ROUNDING = 3e-7, 1e-14
@@ -157,13 +140,11 @@ class LayerPencil:
     dual: bool
 
 
-def is_lossless(medium: LayerMedium) -> bool:
-    """Whether a ``medium`` has positive real permittivities, as the definite blocks
+def is_lossless(case: ModalCase) -> bool:
+    """Whether the layer has positive real permittivities, as the definite blocks
     need.
     """
-    return all(
-        e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around))
-    )
+    return all(e.imag == 0 and e.real > 0 for e in (case.disc, case.around))
 
 
 def diagonalize_low(
@@ -184,7 +165,7 @@ def diagonalize_low(
 
 
 def layer_pencil(
-    basis: HomogeneousBasis, medium: LayerMedium, *, magnetic: bool
+    basis: HomogeneousBasis, case: ModalCase, *, magnetic: bool
 ) -> LayerPencil:
     """Block-diagonalised equation of the layer.
 
@@ -193,11 +174,11 @@ def layer_pencil(
     growth = stiffness^-1, stiffness = mass_(1/eps)^-1 - diag(0, tm / k0^2).
 
     Args:
-        basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
+        basis: homogeneous modes. case: wavenumber and permittivities, lossless.
         magnetic: the form.
     """
-    a, k2 = len(basis.te), medium.k0**2
-    disc, around = (float(e.real) for e in (medium.disc, medium.around))
+    a, k2 = len(basis.te), case.k0**2
+    disc, around = case.disc.real, case.around.real
     if magnetic:
         disc, around = 1 / disc, 1 / around
     contrast = disc - around
@@ -209,7 +190,7 @@ def layer_pencil(
         te_block, te_turn = np.diag(te), te_turn * np.sqrt(np.abs(te))
         tm_block = np.diag(basis.tm) - k2 * weighted[a:, a:]
         tm_block, tm_turn = diagonalize_low(tm_block, k2 * abs(contrast))
-        tm_turn = tm_turn * medium.k0
+        tm_turn = tm_turn * case.k0
         te_sign, tm_sign = np.sign(te), -np.ones(len(basis.tm))
         cross = weighted[:a, a:]
     else:
@@ -275,18 +256,6 @@ def carrying_modes(
     return None
 
 
-def signed_square(e: np.ndarray, mirror: np.ndarray) -> np.ndarray:
-    """e @ e of a matrix e = mirror * eᵀ, whose square is so too: three quarters of the
-    products.
-    """
-    half = len(e) // 2
-    out = np.empty_like(e)
-    out[:half] = e[:half] @ e
-    out[half:, half:] = e[half:] @ e[:, half:]
-    out[half:, :half] = mirror[half:, :half] * out[:half, half:].T
-    return out
-
-
 def matrix_root(
     square: np.ndarray, sign: np.ndarray, least: float, accuracy: float
 ) -> np.ndarray | None:
@@ -294,54 +263,40 @@ def matrix_root(
     iteration does not converge.
 
     X = D + E, D the root of the diagonal. (D_i + D_j) E_ij + (E²)_ij = (X² - D²)_ij is
-    solved by a fixed point, in single precision and, if that is not enough, double. The rows of the lowest levels
-    converge last: they iterate alone until they move by less than a share of the last
-    full step's change.
+    solved by a fixed point, in single precision and, if that is not enough, double.
 
     Args:
         square: X². sign: of growth, with respect to which it is symmetric.
         least: levels of the diagonal below it are raised to it.
         accuracy: relative, of the result.
     """
-    n = len(square)
-    slow = max(1, n // SLOW)
     root = np.sqrt(np.maximum(square.diagonal(), least))
-    order = np.argsort(root)
-    root, sign = root[order], sign[order]
-    mirror = (sign[:, None] * sign).astype(np.float32)
+    mirror = sign[:, None] * sign
     exact_weight = 1 / (root[:, None] + root)
-    exact_offset = square.take(order, 0).take(order, 1) * exact_weight
-    exact_offset.ravel()[:: n + 1] -= root / 2
-    limit = max(accuracy * root[0], ROUNDING * root[-1])
+    exact_offset = square * exact_weight
+    np.fill_diagonal(exact_offset, exact_offset.diagonal() - root / 2)
+    limit = max(accuracy * root.min(), ROUNDING * root.max())
     correction = exact_offset
-    rough = max(limit, ROUGH * root[0])
-    for kind, aim in ((np.float32, rough), (np.float64, limit)):
+    for kind, aim in (
+        (np.float32, max(limit, ROUGH * root.min())),
+        (np.float64, limit),
+    ):
         if kind is np.float64 and accuracy > ROUGH / 10:
             break
         weight, offset = exact_weight.astype(kind), exact_offset.astype(kind)
         e = correction.astype(kind)
-        change = last = first = math.inf
-        for step in range(STEPS):
-            whole = step == 0 or change < max(aim, RESUMED * last)
-            rows = slice(None if whole else slow)
-            product = signed_square(e, mirror) if whole else e[:slow] @ e
-            moved = offset[rows] - weight[rows] * product
-            change = float(np.abs(moved[:slow] - e[:slow]).max())
-            e[rows] = moved
-            if not whole:
-                e[:, :slow] = mirror[:, :slow] * moved.T
-                continue
-            last = change
-            first = min(first, change)
+        change = first = math.inf
+        for _ in range(STEPS):
+            moved = offset - weight * (e @ e)
+            change = float(np.abs(moved - e).max())
+            first, e = min(first, change), moved
             if change < aim or not change <= 2 * first:
                 break
         if not change < aim:
             return None
         # an asymmetry of rounding would lose energy
         correction = ((e + mirror * e.T) / 2).astype(float)
-    correction.ravel()[:: n + 1] += root
-    back = np.argsort(order)
-    return np.asarray(correction.take(back, 0).take(back, 1))
+    return np.asarray(correction + np.diag(root))
 
 
 def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> LayerModes | None:
