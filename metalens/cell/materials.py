@@ -159,7 +159,7 @@ def index(material: record.Material | Material, wavelength_um: float) -> complex
         raise MaterialError(
             f"{constants.name} at {wavelength_um} um: its source holds from {low:.6g} to "
             f"{high:.6g} um ({constants.source}); choose a wavelength inside, another "
-            f"material{_table_hint(constants.name, wavelength_um)}, or plain n and k"
+            "material, or plain n and k"
         )
     k = constants.k.at(wavelength_um) if constants.k else 0.0
     return complex(constants.n.at(wavelength_um), max(0.0, k))
@@ -220,33 +220,6 @@ def _hint(name: str) -> str:
         if suggestion
         else nearest_name_hint(name, NAMES)
     )
-
-
-def _table_hint(name: str, wavelength_um: float) -> str:
-    """Shipped tables of the same substance that hold at a wavelength, in the words of a
-    message.
-    """
-    same_substance = [
-        material
-        for material in NAMES
-        if material != name and _substance(material) == _substance(name)
-    ]
-    ranges = {material: find_material(material).range_um for material in same_substance}
-    in_range = [
-        repr(material)
-        for material, (low, high) in ranges.items()
-        if low <= wavelength_um <= high
-    ]
-    return f" ({' or '.join(in_range)} holds there)" if in_range else ""
-
-
-def _substance(name: str) -> list[str]:
-    """Words of a material's name without phase, axis and process."""
-    return [
-        word
-        for word in name.split("-")
-        if word not in ("a", "c", "o", "e", "rutile", "sputtered", "infrared")
-    ]
 
 
 def _bruggeman(blend: Blend, wavelength_um: float) -> complex:

@@ -13,7 +13,6 @@ from metalens.core.errors import ProcessError
 
 # largest |d bias / d diameter|; above it the fixed-point inverse may not converge
 STEEPEST = 0.5
-_PROBES_NM = np.linspace(10, 2000, 1991)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +22,6 @@ class Bias:
 
     table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond
         the ends.
-    curve_nm: or coefficients c_k of bias = sum c_k (drawn diameter / 100 nm)^k.
     csv: or a file of two columns, drawn diameter and bias in nm, with or without a
         head.
     isolated_nm: what a pillar without neighbours gains beyond one in a full lattice.
@@ -35,7 +33,6 @@ class Bias:
     """
 
     table_nm: tuple[tuple[float, float], ...] = ()
-    curve_nm: tuple[float, ...] = ()
     csv: Path | None = None
     isolated_nm: float = field(default=0.0, metadata={"signed": True})
     range_um: float = 1.0
@@ -46,13 +43,12 @@ class Bias:
         Raises:
             ProcessError: naming the setting.
         """
-        if sum((bool(self.table_nm), bool(self.curve_nm), self.csv is not None)) > 1:
+        if self.table_nm and self.csv is not None:
             raise ProcessError(
-                "bias is given more than once; keep one of table_nm, curve_nm and csv"
+                "bias is given more than once; keep one of table_nm and csv"
             )
         numbers = np.array(
-            [*np.ravel(self.table_nm), *self.curve_nm, self.isolated_nm, self.range_um],
-            float,
+            [*np.ravel(self.table_nm), self.isolated_nm, self.range_um], float
         )
         if not np.isfinite(numbers).all():
             raise ProcessError(
@@ -65,24 +61,11 @@ class Bias:
             raise ProcessError(
                 f"diameters of the bias table must rise and be above 0, got {drawn.tolist()}"
             )
-        self._check_slope()
-
-    def _check_slope(self) -> None:
-        """Refuse a bias whose slope is above 0.5 nm per nm anywhere.
-
-        Raises:
-            ProcessError: with the slope and where it is.
-        """
-        probes = (
-            np.array([pair[0] for pair in self.table_nm])
-            if self.table_nm
-            else _PROBES_NM
-        )
-        slope = np.diff(self.at(probes)) / np.diff(probes)
+        slope = np.diff(self.at(drawn)) / np.diff(drawn)
         if slope.size and abs(slope).max() > STEEPEST:
             at = int(abs(slope).argmax())
             raise ProcessError(
-                f"bias changes by {slope[at]:.2f} nm per nm at {probes[at]:g} nm, need at most {STEEPEST}: "
+                f"bias changes by {slope[at]:.2f} nm per nm at {drawn[at]:g} nm, need at most {STEEPEST}: "
                 "the drawn diameter could not be computed from the fabricated one; check the table"
             )
 
@@ -92,11 +75,6 @@ class Bias:
         if self.table_nm:
             knots, values = np.array(self.table_nm).T
             return np.asarray(np.interp(drawn, knots, values))
-        if self.curve_nm:
-            clipped = np.clip(drawn, _PROBES_NM[0], _PROBES_NM[-1])
-            return np.asarray(
-                np.polynomial.polynomial.polyval(clipped / 100, self.curve_nm)
-            )
         return np.zeros_like(drawn)
 
     def made_nm(self, drawn_nm: Array | float, isolation: Array | float = 0.0) -> Array:

@@ -74,21 +74,15 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     nearly singular (a black layer)
     or the ratio has no principal root.
     """
-    if abs(determinant_2x2(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
+    if abs(np.linalg.det(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
         ratio = np.linalg.solve(first, second)
-        root = cmath.sqrt(determinant_2x2(ratio))
+        root = cmath.sqrt(np.linalg.det(ratio))
         trace = cmath.sqrt(ratio[0, 0] + ratio[1, 1] + 2 * root)
         if abs(trace) > 0.1:
             mean: np.ndarray = (second + root * first) / trace
             return mean
     arithmetic: np.ndarray = (first + second) / 2
     return arithmetic
-
-
-def determinant_2x2(matrix: np.ndarray) -> complex:
-    """Of a 2 x 2 matrix."""
-    (a, b), (c, d) = matrix.tolist()
-    return complex(a * d - b * c)
 
 
 def scatter_layer(

@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.core.errors import CellError
 from metalens.modal.shapes import (
     IntervalBasis,
     SquareBasis,
@@ -301,17 +300,8 @@ def assemble_disc(rho: float, plan: MeshPlan) -> tuple[CellMatrices, CellMatrice
     in half pitches: what a geometry costs once, for all wavelengths; cached.
 
     Args:
-        rho: diameter over pitch. plan: of the mesh.
-
-    Raises:
-        CellError: the disc is not strictly inside the cell: elements between it and the
-            wall would vanish.
+        rho: diameter over pitch, between 0 and 1. plan: of the mesh.
     """
-    if not (math.isfinite(rho) and 0 < rho < 1):
-        raise CellError(
-            f"diameter = {rho:.6g} pitches: the elements that follow the disc need one above 0 and below 1; "
-            "touching pillars are solved by metalens.rcwa"
-        )
     mesh = build_mesh(plan)
     nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
     whole, disc = (

@@ -24,8 +24,7 @@ from metalens.rcwa.basis import (
 )
 from metalens.rcwa.smatrix import FourierModes, film_modes, solve_eigenmodes
 
-Flips = tuple[tuple[int, int], ...]
-FLIPS: Flips = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _GRID = 192  # points along the pitch on which normals are sampled
 _KEPT = 32  # coefficients of normals are cached for a multiple of this many orders
 # distance to a boundary at which the weight w falls to 1/2, over the largest distance
@@ -111,18 +110,13 @@ def permittivity_coefficients(
 
 
 def normal_tables(
-    outlines: tuple[Outline, ...],
-    cell: Cell,
-    reach: tuple[int, int],
-    flips: Flips | None = None,
+    outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]
 ) -> tuple[Array, Array, Array]:
     """Fourier coefficients of the normal field: w nx nx, w ny ny and w nx ny.
 
     Args:
         outlines: whose boundaries count. cell: its lattice.
         reach: orders (m, n); the tables run from -2 reach to 2 reach.
-        flips: mirrors (sx, sy) that outlines and lattice share; None: those that the
-            outlines have.
     """
     radius_um = _disc_radius_um(outlines, cell)
     if radius_um:
@@ -132,9 +126,7 @@ def normal_tables(
         slice(m - 2 * r, m + 2 * r + 1)
         for m, r in zip(sampled_reach, reach, strict=True)
     )
-    tables = _sampled_normals(
-        outlines, cell, (sampled_reach[0], sampled_reach[1]), flips
-    )
+    tables = _sampled_normals(outlines, cell, (sampled_reach[0], sampled_reach[1]))
     xx, yy, xy = (without_rounding(table[rows, columns]) for table in tables)
     return xx, yy, xy
 
@@ -208,10 +200,7 @@ def _radial_field(largest_order: int) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=64)
 def _sampled_normals(
-    outlines: tuple[Outline, ...],
-    cell: Cell,
-    reach: tuple[int, int],
-    flips: Flips | None,
+    outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]
 ) -> tuple[Array, Array, Array]:
     """As :func:`normal_tables`, by the FFT of samples; orders from -reach to reach.
 
@@ -221,7 +210,6 @@ def _sampled_normals(
     Args:
         outlines: whose boundaries count. cell: its lattice.
         reach: orders (m, n).
-        flips: as there.
     """
     x, y = cell.lattice.periods_um(cell.pitch_um)
     counts = [
@@ -237,7 +225,7 @@ def _sampled_normals(
     px, py = px - x * (px > x / 2), py - y * (py > y / 2)
     products, distance = _nearest(outlines, cell, px, py)
     weight = 1 / (1 + (distance / (_FAR * distance.max())) ** 4)
-    mirrors = flips or [
+    mirrors = [
         flip for flip in FLIPS if all(outline.keeps(*flip) for outline in outlines)
     ]
 
@@ -381,7 +369,6 @@ def section_operators(
     waves: PlaneWaves,
     section: PillarSection,
     cell: Cell,
-    flips: Flips | None = None,
     normals: tuple[Outline, ...] | None = None,
 ) -> tuple[Array, Array]:
     """Operators P and Q (see :mod:`metalens.rcwa.basis`) of a section, (n, n) each.
@@ -392,12 +379,11 @@ def section_operators(
     Args:
         space, waves: reduced orders, and the waves made of them.
         section: outlines and permittivities. cell: its lattice.
-        flips: as in :func:`normal_tables`.
         normals: outlines of the normal field; None: those of the section.
     """
     direct, inverse = permittivity_coefficients(section, cell, space.reach)
     outlines = section.outlines if normals is None else normals
-    xx, yy, xy = normal_tables(outlines, cell, space.reach, flips)
+    xx, yy, xy = normal_tables(outlines, cell, space.reach)
     laurent = [toeplitz_matrix(space, direct, link) for link in (EX, EY)]
     excess = [
         matrix - np.linalg.inv(toeplitz_matrix(space, inverse, link))
@@ -443,5 +429,5 @@ def section_modes(
     """
     if not section.outlines:
         return film_modes(waves, complex(np.sqrt(section.outside)), height)
-    P, Q = section_operators(space, waves, section, cell, normals=normals)
+    P, Q = section_operators(space, waves, section, cell, normals)
     return solve_eigenmodes(P, Q, height)

@@ -27,8 +27,6 @@ from metalens.rcwa.permittivity import PillarSection, section_operators
 from metalens.rcwa.smatrix import scatter_zero_order, solve_eigenmodes
 from metalens.rcwa.solver import half_space_indices
 
-_MIRRORED = ((1, 1), (1, -1))  # rows are mirror symmetric in y
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RowResponse:
@@ -144,7 +142,7 @@ def solve_row(
         lattice_frame(supercell, operations),
     )
     waves = plane_waves(space, supercell, light)
-    operators = section_operators(space, waves, slab, supercell, flips=_MIRRORED)
+    operators = section_operators(space, waves, slab, supercell)
     height = 2 * math.pi / wavelength_um * cell.height_um
     substrate, cover = half_space_indices(cell, light)
     zero, sign = waves.zero["xy".index(polarization)]

@@ -85,9 +85,7 @@ def test_the_layout_draws_what_the_table_means(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "text", [OLD, "[bias]\ncurve_nm = [-3.0, 1.5]\n", "", "[bias]\ncsv = 'b.csv'\n"]
-)
+@pytest.mark.parametrize("text", [OLD, "", "[bias]\ncsv = 'b.csv'\n"])
 def test_the_present_bias_is_read_as_the_layout_reads_it(tmp_path, text):
     (tmp_path / "b.csv").write_text("# measured\ndrawn,bias\n90,-4\n200,1\n")
     (tmp_path / "p.toml").write_text(text)

@@ -157,27 +157,6 @@ class Outline:
                 )
         return Outline(tuple(parts))
 
-    def line(self, count: int = 64) -> Array:
-        """(n, 2) one closed line around the solid part, for pictures.
-
-        A cut, run in both directions, joins every hole to the line at the closest
-        corners.
-        It encloses the area of the section (ellipses by ``count`` corners); a mask is
-        drawn from :meth:`polygons`.
-        """
-        joined = self.parts[0].vertices(count)
-        for hole in self.parts[1:]:
-            inner = hole.vertices(count)[::-1]
-            squared_distance = ((joined[:, None] - inner) ** 2).sum(axis=-1)
-            outer_place, inner_place = np.unravel_index(
-                int(squared_distance.argmin()), squared_distance.shape
-            )
-            around = np.roll(inner, -inner_place, axis=0)
-            joined = np.concatenate(
-                [joined[: outer_place + 1], around, around[:1], joined[outer_place:]]
-            )
-        return joined
-
     def boundary(self, step_um: float) -> tuple[Array, Array]:
         """Points (n, 2) on the boundary, spaced by at most ``step_um``, and their unit
         normals, out of the part.

@@ -58,24 +58,6 @@ def test_outside_the_range_is_refused_and_the_range_is_named(name, wavelength_um
         materials.index(name, wavelength_um)
 
 
-@pytest.mark.parametrize(
-    ("name", "wavelength_um", "kin"),
-    [
-        ("Si", 1.55, "'Si-infrared' or 'a-Si'"),
-        ("Ge", 3.0, "'Ge-infrared'"),
-        ("sapphire-e", 7.0, None),
-    ],
-)
-def test_refusal_names_the_tables_of_the_same_substance_that_hold(
-    name, wavelength_um, kin
-):
-    with pytest.raises(MaterialError) as refusal:
-        materials.index(name, wavelength_um)
-    assert f"another material{f' ({kin} holds there)' if kin else ''}, or plain" in str(
-        refusal.value
-    )
-
-
 @pytest.mark.parametrize("wavelength_um", [0.0, -1.0, math.nan, math.inf])
 def test_a_wavelength_that_is_no_length_is_refused(wavelength_um):
     with pytest.raises(MaterialError, match="need a finite length above 0"):

@@ -2,6 +2,8 @@
 limits.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,12 +21,6 @@ def test_table_is_exact_at_its_knots_linear_between_and_constant_beyond():
     bias = Bias(table_nm=TABLE)
     assert bias.at(np.array([80, 120, 100, 20, 500])) == pytest.approx(
         [-6, -3.5, -4.75, -6, 1]
-    )
-
-
-def test_curve_is_the_polynomial_of_the_diameter_in_100_nm():
-    assert Bias(curve_nm=(-8.0, 3.0, -0.2)).at(250.0) == pytest.approx(
-        -8 + 3 * 2.5 - 0.2 * 6.25
     )
 
 
@@ -76,8 +72,7 @@ def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
     [
         ({"table_nm": ((100.0, 0.0), (90.0, 1.0))}, "must rise"),
         ({"table_nm": ((100.0, 0.0), (110.0, 8.0))}, "nm per nm"),
-        ({"curve_nm": (0.0, 80.0)}, "nm per nm"),
-        ({"table_nm": TABLE, "curve_nm": (1.0,)}, "more than once"),
+        ({"table_nm": TABLE, "csv": Path("b.csv")}, "more than once"),
         ({"table_nm": ((100.0, float("inf")),)}, "not finite"),
         ({"range_um": 0.0}, "above 0"),
     ],
@@ -128,11 +123,3 @@ def test_csv_with_head_comments_and_a_bad_line(tmp_path):
         read_csv(empty)
     with pytest.raises(ProcessError, match="cannot be read"):
         read_csv(tmp_path / "absent.csv")
-
-
-def test_a_curve_is_held_beyond_10_and_2000_nm():
-    """A straight one of 3 nm per 100 nm: -7.7 and 52 nm at its ends."""
-    bias = Bias(curve_nm=(-8.0, 3.0))
-    assert bias.at(
-        np.array([4.0, 10.0, 11.0, 1999.0, 2000.0, 2600.0])
-    ) == pytest.approx([-7.7, -7.7, -7.67, 51.97, 52.0, 52.0])

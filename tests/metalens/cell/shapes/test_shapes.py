@@ -197,12 +197,3 @@ def test_walls_bars_holes_and_hollows_are_as_wide_as_they_are(shape, width, spac
         assert cell.size_um(0.08, 0.07) == pytest.approx(
             0.3 * max(0.08 / width, 0.07 / space), rel=1e-3
         )
-
-
-@pytest.mark.parametrize("shape", [*SHAPES, Polygon(U, 0.3)], ids=lambda s: s.kind)
-def test_the_line_around_a_section_for_pictures_encloses_its_area(shape):
-    outline = shape.outline(0.31)
-    x, y = outline.line(48).T
-    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(
-        outline.area_um2, rel=1e-12
-    )
