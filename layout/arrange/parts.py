@@ -235,17 +235,12 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
     def rescaled(old: MaskCell) -> MaskCell:
         placed = old.kept()
         x, y = (scaled(places).astype(np.int32) for places in (placed.x, placed.y))
-        circles = {
-            layer: [tuple(row) for row in scaled(np.array(shapes)).tolist()]
-            for layer, shapes in old.circles.items()
-        }
         return dataclasses.replace(
             old,
             polygons={
                 k: [scaled(points) for points in shapes]
                 for k, shapes in old.polygons.items()
             },
-            circles=circles,
             placed=dataclasses.replace(placed, x=x, y=y),
         )
 
@@ -264,11 +259,8 @@ def moved_cell(
         layers: {old: new} where they change; two that become one are put together.
     """
     polygons: dict[LayerNumber, list[Array]] = {}
-    circles: dict[LayerNumber, list[tuple[int, int, int]]] = {}
     for layer, shapes in cell.polygons.items():
         polygons.setdefault(layers.get(layer, layer), []).extend(shapes)
-    for layer, some in cell.circles.items():
-        circles.setdefault(layers.get(layer, layer), []).extend(some)
     placed = cell.kept()
     pillars = cell.pillars
     if pillars is not None:
@@ -278,7 +270,6 @@ def moved_cell(
         cell,
         name=names[cell.name],
         polygons=polygons,
-        circles=circles,
         placed=dataclasses.replace(
             placed, children=tuple(names[child] for child in placed.children)
         ),

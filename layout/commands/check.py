@@ -8,7 +8,6 @@ from typing import Any
 
 import tyro
 
-from layout.commands.validate import validate_mask
 from layout.drc.klayout import write_lyrdb
 from layout.drc.library import LayerChoice, Metric, check_library
 from layout.drc.report import DrcReport, format_size
@@ -35,8 +34,6 @@ class Options(CommonOptions):
             from corner to corner).
         max_shapes: shapes and cell references that may be expanded, some 100 bytes of
             memory each; omitted: 4 million, and 20 more for each byte of the file.
-        strict: also what readers let pass and a mask shop might not: names of cells,
-            one top cell, doubled vertices, strict tables and the checksum of OASIS.
     """
 
     mask: tyro.conf.Positional[Path]
@@ -46,7 +43,6 @@ class Options(CommonOptions):
     top: str | None = None
     metric: Metric = "projection"
     max_shapes: int | None = None
-    strict: bool = False
 
 
 def run(options: Options) -> int:
@@ -70,7 +66,6 @@ def run(options: Options) -> int:
         content = read_mask(options.mask, options.max_shapes)
         if options.top is not None:
             content = content.below(options.top)
-        form = validate_mask(options.mask, content) if options.strict else []
         report = check_library(
             content,
             process.rules,
@@ -83,9 +78,6 @@ def run(options: Options) -> int:
             write_lyrdb(report, content.tops[0], draft.path)
     values = _values(content, report)
     failures = _failures(options, report, layers)
-    if options.strict:
-        values["form"] = form
-        failures += [f"form: {finding}" for finding in form]
     text = _text(options.mask, content, report)
     return options.console.judged(values, text, failures)
 

@@ -2,19 +2,13 @@
 a hang, or another error.
 """
 
-import json
 import signal
 
 import numpy as np
 import pytest
 
 import layout
-from layout.commands.validate import validate_mask
 from layout.formats import gdsii_read, oasis_read
-from layout.formats import gdsii_write as assemble
-from layout.formats.library import MaskCell, MaskLibrary
-from layout.formats.reading import read_mask
-from metalens import cli
 from metalens.core.errors import MaskFileError
 
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
@@ -160,29 +154,3 @@ def test_a_bomb_of_zeros_is_refused(tmp_path):
     )
     with pytest.raises(MaskFileError, match="compressed block of 3 bytes"):
         layout.read_oasis(tmp_path / "z.oas")
-
-
-@pytest.mark.parametrize(("suffix", "options"), FORMS)
-def test_own_masks_pass_the_validator(plan, tmp_path, suffix, options):
-    path = tmp_path / f"m.{suffix}"
-    (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
-        plan, path, **options
-    )
-    assert validate_mask(path, read_mask(path)) == []
-
-
-def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
-    path = tmp_path / "m.oas"
-    layout.write_oasis(plan, path)
-    words = ["check", str(path), "--strict", "--json"]
-    first = cli.main(words)
-    values = json.loads(capsys.readouterr().out)
-    assert values["form"] == []
-    assert first == (0 if values["ok"] else 1)
-    square = np.array([[0, 0], [900, 0], [900, 900], [0, 900]])
-    both = {name: MaskCell(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
-    assemble.write_gdsii(MaskLibrary("LIB", both), tmp_path / "m.gds")
-    assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
-    told = capsys.readouterr().out
-    assert "keeps the design rules" in told.splitlines()[0]
-    assert "  FAILED: form: 2 top cells (ONE, TWO), need one" in told.splitlines()
