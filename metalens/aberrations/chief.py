@@ -10,7 +10,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import Lens
+from metalens.lens import DiameterMap, Lens
 from metalens.optics import media
 from metalens.optics.media import Media
 from metalens.psf import library_incidence
@@ -269,17 +269,13 @@ def _wave_front(
         )
         raise PropagationError(_failure_text(lens, angle_rad, why))
     phasors = np.where(inside, np.exp(1j * phase), 0.0)
-    guess = _initial_polynomial(
-        phasors,
-        (x[0] + x[-1], y[0] + y[-1]),
-        lens.diameters.steps_um,
-        lens.diameters.lattice.centred,
-    )
+    middle = ((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2)
+    guess = _initial_polynomial(phasors, middle, lens.diameters)
     terms = np.stack(
         [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
     )[inside]
-    scaled = {(i, j): c * radius ** (i + j) for (i, j), c in guess.items()}
-    series, scatter = _fit_polynomial(terms, phasors[inside], scaled)
+    first = [guess.get((i, j), 0.0) * radius ** (i + j) for i, j in POWERS]
+    series, scatter = _fit_polynomial(terms, phasors[inside], np.array(first))
     if scatter > ROUGH:
         why = f"meets no wave front: phases scatter by {scatter:.2f} rad rms"
         raise PropagationError(_failure_text(lens, angle_rad, why))
@@ -336,10 +332,7 @@ def _patch(
 
 
 def _initial_polynomial(
-    turn: Array,
-    twice_um: tuple[float, float],
-    steps: tuple[float, float],
-    centred: bool,
+    turn: Array, middle_um: tuple[float, float], diameters: DiameterMap
 ) -> dict[tuple[int, int], float]:
     """First guess of a quadratic phase from differences of unit phasors.
 
@@ -348,58 +341,48 @@ def _initial_polynomial(
 
     Args:
         turn: (y, x) phasors exp(i phase), 0 where there is no pillar.
-        twice_um: twice the middle (x, y) of the map from the place of the slopes, um.
-        steps: spacing of the sites along (x, y), um.
-        centred: whether the lattice has sites on every other place only.
+        middle_um: middle (x, y) of the map from the place of the slopes, um.
+        diameters: whose lattice it is.
 
     Returns:
         Coefficients by power (i, j) of x^i y^j, rad per um^(i + j).
     """
-    hop = 2 if centred else 1
-    next_x = turn[:, hop:] * turn[:, :-hop].conj()
-    next_y = turn[hop:] * turn[:-hop].conj()
-    lags = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
-    across = next_x[:, lags[0] :] * next_x[:, : -lags[0]].conj()
-    down = next_y[lags[1] :] * next_y[: -lags[1]].conj()
-    mixed = next_x[lags[1] :] * next_x[: -lags[1]].conj()
-    curvature = [
-        np.angle(across.sum()) / (hop * lags[0] * steps[0] ** 2),
-        np.angle(down.sum()) / (hop * lags[1] * steps[1] ** 2),
-    ]
-    twist = np.angle(mixed.sum()) / (hop * lags[1] * steps[0] * steps[1])
-    series = {(2, 0): curvature[0] / 2, (1, 1): twist, (0, 2): curvature[1] / 2}
-    series[1, 0] = (
-        np.angle(next_x.sum()) / (hop * steps[0])
-        - curvature[0] * twice_um[0] / 2
-        - twist * twice_um[1] / 2
-    )
-    series[0, 1] = (
-        np.angle(next_y.sum()) / (hop * steps[1])
-        - curvature[1] * twice_um[1] / 2
-        - twist * twice_um[0] / 2
-    )
-    return series
+    hop = 2 if diameters.lattice.centred else 1  # every other place is a site
+    (dx, dy), (x, y) = diameters.steps_um, middle_um
+
+    def change(field: Array, axis: int, sites: int) -> Array:
+        field = np.moveaxis(field, axis, 0)
+        return np.moveaxis(field[sites:] * field[:-sites].conj(), 0, axis)
+
+    def rate(steps: Array, axis: int) -> float:
+        sites = max(hop, turn.shape[axis] // FAR // hop * hop)
+        return float(np.angle(change(steps, axis, sites).sum()) / (hop * sites))
+
+    steps_x, steps_y = change(turn, 1, hop), change(turn, 0, hop)
+    xx, yy = rate(steps_x, 1) / dx**2, rate(steps_y, 0) / dy**2
+    xy = rate(steps_x, 0) / (dx * dy)
+    slope_x = float(np.angle(steps_x.sum())) / (hop * dx) - xx * x - xy * y
+    slope_y = float(np.angle(steps_y.sum())) / (hop * dy) - yy * y - xy * x
+    quadratic = {(2, 0): xx / 2, (1, 1): xy, (0, 2): yy / 2}
+    return quadratic | {(1, 0): slope_x, (0, 1): slope_y}
 
 
-def _fit_polynomial(
-    terms: Array, turn: Array, first: dict[tuple[int, int], float]
-) -> tuple[Array, float]:
+def _fit_polynomial(terms: Array, turn: Array, series: Array) -> tuple[Array, float]:
     """Least-squares polynomial of a wrapped phase, by iterated wrapped residuals.
 
     Args:
         terms: (pillars, terms) powers of the place.
         turn: (pillars,) phasors exp(i phase).
-        first: guess of some coefficients by power; 0 for the others.
+        series: (terms,) guess of the coefficients.
 
     Returns:
         (terms,) coefficients in rad, and the rms residual in rad.
     """
-    series = np.array([first.get(power, 0.0) for power in POWERS])
     inverse = np.linalg.pinv(terms)
     for _ in range(TURNS):
         residual = turn * np.exp(-1j * (terms @ series))
         middle = np.angle(residual.sum())
+        series = series + inverse @ np.angle(residual * np.exp(-1j * middle))
         series[0] += middle
-        series += inverse @ np.angle(residual * np.exp(-1j * middle))
     residual = np.angle(turn * np.exp(-1j * (terms @ series)))
     return series, float(np.sqrt((residual**2).sum() / max(len(turn) - len(POWERS), 1)))

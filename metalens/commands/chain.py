@@ -264,12 +264,7 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
         "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
         ("library", "cell.toml", "-o", "library.h5"),
         ("max_error", "largest error bar of |t|"),
-        (
-            (
-                "library.png",
-                "Phase and transmission of the pillars with their error bars, and the proxy's residual.",
-            ),
-        ),
+        (),
     )
     yield ChainStage(
         "Lens",
@@ -277,12 +272,7 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
         "over all pillars then shows where the light really meets.",
         ("design", "design.toml", "-o", "lens.h5"),
         ("max_phase_error_rad", "rad between target and assigned phase"),
-        (
-            (
-                "lens.png",
-                "Phase and diameter of the pillars across the lens, and a zoom to single pillars.",
-            ),
-        ),
+        (("lens.png", "Phase of the pillars across the lens."),),
     )
     yield ChainStage(
         "Point spread functions",

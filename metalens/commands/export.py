@@ -10,7 +10,6 @@ import tyro
 from metalens import lens
 from metalens.commands.common import CommonOptions, Output
 from metalens.core import transaction
-from metalens.core.errors import LensError
 from metalens.lens import export
 
 
@@ -39,13 +38,6 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     export.check_export_format(options.output)
-    if (
-        options.samples != Options.samples
-        and options.output.suffix.lower() in export.ARRAYS
-    ):
-        raise LensError(
-            f"--samples {options.samples}: counts the points of a .dat; arrays hold every pillar"
-        )
     with options.claim(options.output) as draft:
         device = lens.load(options.lens)
         grid = options.output.suffix.lower() == export.GRID

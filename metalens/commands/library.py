@@ -1,5 +1,5 @@
-"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy,
-and a figure beside it.
+"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, and its
+proxy.
 """
 
 import dataclasses
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
     library.check_sweep(settings.cell, settings.sweep)
     target = options.output
     inputs = _inputs(options.config, settings.cell)
-    with options.claim(target, companions=(".png",)) as draft, options.shared():
+    with options.claim(target) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
         swept = library.sweep(
@@ -120,7 +120,7 @@ def _import_table(options: Options, cell_file: Path) -> int:
     inputs = _inputs(cell_file, settings.cell) | {
         options.config.name: store.sha256(options.config)
     }
-    with options.claim(options.output, companions=(".png",)) as draft:
+    with options.claim(options.output) as draft:
         return _finish(options, draft.path, imported, settings, inputs, 0.0)
 
 
@@ -132,7 +132,7 @@ def _finish(
     inputs: dict[str, str],
     seconds: float,
 ) -> int:
-    """Fit the proxy, write the library, draw and judge it; the exit status.
+    """Fit the proxy, write the library and judge it; the exit status.
 
     Args:
         options: of the command line.
@@ -142,8 +142,6 @@ def _finish(
         inputs: SHA-256 of each input file.
         seconds: time of the sweep.
     """
-    from metalens.library import library_figure
-
     fitted: ProxyFit | None = None
     refusal = ""
     try:
@@ -160,7 +158,6 @@ def _finish(
         provenance=provenance,
     )
     library.save(path, pillars)
-    library_figure(path.with_suffix(".png"), pillars, fitted)
     failures = _failures(
         pillars,
         fitted,
@@ -343,16 +340,14 @@ def _circular(turned: GeometricPhase) -> dict[str, Any]:
 
 
 def _run_two_sizes(options: Options, settings: CellFile) -> int:
-    """Sweep over two sizes, write and draw the library.
+    """Sweep over two sizes and write the library.
 
     Exit status 1 where most error bars miss the tolerance, or a held-out pair lies
     above its bar.
     """
-    from metalens.library import plots
-
     target = options.output
     inputs = _inputs(options.config, settings.cell)
-    with options.claim(target, companions=(".png",)) as draft, options.shared():
+    with options.claim(target) as draft, options.shared():
         start = time.perf_counter()
         pillars = axes.sweep_two_sizes(
             settings.cell,
@@ -364,7 +359,6 @@ def _run_two_sizes(options: Options, settings: CellFile) -> int:
         about = store.Provenance(config.dumps(settings), inputs)
         pillars = dataclasses.replace(pillars, provenance=about)
         axes.save(draft.path, pillars)
-        plots.axes_library_figure(draft.path.with_suffix(".png"), pillars)
     return options.console.report(
         f"{target}: library over two sizes of {settings.cell.described}",
         _two_size_values(pillars, seconds),

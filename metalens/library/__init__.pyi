@@ -11,7 +11,6 @@ from .fit import ProxyFit as ProxyFit
 from .fit import ProxyTolerances as ProxyTolerances
 from .fit import proxy_of as proxy_of
 from .geometric_phase import GeometricPhase as GeometricPhase
-from .plots import library_figure as library_figure
 from .proxy import MOST_ERROR as MOST_ERROR
 from .proxy import Proxy as Proxy
 from .proxy import height_hint as height_hint

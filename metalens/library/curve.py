@@ -31,19 +31,17 @@ class SolvedNodes:
     response: (n, 2) complex t and r.
     error: (n,) error estimate of the solver.
     converged: whether the last nodes were predicted within the tolerance.
-    reason: why the search stopped.
     """
 
     diameter_um: Array
     response: Array
     error: Array
     converged: bool = True
-    reason: str = ""
 
     def to_json(self) -> list[Any]:
         """Lists of numbers from which :meth:`from_json` restores the nodes exactly."""
         columns = self.diameter_um, self.response.view(float), self.error
-        return [*(column.tolist() for column in columns), self.converged, self.reason]
+        return [*(column.tolist() for column in columns), self.converged]
 
     @classmethod
     def from_json(cls, row: list[Any]) -> "SolvedNodes":
@@ -52,11 +50,11 @@ class SolvedNodes:
         Raises:
             ValueError: columns of different lengths.
         """
-        diameters, parts, errors, converged, reason = row
+        diameters, parts, errors, converged = row
         if not len(diameters) == len(parts) == len(errors):
             raise ValueError("columns of different lengths")
         response = np.array(parts).view(complex)
-        return cls(np.array(diameters), response, np.array(errors), converged, reason)
+        return cls(np.array(diameters), response, np.array(errors), converged)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -217,15 +215,8 @@ def sample_adaptively(
         responses.append(response)
         earlier_fits.append(fit)
         predicted = predicted + 1 if agreed and error < tolerance else 0
-    reason = (
-        f"the last {CALM} of {len(x)} solves were predicted within {tolerance:g}"
-        if predicted == CALM
-        else f"{most} solves do not meet {tolerance:g}"
-    )
     errors = np.array([solved.t_error for solved in responses])
-    return SolvedNodes(
-        np.array(x), _responses(responses), errors, predicted == CALM, reason
-    )
+    return SolvedNodes(np.array(x), _responses(responses), errors, predicted == CALM)
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:

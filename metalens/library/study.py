@@ -315,21 +315,3 @@ def best_cell(
         key=lambda cell: worst_turns[cell],
     )
     return best[1], best[0]
-
-
-def round_to_tolerance(value: object) -> object:
-    """The value with all numbers at six significant digits, so that the text is the
-    same on any machine.
-
-    Args:
-        value: a number, text, list or dictionary.
-    """
-    if isinstance(value, float):
-        return float(f"{value:.6g}")
-    if isinstance(value, dict):
-        return {k: round_to_tolerance(v) for k, v in value.items()}
-    return (
-        [round_to_tolerance(v) for v in value]
-        if isinstance(value, list | tuple)
-        else value
-    )

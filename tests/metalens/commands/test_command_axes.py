@@ -60,7 +60,6 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
         axes.cell_of_sizes(library.cell, x, y), x, 0.71, harmonics=told["harmonics"] + 3
     )
     assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
-    assert (tmp_path / "axes.png").stat().st_size > 20_000
     panels = artefacts.axes_panels(tmp_path / "axes.h5")
     assert panels[1].values[1, 0, j, i] == pytest.approx(
         abs(library.t[0, i, j, 1, 1])
