@@ -33,7 +33,6 @@ from metalens.lens import Lens
 from metalens.lens import picture as lens_plot
 from metalens.library import PillarLibrary, axes
 from metalens.optics import Layers, check_gaps
-from metalens.psf import FocusMetrics
 
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
 # pillars whose PSF is computed with the design: 2.6 mm at a pitch of 0.3 um
@@ -609,34 +608,27 @@ def _judge(
         wanted: whether the profile has a focus that can be judged.
         expected: Strehl ratio that the phase errors leave.
     """
-    names = (
-        "wavefront_efficiency",
-        "sampled_aperture",
-        "steepest",
-        "transmission",
-        "strehl",
-        "max_phase_error_rad",
-        "rms_phase_error_rad",
-        "turns",
-    )
-    values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
-    own = {name: getattr(quality, name) for name in names}
+    values = asdict(quality)
+    field_deg = math.degrees(values.pop("field_of_view_rad"))
     if not quality.focuses:
-        return values | own, ""
-    values |= {
-        "numerical_aperture": quality.numerical_aperture,
-        "field_of_view_deg": math.degrees(quality.field_of_view_rad),
-        "efficiency": None,
-    }
+        del values["numerical_aperture"]
+        return values, ""
+    values |= {"field_of_view_deg": field_deg, "efficiency": None}
     judged = wanted and not options.skip_focus_check
     if quality.pillars > MOST_PILLARS or find_spec("torch") is None:
         if judged:
             options.console.say(
                 f"no focus check: it needs torch and at most {MOST_PILLARS:,} pillars"
             )
-        return values | own, ""
+        return values, ""
     check = design.check_focus(designed, axial=judged, expected=expected)
-    values |= _psf_values(check.figures) | own
+    figures = check.figures
+    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
+    values |= {name: getattr(figures, name) for name in names} | {
+        "psf_strehl": figures.strehl,
+        "psf_strehl_error": figures.strehl_error,
+        "diffraction_limit": asdict(figures.limit),
+    }
     if not judged:
         return values, ""
     values |= {
@@ -647,17 +639,7 @@ def _judge(
     }
     problem = "the focus is dim" if check.placed else "no focus where it should be"
     failure = (
-        f"{problem}: a Strehl ratio of {check.figures.strehl:.3f}, expected "
+        f"{problem}: a Strehl ratio of {figures.strehl:.3f}, expected "
         f"{check.expected:.3f}"
     )
     return values, "" if check.passed else failure
-
-
-def _psf_values(figures: FocusMetrics) -> dict[str, Any]:
-    """Figures of the PSF of the design source for JSON."""
-    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
-    return {name: getattr(figures, name) for name in names} | {
-        "psf_strehl": figures.strehl,
-        "psf_strehl_error": figures.strehl_error,
-        "diffraction_limit": asdict(figures.limit),
-    }

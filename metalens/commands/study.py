@@ -56,7 +56,7 @@ def run(options: Options) -> int:
         verdicts = cell_study.run_study(study, options.console, journal=journal)
         plots.write_study(draft.path, study, verdicts)
     journal.finish()
-    best = cell_study.best_cell(study, verdicts)
+    best = cell_study.best_cell(verdicts)
     return options.console.report(
         f"{options.output}: the lowest cell with a full turn everywhere",
         {
@@ -64,7 +64,6 @@ def run(options: Options) -> int:
             "height_um": best and best[1],
             "cells": len(verdicts),
         },
-        notes=[cell_study.uncertain_entries(study, verdicts)],
         failures=[] if best else ["no cell covers a full turn at all wavelengths"],
     )
 

@@ -4,7 +4,6 @@ printable pillars cover smoothly?
 
 import itertools
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -269,49 +268,18 @@ def _mean_over_phase(phase: Array, power: Array) -> float:
     return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
 
 
-def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
-    """Sentence on how many runs have an error bar of t above the tolerance, with the
-    largest; empty where none has.
-
-    Args:
-        study: what is compared.
-        verdicts: of all its cells.
-    """
-    runs = [v for v in verdicts if v.turns > 0]
-    uncertain = [v for v in runs if v.error > study.tolerance]
-    if not uncertain:
-        return ""
-    worst = max(uncertain, key=lambda v: v.error)
-    place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
-    return (
-        f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
-        f"largest of {worst.error:.2g} ({place})"
-    )
-
-
-def best_cell(
-    study: CellStudy, verdicts: list[CellVerdict]
-) -> tuple[float, float] | None:
+def best_cell(verdicts: list[CellVerdict]) -> tuple[float, float] | None:
     """(pitch, height) in um of the lowest pillars that cover a full turn at every
     wavelength; None where no cell does.
 
     Among pitches of equal height, the one with most turns at its worst wavelength.
 
     Args:
-        study: what is compared.
-        verdicts: of its cells.
+        verdicts: of all cells and wavelengths of a study.
     """
-    by_cell: dict[tuple[float, float], list[float]] = {}
+    turns: dict[tuple[float, float], float] = {}
     for v in verdicts:
-        by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
-    worst_turns = {
-        cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1
-    }
-    if not worst_turns:
-        return None
-    height = min(cell[0] for cell in worst_turns)
-    best = max(
-        (cell for cell in worst_turns if cell[0] == height),
-        key=lambda cell: worst_turns[cell],
-    )
-    return best[1], best[0]
+        cell = v.pitch_um, v.height_um
+        turns[cell] = min(v.turns, turns.get(cell, math.inf))
+    covering = [cell for cell in turns if turns[cell] >= 1]
+    return min(covering, key=lambda cell: (cell[1], -turns[cell]), default=None)

@@ -97,7 +97,7 @@ class _SweepRun:
         inaccurate = [  # 20 entries: a curve takes about as many solves
             light
             for light, row in rows.items()
-            if light not in self.curves and self.misses(row).sum() > 20
+            if light not in self.curves and (row[2].real > sweep.bar).sum() > 20
         ]
         if inaccurate:
             self.solve(inaccurate, "more curves")
@@ -145,10 +145,6 @@ class _SweepRun:
         for wave, nodes in zip(waves, solved, strict=True):
             self.curves[wave] = workers.fit_curve(nodes, tolerance=self.sweep.bar)
 
-    def misses(self, row: Array) -> Array:
-        """(diameter,) mask of the entries of a row whose error exceeds the tolerance."""
-        return np.asarray(row[2].real > self.sweep.bar)
-
     def rows(self, diameters: Array) -> Rows:
         """All rows of the sweep: those of the curves, then interpolated between
         wavelengths, then between angles (in sin²).
@@ -185,8 +181,8 @@ class _SweepRun:
         """
         tasks = []
         for light, row in rows.items():
-            misses = self.misses(row)
             bar = self.sweep.bar
+            misses = row[2].real > bar
             curve = self.curves.get(light)
             if curve and engines.is_at_finest_discretization(
                 self.cell, curve.nodes.error, bar * workers.SOLVE_SHARE

@@ -33,14 +33,14 @@ def test_known_coverages(verdicts):
 
 def test_choice_takes_the_lowest_then_the_most(verdicts):
     narrow, wide = verdicts
-    assert cell_study.best_cell(SMALL, verdicts) == (0.30, 0.7)
+    assert cell_study.best_cell(verdicts) == (0.30, 0.7)
     taller = dataclasses.replace(narrow, height_um=0.9, turns=2.0)
-    assert cell_study.best_cell(SMALL, [taller, narrow]) == (0.30, 0.7)
+    assert cell_study.best_cell([taller, narrow]) == (0.30, 0.7)
     better = dataclasses.replace(narrow, pitch_um=0.31, turns=1.6)
-    assert cell_study.best_cell(SMALL, [narrow, better]) == (0.31, 0.7)
+    assert cell_study.best_cell([narrow, better]) == (0.31, 0.7)
     elsewhere = dataclasses.replace(better, wavelength_um=0.94, turns=0.4)
-    assert cell_study.best_cell(SMALL, [narrow, better, elsewhere]) == (0.30, 0.7)
-    assert cell_study.best_cell(SMALL, [wide]) is None
+    assert cell_study.best_cell([narrow, better, elsewhere]) == (0.30, 0.7)
+    assert cell_study.best_cell([wide]) is None
 
 
 def test_json_and_figure(verdicts, tmp_path):
