@@ -25,7 +25,7 @@ from metalens.library import GeometricPhase, PillarLibrary, Proxy, height_hint
 from metalens.library.axes import AxesLibrary
 
 EDGE_UM = 2e-3  # a proxy that ends this near a printable limit is ended by the process
-_STEP_RAD = 0.05  # phase step between tabulated diameters (parabolic interpolation)
+_SIZES = 1025  # tabulated diameters, with parabolas between them
 
 # target phases (channels, sites) -> (maps (k, sites), [(phase, |t|) of each channel])
 _Choice = Callable[
@@ -275,7 +275,7 @@ def assign_multi_wavelength(
     limits = limits or Limits()
     for wave in waves:  # every wavelength is checked; the range is the same for all
         span = printable_range_um(proxy, cell, limits, wave, accept_partial_turn=True)
-    tabulated = _table_sizes(proxy, span, waves)
+    tabulated = np.linspace(*span, _SIZES)
     responses = (_response(proxy, tabulated, wave) for wave in waves)
     t = [level * np.exp(1j * phase) for phase, level in responses]
     table = CandidateTable(np.stack(t), np.array(weights))
@@ -283,7 +283,7 @@ def assign_multi_wavelength(
     def choose_sizes(targets: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
         chosen = span[0] + (tabulated[1] - tabulated[0]) * table.between(targets)
         chosen = chosen.astype(np.float32)
-        return [chosen], [_response(proxy, chosen, wave, span) for wave in waves]
+        return [chosen], [_response(proxy, chosen, wave) for wave in waves]
 
     sites = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
     phases = [target.phase for target in wavelength_targets]
@@ -599,20 +599,16 @@ def _fill_sites(
 
 
 def _response(
-    proxy: Proxy,
-    size_um: Array,
-    wavelength_um: float,
-    within_um: tuple[float, float] = (-math.inf, math.inf),
+    proxy: Proxy, size_um: Array, wavelength_um: float
 ) -> tuple[Array, Array]:
     """Phase in rad and |t| of pillars of given sizes by the proxy.
 
     Args:
         proxy: phase and |t| over the diameter.
-        size_um: (n,) sizes, um.
+        size_um: (n,) sizes, um; float32 rounding may leave the domain.
         wavelength_um: vacuum wavelength, um.
-        within_um: range to which the sizes are clipped (float32 rounding may leave it).
     """
-    size_um = np.asarray(size_um, float).clip(*within_um)
+    size_um = np.asarray(size_um, float).clip(*proxy.domain_um)
     phase = proxy.phase_rad(size_um, wavelength_um)
     return phase, proxy.transmission(size_um, wavelength_um)
 
@@ -666,23 +662,6 @@ def _printable_sizes_um(cell: Cell, limits: Limits) -> tuple[float, float]:
     """(least, largest) size in um that a process prints."""
     gap_um = limits.min_gap_nm * 1e-3
     return cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
-
-
-def _table_sizes(
-    proxy: Proxy, span_um: tuple[float, float], waves_um: Sequence[float]
-) -> Array:
-    """Evenly spaced diameters in um, the phase step at most 0.05 rad at all
-    wavelengths.
-
-    Args:
-        proxy: phase over the diameter.
-        span_um: least and largest diameter.
-        waves_um: vacuum wavelengths.
-    """
-    probe = np.linspace(*span_um, 513)
-    slopes = [np.abs(proxy.dphase_ddiameter(probe, wave)).max() for wave in waves_um]
-    count = math.ceil(float(max(slopes)) * (span_um[1] - span_um[0]) / _STEP_RAD) + 1
-    return np.linspace(*span_um, max(64, count))
 
 
 def _is_printable(library: AxesLibrary, limits: Limits) -> Array:

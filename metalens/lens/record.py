@@ -19,6 +19,7 @@ from metalens.core.errors import DomainError, LensError
 from metalens.core.store import Provenance, typed_reader
 from metalens.lens.neighbours import NeighbourRows
 from metalens.library import Proxy
+from metalens.library.axes import tabulated_index
 from metalens.optics.aperture_stop import Stop as Stop
 from metalens.optics.layers import Layers as Layers
 from metalens.optics.layers import check_gaps
@@ -251,20 +252,14 @@ class TwoSizeTable:
         Raises:
             DomainError: a wavelength or a size that the table does not hold.
         """
-        matches = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
-        if not len(matches):
-            tabulated = ", ".join(f"{w:g}" for w in self.wavelength_um)
-            raise DomainError(
-                f"wavelength {wavelength_um:g} um: pillars of two sizes are known at {tabulated} um alone"
-            )
         has_pillar = np.asarray(x_um) > 0
         row, column = (
             _place(axis, np.where(has_pillar, size, axis[0]))
             for axis, size in ((self.x_um, x_um), (self.y_um, y_um))
         )
-        return np.asarray(
-            np.where(has_pillar, self.t[matches[0], row, column, "xy".index(light)], 0)
-        )
+        k = tabulated_index(self.wavelength_um, wavelength_um)
+        t = self.t[k, row, column, "xy".index(light)]
+        return np.asarray(np.where(has_pillar, t, 0))
 
     @property
     def proxy(self) -> Proxy:

@@ -97,13 +97,26 @@ class AxesLibrary:
         Raises:
             DomainError: the library does not hold it.
         """
-        places = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
-        if not len(places):
-            available = ", ".join(f"{w:g}" for w in self.wavelength_um)
-            raise DomainError(
-                f"wavelength {wavelength_um:g} um: this library holds {available} um; sweep it there too"
-            )
-        return int(places[0])
+        return tabulated_index(self.wavelength_um, wavelength_um)
+
+
+def tabulated_index(wavelengths_um: Array, wavelength_um: float) -> int:
+    """Index of a wavelength in a table.
+
+    Args:
+        wavelengths_um: (w,) of the table.
+        wavelength_um: wanted, um.
+
+    Raises:
+        DomainError: the table does not hold it.
+    """
+    places = np.flatnonzero(np.abs(wavelengths_um - wavelength_um) <= 1e-9)
+    if not len(places):
+        available = ", ".join(f"{w:g}" for w in wavelengths_um)
+        raise DomainError(
+            f"wavelength {wavelength_um:g} um: the table of two sizes holds {available} um; sweep it there too"
+        )
+    return int(places[0])
 
 
 def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
