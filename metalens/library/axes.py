@@ -475,17 +475,22 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     """Least number of harmonics whose error bars meet the solver's share of the
     tolerance at four probe sizes; the largest possible one where none does.
     """
-    from metalens.rcwa import jones
+    from metalens.rcwa import jones, most_harmonics
 
     (x0, x1), (y0, y1) = size_ranges(sweep)
     probes = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in probes]
-    target = SOLVER_SHARE * sweep.bar
-    return max(
-        jones(cell_of_sizes(cell, x, y), x, wavelength, tolerance=target).orders
-        for x, y in sizes
-        for wavelength in sweep.wavelengths_um
-    )
+    most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
+    for harmonics in range(min(5, most), most):
+        target = SOLVER_SHARE * sweep.bar
+        options = {"tolerance": target, "harmonics": harmonics}
+        if all(
+            jones(cell_of_sizes(cell, x, y), x, wavelength, **options).converged  # type: ignore[arg-type]
+            for x, y in sizes
+            for wavelength in sweep.wavelengths_um
+        ):
+            return harmonics
+    return most
 
 
 def _choose_lines(nodes: _Nodes, sweep: Sweep) -> tuple[Array, Array]:
