@@ -44,7 +44,7 @@ def test_every_pillar_has_its_entry_and_no_pillar_has_none(light):
         (0.08, 0.2, 0.85, "0.08 um"),  # one step before the first
         (0.2, 0.2, 0.85, "0.2 um"),
         (0.12, 0.3, 0.85, "0.3 um"),
-        (0.12, 0.2, 0.8500001, "known at 0.78, 0.85 um"),
+        (0.12, 0.2, 0.8500001, "holds 0.78, 0.85 um"),
     ],
 )
 def test_what_the_table_does_not_hold_is_refused_by_name(x, y, wave, word):
