@@ -3,7 +3,6 @@ ratio, conditions.
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from codesign.commands.options import optics as optics_options
 from codesign.commands.options.paper import Options
 from codesign.evaluate import ROLES, ClaimLine, MeasuredNumber, paper
 from codesign.settings import ExperimentConfig
+from codesign.train import run as codesign_run
 from metalens.core import report, store
 from metalens.core.errors import ConfigError
 
@@ -44,24 +44,20 @@ def run(options: Options) -> int:
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
         if options.runs and options.measure:
             _run_measurements(options, draft.path)
-        claims = paper.claim_lines(
-            collect_measurements(draft.path, runs, options.others), draft.path
-        )
+        measured = collect_measurements(draft.path, runs)
+        claims = paper.claim_lines(measured, draft.path)
         _write_page(draft.path, claims)
-        values = [
-            {
-                **asdict(t.claim),
-                "ours": asdict(t.ours) if t.ours else None,
-                "picture": t.picture,
-            }
-            for t in claims
-        ]
+        values = [asdict(line) for line in claims]
+        values = [line.pop("claim") | line for line in values]
         store.write_text(
             draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n"
         )
-    text = f"{claims_table(claims)}\nopen {folder / PAGE}"
+    head = ("place", "what", "paper", "ours", "ratio", "conditions")
+    table = report.Table(head, [line.words() for line in claims]).text
     return options.console.judged(
-        {"lines": values, "folder": str(folder)}, text, measurement_failures(folder)
+        {"lines": values, "folder": str(folder)},
+        f"{table}\nopen {folder / PAGE}",
+        measurement_failures(folder),
     )
 
 
@@ -82,13 +78,12 @@ def measurement_failures(folder: Path) -> list[str]:
 
 
 def collect_measurements(
-    folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()
+    folder: Path, runs: dict[str, Path]
 ) -> dict[str, MeasuredNumber]:
-    """Numbers measured into ``folder``, and those of the runs and ablations.
+    """Numbers measured into ``folder``, and those of the runs.
 
     Args:
-        folder: of the measurements. runs: folder by role. others: runs with a part
-            frozen.
+        folder: of the measurements. runs: folder by role.
 
     Raises:
         StoreError, TrainingError: a measurement or a run is damaged or of another
@@ -103,9 +98,7 @@ def collect_measurements(
     if "optics" in files:
         measured |= paper.of_optics(files["optics"])
     rows = {role: finished.rows_of(path) for role, path in runs.items()}
-    ours = rows.get("proposed", [])
-    measured |= paper.of_runs(rows) | paper.of_gaze(ours)
-    return measured | paper.of_ablations(ours, dict(paper.frozen_rows(others)))
+    return measured | paper.of_runs(rows) | paper.of_gaze(rows.get("proposed", []))
 
 
 def _run_measurements(options: Options, folder: Path) -> None:
@@ -124,18 +117,20 @@ def _run_measurements(options: Options, folder: Path) -> None:
             command_experiment.run(experiment)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
-        order = sorted(
-            zip(names, options.runs, strict=True),
-            key=lambda pair: pair[0] != "hyperbolic",
+        # the tables name lenses by their files, and compare them with the first
+        (folder / "lenses").mkdir(exist_ok=True)
+        paths = {name: folder / "lenses" / f"{name}.h5" for name in names}
+        for path, run_dir in zip(paths.values(), options.runs, strict=True):
+            store.write_bytes(path, (run_dir / "lens.h5").read_bytes())
+        first = paths.pop("hyperbolic", None)
+        tolerance = max(
+            codesign_run.load_run_settings(run_dir / "run.toml").optics.image_tolerance
+            for run_dir in options.runs
         )
-        lenses = tuple(_copy_lens(folder, name, path) for name, path in order)
         settings_file = folder / "optics.toml"
-        store.write_text(
-            settings_file,
-            f"[scenes]\nimage_tolerance = {paper.image_tolerance(options.runs)}\n",
-        )
+        store.write_text(settings_file, f"[scenes]\nimage_tolerance = {tolerance}\n")
         optics = optics_options.Options(
-            lenses=lenses,
+            lenses=(*([first] if first else []), *paths.values()),
             output=folder / "optics",
             config=settings_file,
             scenes=options.scenes,
@@ -145,48 +140,22 @@ def _run_measurements(options: Options, folder: Path) -> None:
         command_evaluate_optics.run(optics)
 
 
-def _copy_lens(folder: Path, name: str, run_dir: Path) -> Path:
-    """Copy of a run's lens under the name of its role, which the tables use."""
-    lens_folder = folder / "lenses"
-    lens_folder.mkdir(exist_ok=True)
-    store.write_bytes(lens_folder / f"{name}.h5", (run_dir / "lens.h5").read_bytes())
-    return lens_folder / f"{name}.h5"
-
-
-def claims_table(claims: list[ClaimLine]) -> str:
-    """The lines as text.
-
-    Args:
-        claims: with their measurements.
-    """
-    head = ("place", "what", "paper", "ours", "ratio", "conditions")
-    return report.Table(head, [line.words() for line in claims]).text
-
-
 def _write_page(folder: Path, claims: list[ClaimLine]) -> None:
     """Write the page: for every table and figure of the paper, its claims and ours."""
-    places = list(dict.fromkeys(t.claim.place for t in claims))
     head = ("what", "paper", "ours", "ratio", "conditions")
     sections = []
-    for place in places:
-        lines = [t for t in claims if t.claim.place == place]
-        items: list[report.Figure | report.Table] = (
-            [report.Table(head, [t.words()[1:] for t in lines if not t.picture])]
-            if any(not t.picture for t in lines)
-            else []
-        )
-        items += [
-            report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True)
-            for t in lines
-            if t.picture
+    for place in dict.fromkeys(line.claim.place for line in claims):
+        lines = [line for line in claims if line.claim.place == place]
+        items: list[report.Figure | report.Table] = [
+            report.Figure(
+                (folder / line.picture).read_bytes(), line.claim.what, wide=True
+            )
+            for line in lines
+            if line.picture
         ]
+        rows = [line.words()[1:] for line in lines if not line.picture]
+        if rows:
+            items.insert(0, report.Table(head, rows))
         sections.append(report.Section(place, items=items))
-    measured = sum(t.ours is not None or bool(t.picture) for t in claims)
-    keys = [
-        report.KeyFigure("claims of the paper", str(len(claims))),
-        report.KeyFigure("measured here", str(measured)),
-    ]
     lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
-    report.write_report(
-        folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys
-    )
+    report.write_report(folder / PAGE, "The paper, and ours", sections, lead=lead)

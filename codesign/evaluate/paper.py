@@ -2,16 +2,14 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from codesign.adapt import source as finished
-from codesign.train import run as runs
 from metalens.core import config
-from metalens.core.errors import StoreError, TrainingError
+from metalens.core.errors import StoreError
 
 # roles of the runs, in the order of the command line
 ROLES = ("proposed", "hyperbolic", "best_focus", "double_helix")
@@ -83,44 +81,29 @@ class ClaimLine:
 
     @property
     def ratio(self) -> float:
-        """Ours over the paper's; nan without either."""
-        return (
-            self.ours.value / self.claim.value
-            if self.ours and not self.claim.picture
-            else math.nan
-        )
+        """Ours over the paper's; nan where it was not measured."""
+        return self.ours.value / self.claim.value if self.ours else math.nan
 
     def words(self) -> tuple[str, str, str, str, str, str]:
         """Cells of a table: place, what, paper, ours, ratio, conditions."""
-        c = self.claim
-        paper = (
-            "picture"
-            if c.picture
-            else f"{c.value:g} {c.unit if c.unit != 'ratio' else ''}".strip()
-        )
-        if self.picture:
-            return c.place, c.what, paper, self.picture, "", c.note
-        if self.ours is None:
-            return c.place, c.what, paper, "not measured", "", f"measure with: {c.how}"
-        span = (
-            f" [{self.ours.low:.3g}, {self.ours.high:.3g}]"
-            if not math.isnan(self.ours.low)
-            else ""
-        )
-        ratio = "" if c.picture else f"{self.ratio:.2f}"
-        conditions = "; ".join(
-            w for w in (self.ours.conditions, f"paper: {c.note}" if c.note else "") if w
-        )
-        return c.place, c.what, paper, f"{self.ours.value:.3g}{span}", ratio, conditions
+        claim, ours, ratio, conditions = self.claim, self.picture, "", self.claim.note
+        if not self.picture and self.ours is None:
+            ours, conditions = "not measured", f"measure with: {claim.how}"
+        elif self.ours is not None:
+            low, high = self.ours.low, self.ours.high
+            span = "" if math.isnan(low) else f" [{low:.3g}, {high:.3g}]"
+            ours, ratio = f"{self.ours.value:.3g}{span}", f"{self.ratio:.2f}"
+            conditions = self.ours.conditions
+            if claim.note:
+                conditions += f"; paper: {claim.note}"
+        value = f"{claim.value:g} {claim.unit}".removesuffix(" ratio").strip()
+        paper = "picture" if claim.picture else value
+        return claim.place, claim.what, paper, ours, ratio, conditions
 
 
 def load_claims() -> tuple[PaperClaim, ...]:
     """Every claim, in the order of the paper."""
-    text = (
-        resources.files("codesign")
-        .joinpath("data", "claims.toml")
-        .read_text(encoding="utf-8")
-    )
+    text = (resources.files("codesign") / "data" / "claims.toml").read_text("utf-8")
     return config.loads(text, PaperClaims, where="claims.toml").claim
 
 
@@ -155,19 +138,19 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     """
     content = _load_json(path, "runs", "ratios", "settings")
     settings = content["settings"]
-    numbers: dict[str, MeasuredNumber] = {}
+    numbers = {}
     for run in content["runs"]:
         conditions = f"{settings['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {settings['seed']}"
         for name, key in QUANTITIES.items():
-            low, high = run.get(f"{name}_interval", (math.nan, math.nan))
+            interval = run.get(f"{name}_interval", (math.nan, math.nan))
             numbers[f"{key}/{run['name']}"] = MeasuredNumber(
-                run[name], low, high, conditions
+                run[name], *interval, conditions
             )
+    conditions = "mid-range hyperbolic, paired subjects"
     for entry in content["ratios"]:
         if entry["against"] == "hyperbolic" and entry["quantity"] in QUANTITIES:
-            low, high = entry["interval"]
             numbers[f"{QUANTITIES[entry['quantity']]}/ratio"] = MeasuredNumber(
-                entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
+                entry["ratio"], *entry["interval"], conditions
             )
     return numbers
 
@@ -187,18 +170,16 @@ def of_dim(bright: Path, dim: Path) -> dict[str, MeasuredNumber]:
         {run["name"]: run["gaze_axial_deg"] for run in _load_json(path, "runs")["runs"]}
         for path in (bright, dim)
     )
+    if "proposed" not in dim_deg:
+        return {}
     conditions = "gaze under axial slip, networks trained in good light"
-    numbers = {}
-    if "proposed" in dim_deg:
-        numbers["dim/proposed"] = MeasuredNumber(
-            dim_deg["proposed"] / bright_deg["proposed"], conditions=conditions
+    return {
+        f"dim/{name}": MeasuredNumber(
+            error / (bright_deg if name == "proposed" else dim_deg)["proposed"],
+            conditions=conditions,
         )
-        for name in ("hyperbolic", "double_helix"):
-            if name in dim_deg:
-                numbers[f"dim/{name}"] = MeasuredNumber(
-                    dim_deg[name] / dim_deg["proposed"], conditions=conditions
-                )
-    return numbers
+        for name, error in dim_deg.items()
+    }
 
 
 def of_optics(path: Path) -> dict[str, MeasuredNumber]:
@@ -212,23 +193,27 @@ def of_optics(path: Path) -> dict[str, MeasuredNumber]:
         StoreError: no such file, or of another version.
     """
     content = _load_json(path, "lenses", "angles_deg", "normalisation")
-    numbers: dict[str, MeasuredNumber] = {}
-    reference = content["lenses"].get("hyperbolic")
-    for name, values in content["lenses"].items():
-        for kind, (value, low, high) in values["scene_ratios"].items():
-            numbers[f"scenes/{kind}/{name}"] = MeasuredNumber(
-                value, low, high, "same states, images of equal light"
-            )
-        if reference is None:
-            continue
-        for i, angle in enumerate(content["angles_deg"]):
-            information, reference_information = (
-                sum(lens_values["information_per_mm2"][i][0])
-                for lens_values in (values, reference)
-            )
-            conditions = f"honest I(z), {content['normalisation']} normalisation, pixels not binned"
+    lenses = content["lenses"]
+    numbers = {
+        f"scenes/{kind}/{name}": MeasuredNumber(
+            *ratio, "same states, images of equal light"
+        )
+        for name, values in lenses.items()
+        for kind, ratio in values["scene_ratios"].items()
+    }
+    if "hyperbolic" not in lenses:
+        return numbers
+    conditions = (
+        f"honest I(z), {content['normalisation']} normalisation, pixels not binned"
+    )
+    for i, angle in enumerate(content["angles_deg"]):
+        information = {
+            name: sum(values["information_per_mm2"][i][0])
+            for name, values in lenses.items()
+        }
+        for name, value in information.items():
             numbers[f"information/{angle:g}/{name}"] = MeasuredNumber(
-                information / reference_information, conditions=conditions
+                value / information["hyperbolic"], conditions=conditions
             )
     return numbers
 
@@ -240,30 +225,28 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumbe
     Args:
         rows: rows of result.json by role of the run.
     """
-    if not {"proposed", "hyperbolic"} <= rows.keys():
+    ours, reference = (rows.get(role, []) for role in ROLES[:2])
+    pairs = [
+        (row, other)
+        for row in ours
+        for other in reference
+        if row["budget_mmacs"] == other["budget_mmacs"]
+    ]
+    if not pairs:
         return {}
-    ours, reference = (
-        {row["budget_mmacs"]: row for row in rows[name] if "axial_slip_mm" in row}
-        for name in ("proposed", "hyperbolic")
-    )
-    shared = sorted(ours.keys() & reference.keys())
-    if not shared:
-        return {}
-    budget = shared[0]
-    error = ours[budget]["axial_slip_mm"] / reference[budget]["axial_slip_mm"]
+    row, other = min(pairs, key=lambda pair: float(pair[0]["budget_mmacs"]))
     numbers = {
         "fig8a/error": MeasuredNumber(
-            error, conditions=f"axial slippage at {ours[budget]['mmacs']:.1f} MMACs"
+            row["axial_slip_mm"] / other["axial_slip_mm"],
+            conditions=f"axial slippage at {row['mmacs']:.1f} MMACs",
         )
     }
-    goal = min(row["axial_slip_mm"] for row in reference.values())
-    reference_mmacs = min(
-        row["mmacs"] for row in reference.values() if row["axial_slip_mm"] == goal
-    )
-    sufficient = [row["mmacs"] for row in ours.values() if row["axial_slip_mm"] <= goal]
+    best = min(reference, key=lambda r: (r["axial_slip_mm"], r["mmacs"]))
+    goal = best["axial_slip_mm"]
+    sufficient = [r["mmacs"] for r in ours if r["axial_slip_mm"] <= goal]
     if sufficient:
         numbers["fig8a/compute"] = MeasuredNumber(
-            min(sufficient) / reference_mmacs,
+            min(sufficient) / best["mmacs"],
             conditions=f"axial slippage of {goal:.2f} mm or less",
         )
     return numbers
@@ -287,31 +270,6 @@ def _load_json(path: Path, *needed: str) -> dict[str, Any]:
     return content
 
 
-def frozen_parts(folder: Path) -> tuple[str, ...]:
-    """Parts of a finished run that were frozen in training, from its result.json.
-
-    Args:
-        folder: folder of the run.
-
-    Raises:
-        TrainingError: no finished run, or of another version.
-    """
-    finished.rows_of(folder)  # refuses what is missing, cut short or empty
-    return tuple(_load_json(folder / "result.json").get("frozen", ()))
-
-
-def image_tolerance(folders: Sequence[Path]) -> float:
-    """Image tolerance to compare the lenses of runs at: the largest of theirs.
-
-    Args:
-        folders: folders of finished runs.
-    """
-    return max(
-        runs.load_run_settings(folder / "run.toml").optics.image_tolerance
-        for folder in folders
-    )
-
-
 def of_gaze(rows: Sequence[Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
     """Table 2: gaze errors of the fastest and of the most accurate network of the
     proposed run, on people whom training never used.
@@ -319,12 +277,11 @@ def of_gaze(rows: Sequence[Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
     Args:
         rows: rows of its result.json.
     """
-    known = [row for row in rows if "gaze_deg" in row]
-    if not known:
+    if not rows:
         return {}
     chosen = {
-        "efficient": min(known, key=lambda row: float(row["mmacs"])),
-        "accurate": min(known, key=lambda row: float(row["gaze_deg"])),
+        "efficient": min(rows, key=lambda row: float(row["mmacs"])),
+        "accurate": min(rows, key=lambda row: float(row["gaze_deg"])),
     }
     return {
         f"table2/proposed_{name}": MeasuredNumber(
@@ -332,54 +289,3 @@ def of_gaze(rows: Sequence[Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
         )
         for name, row in chosen.items()
     }
-
-
-def of_ablations(
-    ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> dict[str, MeasuredNumber]:
-    """Fig. 8b: compute of a run with one part frozen over that of the joint run, at the
-    best axial slippage of the frozen run.
-
-    A part whose best error the joint run does not reach is left out.
-
-    Args:
-        ours: rows of the joint run.
-        others: rows by frozen part.
-    """
-    numbers = {}
-    for part, rows in others.items():
-        best = min(rows, key=lambda row: float(row["axial_slip_mm"]))
-        sufficient = [
-            float(row["mmacs"])
-            for row in ours
-            if row["axial_slip_mm"] <= best["axial_slip_mm"]
-        ]
-        if sufficient:
-            conditions = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(sufficient):.1f} MMACs"
-            numbers[f"fig8b/{part}"] = MeasuredNumber(
-                float(best["mmacs"]) / min(sufficient), conditions=conditions
-            )
-    return numbers
-
-
-def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """(part, rows) of every run in which exactly one part was frozen.
-
-    Args:
-        folders: of finished runs.
-
-    Raises:
-        TrainingError: two runs with the same part frozen.
-    """
-    owner: dict[str, Path] = {}
-    for folder in folders:
-        parts = frozen_parts(folder)
-        if len(parts) != 1:
-            continue
-        (part,) = parts
-        if part in owner:
-            raise TrainingError(
-                f"{owner[part]} and {folder} both have {part} frozen; give one of them"
-            )
-        owner[part] = folder
-        yield part, finished.rows_of(folder)

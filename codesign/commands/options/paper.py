@@ -21,8 +21,6 @@ class Options(CommonOptions):
             best focus, double helix, as
             far as there are; without any, the claims are listed with the commands that
             measure them.
-        others: further finished runs with one part frozen (Fig. 8b); each run's
-            result.json tells which it is.
         output: folder for paper.json, report.html, and the measurements in optics,
             experiment and dim beside them.
         subjects: of the experiment.
@@ -33,7 +31,6 @@ class Options(CommonOptions):
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    others: tuple[Path, ...] = ()
     output: Output = Path("paper")
     subjects: int = 20
     scenes: int = 24
