@@ -1,7 +1,7 @@
 """Settings that command lines show; they need neither torch nor time."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,6 +10,25 @@ from metalens.core.errors import ConfigError
 
 Part = Literal["optics", "pitch", "architecture"]
 Place = Literal["auto", "cpu", "cuda"]
+LEAST, LARGEST = 1e-9, 1e9  # of numbers above 0 and without another limit
+
+
+def check_ranges(record: Any, **limits: tuple[float, float]) -> None:
+    """Refuse numbers of a settings record that lie outside their limits.
+
+    Args:
+        record: its fields are numbers, tuples of numbers, or None where left out.
+        limits: (least, largest) by name of the field.
+
+    Raises:
+        ConfigError: the field, its value and what is needed.
+    """
+    for name, (least, largest) in limits.items():
+        value = getattr(record, name)
+        if value is not None and not all(
+            least <= v <= largest for v in np.ravel(value)
+        ):
+            raise ConfigError(f"{name} = {value}: need {least:g} to {largest:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +53,9 @@ class RetrainConfig:
     budget_mmacs: float = 0.0
 
     def __post_init__(self) -> None:
-        if (
-            min(self.steps, self.draws, self.judge, self.test_batches) < 1
-            or self.seed < 0
-            or not self.rate > 0
-        ):
-            raise ConfigError(
-                f"{self}: need steps, draws, judge and test_batches of 1 or more, a seed of 0 or more, a rate above 0"
-            )
+        counts = ("steps", "draws", "judge", "test_batches")
+        check_ranges(self, **dict.fromkeys(counts, (1, LARGEST)))
+        check_ranges(self, seed=(0, LARGEST), rate=(LEAST, LARGEST))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,19 +105,9 @@ class ExperimentConfig:
                 f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
                 "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
             )
-        if self.people < 2:
-            raise ConfigError(
-                f"people {self.people}: need two or more, to tell how people differ"
-            )
-        if min(self.hidden, self.seed, self.fixation_deg, self.pupil_sd) < 0:
-            raise ConfigError(
-                f"hidden {self.hidden}, seed {self.seed}, fixation_deg {self.fixation_deg:g}, pupil_sd "
-                f"{self.pupil_sd:g}: need 0 or more"
-            )
-        if not all(0 < field < 120 for field in self.field_deg):
-            raise ConfigError(
-                f"field_deg {self.field_deg}: need two angles above 0 and below 120, as eyes turn"
-            )
+        rest = ("hidden", "seed", "fixation_deg", "pupil_sd")
+        check_ranges(self, **dict.fromkeys(rest, (0, LARGEST)))
+        check_ranges(self, people=(2, LARGEST), field_deg=(LEAST, 119))
 
     @property
     def stimuli_deg(self) -> Array:

@@ -109,14 +109,9 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
 }
 
-# modules of the packages above that commands load by name: ``SceneObjective(pupil,
-# settings)`` of free-form designs; the printable limits of PROCESS.toml; the summary of
-# a mask
-ABOVE = {
-    "scenes": "codesign.evaluate.scenes",
-    "process": "layout.process.limits",
-    "mask": "layout.commands.info",
-}
+# modules of the packages above that commands load by name: the printable limits of
+# PROCESS.toml; the summary of a mask
+ABOVE = {"process": "layout.process.limits", "mask": "layout.commands.info"}
 # source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and
 # its PSFs
 PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}

@@ -43,50 +43,38 @@ def run(options: Options) -> int:
         # an impossible spectrum is refused before the work
         spectrum.spectrum_points(Source(made.wavelength_um * 1e3, inputs.fwhm_nm))
     with options.claim(target, companions=(".html", ".png")) as draft:
-        origin = _provenance(options, inputs)
+        weights = options.run / "checkpoint.safetensors" if options.run else None
+        files = [
+            options.lens,
+            options.library,
+            options.process,
+            options.asbuilt,
+            weights,
+        ]
+        origin = store.Provenance(
+            config=f"fwhm_nm = {inputs.fwhm_nm}\n",
+            inputs={file.name: store.sha256(file) for file in files if file},
+        )
         budget = ErrorBudget(made, inputs)
         links = options.console.track(budget.entries(), total=19, label="links")
         rows = list(links)
         save_budget(draft.path, rows, origin)
         write_budget_page(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), plot_budget(rows))
-    values = {"rows": [dataclasses.asdict(row) for row in rows], **budget_summary(rows)}
-    light = of_light(made)
-    words = "\n".join(filter(None, [budget_table(rows).text, light]))
-    return options.console.judged(
-        _without_nan(values | {"light": light}), words, budget.above
-    )
-
-
-def of_light(built: lens.Lens) -> str:
-    """Polarisation that a budget is for, where pillars of one size treat x and y
-    differently.
-
-    Empty for other lenses.
-
-    Args:
-        built: lens.
-    """
-    if not built.one_light:
-        return ""
-    return f"of {built.one_light}: these pillars ({built.cell.described}) answer x and y apart"
-
-
-def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:
-    """Total gaze and PSF error; with a run, the measured error and total over measured.
-
-    Args:
-        rows: of the budget.
-    """
+    values: dict[str, Any] = {"rows": [dataclasses.asdict(row) for row in rows]}
     total = rows[-1]
-    summary = {"gaze_error_deg": math.degrees(total.gaze_rad), "psf_error": total.psf}
+    values |= {
+        "gaze_error_deg": math.degrees(total.gaze_rad), "psf_error": total.psf, "light": "",
+    }  # fmt: skip
     for row in rows:
         if row.link == MEASURED:
-            summary |= {
-                "measured_deg": math.degrees(row.gaze_rad),
-                "closure": rows[-1].gaze_rad / row.gaze_rad,
-            }
-    return summary
+            values["measured_deg"] = math.degrees(row.gaze_rad)
+            values["closure"] = total.gaze_rad / row.gaze_rad
+    words = budget_table(rows).text
+    if made.one_light:  # pillars of one size that treat x and y differently
+        values["light"] = f"for {made.one_light} alone: {made.cell.described}"
+        words += f"\n{values['light']}"
+    return options.console.judged(values, words, budget.above)
 
 
 def save_budget(
@@ -97,15 +85,12 @@ def save_budget(
     Args:
         path: of the file. rows: of the budget. provenance: of the file.
     """
-    numbers = {
-        name: np.array([getattr(r, name) for r in rows])
-        for name in ("phase_rad", "psf", "gaze_rad")
+    arrays = {
+        name: np.array([getattr(row, name) for row in rows])
+        for name in BudgetEntry.__slots__
     }
-    words = {
-        name: np.array([getattr(r, name) for r in rows]) for name in ("link", "method")
-    }
-    counted = {"counted": np.array([r.counted for r in rows], np.uint8)}
-    store.save(path, "budget", numbers | words | counted, provenance=provenance)
+    arrays["counted"] = arrays["counted"].astype(np.uint8)
+    store.save(path, "budget", arrays, provenance=provenance)
 
 
 @typed_reader
@@ -119,18 +104,13 @@ def load_budget(path: Path) -> list[BudgetEntry]:
         StoreError: not a budget file.
     """
     arrays = store.load(path, "budget").arrays
-    words = {
-        n: [w.decode() if isinstance(w, bytes) else str(w) for w in arrays[n]]
-        for n in ("link", "method")
-    }
-    counted = [bool(c) for c in arrays.get("counted", np.ones(len(words["link"])))]
-    columns = (
-        words["link"],
-        *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")),
-        words["method"],
-        counted,
-    )
-    return [BudgetEntry(*row) for row in zip(*columns, strict=True)]
+    columns = {name: arrays[name].tolist() for name in BudgetEntry.__slots__}
+    for name in ("link", "method"):
+        columns[name] = [
+            word.decode() if isinstance(word, bytes) else word for word in columns[name]
+        ]
+    columns["counted"] = [bool(value) for value in columns["counted"]]
+    return [BudgetEntry(*row) for row in zip(*columns.values(), strict=True)]
 
 
 def write_budget_page(path: Path, rows: list[BudgetEntry]) -> None:
@@ -139,27 +119,16 @@ def write_budget_page(path: Path, rows: list[BudgetEntry]) -> None:
     Args:
         path: to write. rows: of the budget.
     """
-    named = {row.link: row for row in rows}
-    figures = [
-        report.KeyFigure(words, f"{math.degrees(named[link].gaze_rad):.2g}°")
-        for words, link in (
-            ("gaze error of all links", TOTAL),
-            ("measured on the same frames", MEASURED),
-        )
-        if link in named and math.isfinite(named[link].gaze_rad)
-    ]
     words = (
-        "From the true pupil to the answer one cause more at a time, from there to the pillars each changed alone in "
-        "the device's image. What a network was trained with is shown switched off and is not in the sum. Without a "
-        "run nothing reads gaze."
+        "From the true pupil to the predicted gaze one cause more at a time, from there to the pillars each changed "
+        "alone in the device's image. What a network was trained with is shown switched off and is not in the sum. "
+        "Without a run nothing reads gaze."
     )
     picture = report.Figure(
         plot_budget(rows), "Error of each link, log scale.", wide=True
     )
-    table = budget_table(rows)
-    section = report.Section("Error budget", words, (picture, table))
-    lead = "What each link of the chain costs, in phase, PSF and gaze."
-    report.write_report(path, "Error budget", [section], lead=lead, key_figures=figures)
+    section = report.Section("Error budget", words, (picture, budget_table(rows)))
+    report.write_report(path, "Error budget", [section])
 
 
 def budget_table(rows: list[BudgetEntry]) -> report.Table:
@@ -170,14 +139,12 @@ def budget_table(rows: list[BudgetEntry]) -> report.Table:
     """
     head = ("link", "phase / rad", "PSF, relative", "gaze / deg", "method")
     caption = "Mean angles over eyes; the sum is the root of their squares."
-    return report.Table(head, [budget_cells(row) for row in rows], caption)
-
-
-def budget_cells(row: BudgetEntry) -> tuple[str, ...]:
-    """A row as words: link, phase in rad, PSF, gaze in degrees, method; – for none."""
-    values = row.phase_rad, row.psf, math.degrees(row.gaze_rad)
-    shown = ("–" if math.isnan(v) else f"{v:.2g}" for v in values)
-    return (row.link, *shown, row.method)
+    cells = []
+    for row in rows:
+        values = row.phase_rad, row.psf, math.degrees(row.gaze_rad)
+        shown = ("–" if math.isnan(value) else f"{value:.2g}" for value in values)
+        cells.append((row.link, *shown, row.method))
+    return report.Table(head, cells, caption)
 
 
 def plot_budget(rows: list[BudgetEntry]) -> bytes:
@@ -216,21 +183,3 @@ def _budget_inputs(options: Options) -> BudgetInputs:
         run=finished.load_finished_run(options.run) if options.run else None,
         frames=options.frames,
     )
-
-
-def _provenance(options: Options, given: BudgetInputs) -> store.Provenance:
-    weights = options.run / "checkpoint.safetensors" if options.run else None
-    files = [options.lens, options.library, options.process, options.asbuilt, weights]
-    return store.Provenance(
-        config=f"fwhm_nm = {given.fwhm_nm}\n",
-        inputs={f.name: store.sha256(f) for f in files if f is not None},
-    )
-
-
-def _without_nan(values: Any) -> Any:
-    """Values for JSON, with None in place of nan."""
-    if isinstance(values, dict):
-        return {k: _without_nan(v) for k, v in values.items()}
-    if isinstance(values, list):
-        return [_without_nan(v) for v in values]
-    return None if isinstance(values, float) and math.isnan(values) else values

@@ -16,23 +16,21 @@ from codesign.commands.options.codesign import Options
 from codesign.network import Subnet
 from codesign.optics import image_formation
 from codesign.optics import stack as trained
-from codesign.settings import Part
 from codesign.train import (
     BudgetResult,
     CodesignRun,
-    LogRecord,
     RunConfig,
     assess,
     best_candidate,
     checkpoint,
     device_of,
     finished_budgets,
-    pareto_front,
     place_on_device,
     results,
     search,
 )
 from codesign.train import run as runs
+from codesign.train.trainer import TrainedModel
 from metalens import lens
 from metalens.core import config, report, store, transaction
 from metalens.core.errors import ConfigError
@@ -52,9 +50,9 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    settings = _with_frozen_parts(
-        runs.load_run_settings(options.config), options.freeze
-    )
+    settings = runs.load_run_settings(options.config)
+    frozen = tuple(sorted({*settings.run.frozen, *options.freeze}))
+    settings = replace(settings, run=replace(settings.run, frozen=frozen))
     device = device_of(options.device)
     parallel.join_processes(device)
     if parallel.process_rank():
@@ -88,8 +86,6 @@ def _train_and_search(
     """
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
-    if settings.run.pitch_um < settings.optics.sample_um:
-        console.say(_fine_pitch_warning(settings))
     place_on_device(going.trainer, device)
     parallel.wait_for_all()
     event_writer = _event_writer(folder, going.trainer.step) if options.events else None
@@ -99,85 +95,53 @@ def _train_and_search(
     for record in console.track(records, total=steps_left, label="training"):
         checkpoint.append_entry(folder / LOG, {"kind": "step", **asdict(record)})
         if event_writer:
-            _write_events(event_writer, record)
+            for name, value in asdict(record).items():
+                event_writer.add_scalar(name, float(value), record.step)
+            event_writer.flush()
         if (limit := going.trainer.pitch_held_um) is not None and not pitch_reported:
             pitch_reported = True
-            console.say(f"step {record.step}: {_of_pitch(going, limit)}")
+            console.say(f"step {record.step}: {_pitch_limit_text(going, limit)}")
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
     for budget, candidate in search.search_architectures(going, folder / CHECKPOINT):
-        score = {
-            "budget_mmacs": budget,
-            "error": candidate.error,
-            "mmacs": candidate.macs / 1e6,
-        }
+        mmacs = candidate.macs / 1e6
         entry = {
-            "kind": "birth",
-            **score,
+            "kind": "birth", "budget_mmacs": budget, "error": candidate.error, "mmacs": mmacs,
             "architecture": asdict(candidate.architecture),
-        }
+        }  # fmt: skip
         checkpoint.append_entry(folder / LOG, entry)
         console.say(
-            f"budget {budget:g} MMACs: gaze error {candidate.error:.2f} deg at {candidate.macs / 1e6:.2f} MMACs"
+            f"budget {budget:g} MMACs: gaze error {candidate.error:.2f} deg at {mmacs:.2f} MMACs"
         )
     parallel.leave_processes()
     ends = finished_budgets(going)
-    image = _image_record(going)
-    _write_results(folder, going, ends, image)
-    if options.export:
-        _export(folder, going, ends)
+    margin = settings.scenes.margin
+    image = image_formation.describe_image(
+        settings.optics, going.trainer.model.coefficients_rad.detach(),
+        settings.scenes.pixels + 2 * margin, margin=margin,
+    )  # fmt: skip
+    _write_results(folder, going, ends, image, export=options.export)
     return [end.row for end in ends], image
 
 
-def _fine_pitch_warning(settings: RunConfig) -> str:
-    """Warning that the pitch is finer than the samples of the image."""
-    return (
-        f"run.pitch_um = {settings.run.pitch_um:g} is finer than the samples of the image, optics.sample_um = "
-        f"{settings.optics.sample_um:g}: such pixels cost more and show nothing new"
-    )
-
-
-def _of_pitch(codesign_run: CodesignRun, limit_um: float) -> str:
+def _pitch_limit_text(codesign_run: CodesignRun, limit_um: float) -> str:
     """Why the pitch was clamped at a limit, and what to change."""
     settings = codesign_run.settings
+    cause = "coarser pixels would leave a network less than it can take"
     if limit_um <= codesign_run.trainer.model.finest_um:
-        return (
-            f"the pitch is held at {limit_um:.3f} um and asks for less, where the smallest network would be beyond "
-            f"the budget of {min(settings.run.budgets_mmacs):g} MMACs"
+        cause = (
+            "finer pixels take the smallest network beyond the budget of "
+            f"{min(settings.run.budgets_mmacs):g} MMACs"
         )
-    if limit_um <= settings.optics.sample_um:
-        more = settings.optics.sample_um / 2
-        return (
-            f"the pitch is held at {limit_um:.3f} um, the samples of the image, and asks for less; to let it go on, "
-            f"set optics.sample_um = {more:g} with optics.window_samples, scenes.pixels and scenes.margin twice as many"
+    elif limit_um <= settings.optics.sample_um:
+        cause = (
+            "the samples of the image; halve optics.sample_um, and double optics.window_samples, scenes.pixels and "
+            "scenes.margin, to let it go on"
         )
-    return f"the pitch is held at {limit_um:.3f} um: coarser pixels would leave a network less than it can take"
-
-
-def _image_record(codesign_run: CodesignRun) -> dict[str, Any]:
-    """Image model of a run and its error:
-    :func:`codesign.optics.image_formation.describe_image`.
-    """
-    settings = codesign_run.settings
-    side = settings.scenes.pixels + 2 * settings.scenes.margin
-    coefficients = codesign_run.trainer.model.coefficients_rad.detach()
-    return image_formation.describe_image(
-        settings.optics, coefficients, side, margin=settings.scenes.margin
-    )
-
-
-def _export(folder: Path, codesign_run: CodesignRun, ends: list[BudgetResult]) -> None:
-    """Write the network of every budget as ONNX."""
-    for end, state in zip(ends, codesign_run.searches, strict=True):
-        path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
-        own = replace(codesign_run, trainer=end.trainer)
-        net = end.trainer.model.net
-        onnx_file.write_network_file(
-            path, own, net, best_candidate(state.history).architecture
-        )
+    return f"the pitch is held at {limit_um:.3f} um: {cause}"
 
 
 def _train_along(folder: Path, settings: RunConfig, device: torch.device) -> int:
@@ -196,12 +160,6 @@ def _train_along(folder: Path, settings: RunConfig, device: torch.device) -> int
     return 0
 
 
-def _with_frozen_parts(settings: RunConfig, parts: tuple[Part, ...]) -> RunConfig:
-    """The settings with further parts frozen."""
-    frozen = tuple(sorted({*settings.run.frozen, *parts}))
-    return replace(settings, run=replace(settings.run, frozen=frozen))
-
-
 def _event_writer(folder: Path, step: int) -> Any:
     """TensorBoard events of the run's folder; those beyond a resumed step are dropped.
 
@@ -216,14 +174,6 @@ def _event_writer(folder: Path, step: int) -> Any:
         ) from None
     make: Any = SummaryWriter
     return make(str(folder), purge_step=step + 1 if step else None)
-
-
-def _write_events(writer: Any, record: LogRecord) -> None:
-    """Write a step's scalars to TensorBoard."""
-    for name, value in asdict(record).items():
-        if name != "step":
-            writer.add_scalar(name, float(value), record.step)
-    writer.flush()
 
 
 def _start(folder: Path, settings: RunConfig) -> CodesignRun:
@@ -251,30 +201,54 @@ def _write_results(
     folder: Path,
     codesign_run: CodesignRun,
     ends: list[BudgetResult],
-    said: dict[str, Any],
+    image: dict[str, Any],
+    *,
+    export: bool,
 ) -> None:
-    """Write lens.h5, networks, result.json, answers.h5 and the plot of the Pareto
-    set.
+    """Write the lenses, networks, candidates' errors over cost, result.json and
+    answers.h5.
     """
-    settings = codesign_run.settings
+    settings, trainer = codesign_run.settings, codesign_run.trainer
     provenance = store.Provenance(
         config=config.dumps(settings), seed=settings.inner.seed
     )
-    phase = codesign_run.trainer.model.coefficients_rad.detach()
-    lens.save(
-        folder / "lens.h5", trained.trained_lens(settings.optics, phase, provenance)
-    )
-    _write_networks(folder, codesign_run, ends, provenance)
-    pitch_um = float(codesign_run.trainer.model.pitch_um.detach())
+
+    def save_lens(path: Path, model: TrainedModel) -> None:
+        phase = model.coefficients_rad.detach()
+        lens.save(path, trained.trained_lens(settings.optics, phase, provenance))
+
+    save_lens(folder / "lens.h5", trainer.model)
+    figure, axes = report.make_figure(size=(6.0, 4.0))
+    for end, state in zip(ends, codesign_run.searches, strict=True):
+        model, budget = end.trainer.model, end.row["budget_mmacs"]
+        architecture = best_candidate(state.history).architecture
+        costs = [candidate.macs / 1e6 for candidate in state.history]
+        errors = [candidate.error for candidate in state.history]
+        axes.plot(costs, errors, "o", label=f"budget {budget:g} MMACs")
+        optics = {
+            "optics.coefficients_rad": model.coefficients_rad,
+            "optics.log_pitch": model.log_pitch,
+        }
+        network = Subnet(model.net, architecture)
+        checkpoint.save_network(weights_file(folder, budget), network, beside=optics)
+        if settings.search.inner_steps:
+            save_lens(lens_file(folder, settings, budget), model)
+        if export:
+            own = replace(codesign_run, trainer=end.trainer)
+            path = folder / f"subnet_{budget:g}.onnx"
+            onnx_file.write_network_file(path, own, model.net, architecture)
+    axes.set(xlabel="MMACs", ylabel="gaze error on validation / deg")
+    axes.legend()
+    store.write_bytes(folder / "pareto.png", report.figure_png(figure))
     rows = [end.row for end in ends]
     record = {
-        "pitch_um": pitch_um,
+        "pitch_um": float(trainer.model.pitch_um.detach()),
         "seed": settings.inner.seed,
         "steps": settings.inner.steps,
         "rows": rows,
         "frozen": list(settings.run.frozen),
-        "image": said,
-        "pitch_held_um": codesign_run.trainer.pitch_held_um,
+        "image": image,
+        "pitch_held_um": trainer.pitch_held_um,
         "threads": torch.get_num_threads(),
         "bytes_depend_on_threads": True,
     }
@@ -283,70 +257,8 @@ def _write_results(
         f"network_{i}": f"budget {row['budget_mmacs']:g} million MACs"
         for i, row in enumerate(rows)
     }
-    store.save(
-        folder / ANSWERS,
-        "answers",
-        results.predictions_of_frames(ends, SHOWN),
-        attributes=labels,
-    )
-    if codesign_run.searches:
-        store.write_bytes(folder / "pareto.png", _pareto_picture(codesign_run))
-
-
-def _write_networks(
-    folder: Path,
-    codesign_run: CodesignRun,
-    ends: list[BudgetResult],
-    about: store.Provenance,
-) -> None:
-    """Write every budget's network, cut to its architecture, with lens and pitch.
-
-    And its own lens file, where the search optimised lenses.
-    """
-    for end, state in zip(ends, codesign_run.searches, strict=True):
-        model = end.trainer.model
-        budget = end.row["budget_mmacs"]
-        network = Subnet(model.net, best_candidate(state.history).architecture)
-        optics = {
-            "optics.coefficients_rad": model.coefficients_rad,
-            "optics.log_pitch": model.log_pitch,
-        }
-        checkpoint.save_network(weights_file(folder, budget), network, beside=optics)
-        if codesign_run.settings.search.inner_steps:
-            own_lens = trained.trained_lens(
-                codesign_run.settings.optics, model.coefficients_rad.detach(), about
-            )
-            lens.save(lens_file(folder, codesign_run.settings, budget), own_lens)
-
-
-def _pareto_picture(codesign_run: CodesignRun) -> bytes:
-    """PNG of gaze error over cost of all candidates, with their Pareto set."""
-    figure, axes = report.make_figure(size=(6.0, 4.0))
-    for budget, state in zip(
-        codesign_run.settings.run.budgets_mmacs, codesign_run.searches, strict=True
-    ):
-        macs = [c.macs / 1e6 for c in state.history]
-        axes.plot(
-            macs,
-            [c.error for c in state.history],
-            "o",
-            label=f"budget {budget:g} MMACs",
-        )
-    front = pareto_front([c for s in codesign_run.searches for c in s.history])
-    axes.step(
-        [c.macs / 1e6 for c in front],
-        [c.error for c in front],
-        where="post",
-        color="k",
-        label="Pareto set",
-    )
-    axes.set(
-        xlabel="MMACs",
-        ylabel="gaze error on validation / deg",
-        title="Accuracy against compute",
-    )
-    axes.legend()
-    return report.figure_png(figure)
+    answers = results.predictions_of_frames(ends, SHOWN)
+    store.save(folder / ANSWERS, "answers", answers, attributes=labels)
 
 
 COLUMNS = {  # of the table, by name in result.json

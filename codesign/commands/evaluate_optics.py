@@ -18,10 +18,10 @@ from codesign.evaluate import (
     SensitivityScenes,
     field_page,
     judge_lenses,
+    plots,
     reader,
 )
 from codesign.evaluate import optics as evaluate_optics
-from codesign.evaluate import plots as evaluate_plots
 from codesign.eye import states_at
 from metalens import design
 from metalens import lens as lenses
@@ -75,7 +75,7 @@ def run(options: Options) -> int:
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)
-    words = f"{text}\n\n{folder}: tables.txt, optics.json, five pictures, report.html"
+    words = f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html"
     return options.console.judged(values, words, values["failures"])
 
 
@@ -130,14 +130,21 @@ def _measure(
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
-    pictures = {
-        "axial": evaluate_plots.plot_axial_information(axial, setting),
-        "slices": evaluate_plots.plot_depth_slices(axial, setting),
-        "scenes": evaluate_plots.plot_scenes(scenes),
-        "field": field_page.plot_over_field(over_field),
-        "mtf": field_page.mtf_picture(over_field),
-    }
-    _write_page(folder, pictures, tables)
+    sections = [Section("Tables", items=tables)]
+    for name, picture, caption in (
+        ("field", field_page.plot_over_field(over_field), field_page.CAPTION),
+        ("scenes", plots.plot_scenes(scenes), plots.CAPTIONS["scenes"]),
+        (
+            "axial",
+            plots.plot_axial_information(axial, setting),
+            plots.CAPTIONS["axial"],
+        ),
+    ):
+        store.write_bytes(folder / f"{name}.png", picture)
+        sections.insert(
+            0, Section(items=[Figure(picture, caption, wide=True)], title=name)
+        )
+    write_report(folder / "report.html", "What the lenses tell", sections)
     return values, text
 
 
@@ -155,18 +162,6 @@ def _reader_table(
         "settings": dataclasses.asdict(setting),
         "lenses": numbers,
     }
-
-
-def _write_page(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:
-    """The pictures, and the page of pictures and tables."""
-    captions = evaluate_plots.CAPTIONS | field_page.CAPTIONS
-    for name, image in pictures.items():
-        store.write_bytes(folder / f"{name}.png", image)
-    items = [
-        Figure(image, captions[name], wide=True) for name, image in pictures.items()
-    ]
-    sections = [Section("Pictures", items=items), Section("Tables", items=tables)]
-    write_report(folder / "report.html", "What the lenses tell", sections)
 
 
 def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:

@@ -1,7 +1,9 @@
-"""RUN_DIR... to Figs. 10 and 11: gaze and slippage of synthetic subjects before each
-run's lens and network (Sec. 5).
+"""RUN_DIR... to Figs. 10 and 11: gaze and slippage of synthetic subjects, or in own
+frames, before each run's lens and network (Sec. 5).
 """
 
+import csv
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,7 +14,14 @@ import numpy as np
 
 from codesign.adapt import FinishedRun, retrained_network
 from codesign.commands.options.experiment import Options
-from codesign.evaluate import AXIAL, LATERAL, RunResult, plots, run_experiment
+from codesign.evaluate import (
+    AXIAL,
+    LATERAL,
+    RunResult,
+    own_frames,
+    plots,
+    run_experiment,
+)
 from codesign.gaze import PopulationPrior, people_file
 from codesign.optics import image_formation
 from codesign.settings import ExperimentConfig
@@ -22,11 +31,10 @@ from metalens.core import reading, report, store
 from metalens.core.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
-GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-range"}
 
 
 def run(options: Options) -> int:
-    """Run the virtual experiment: simulate, predict, calibrate, and write tables and
+    """Simulate subjects or read own frames, predict, calibrate, and write tables and
     plots.
 
     Exit 1 where the error of a run's images is above what the run requires.
@@ -45,72 +53,117 @@ def run(options: Options) -> int:
         raise ConfigError(
             f"names {', '.join(names)}: two are alike; give every run one of its own"
         )
-    folder = options.output
-    config = options.settings
-    sources = [retrained_network.load_retrained(path) for path in options.runs]
-    with options.claim_folder(folder) as draft:
-        results: list[RunResult] = []
-        steps = run_experiment(sources, config, names=names)
-        for _, latest in options.console.track(
-            steps, total=config.subjects, label="subjects"
-        ):
-            results = latest
-        lenses = {
-            name: retrained_network.lens_of(path)
-            for name, path in zip(names, options.runs, strict=True)
-        }
-        values = experiment_summary(results, config) | {
-            "images": image_summary(options.runs, names),
-            "lenses": lenses,
-            "beyond_training_mm": {
-                name: _beyond_training(source, config)
-                for name, source in zip(names, sources, strict=True)
-            },
-        }
-        values["failures"] = [
-            f"{result.name}: {result.above}" for result in results if result.above
-        ]
-        pictures = {
-            "ambiguity.png": plots.plot_ambiguity(results[0]),
-            "errors.png": plots.plot_gaze_errors(results),
-        }
-        _write_files(draft.path, values, pictures)
-        for number, (result, source) in enumerate(
-            zip(results, sources, strict=True), 1
-        ):
-            if isinstance(result.how, PopulationPrior):
-                people_file.save_people(
-                    draft.path / f"people_{number}.h5",
-                    result.how,
-                    provenance=_provenance(source, config),
-                )
-    return options.console.judged(
-        values, f"{experiment_text(values)}\nopen {folder / PAGE}", values["failures"]
-    )
-
-
-def _provenance(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
-    """Settings of run and experiment, and the seed."""
-    seed = source.settings.inner.seed
-    return store.Provenance(
-        config=f"{settings.dumps(source.settings)}\n{settings.dumps(config)}", seed=seed
-    )
-
-
-def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """Image model and error of every run, from its result.json; None where it has none.
-
-    Of a retraining, those of its run.
-
-    Args:
-        folders: of finished runs. names: of the runs.
-    """
-    return {
-        name: json.loads(
-            (retrained_network.run_of(folder) / "result.json").read_text("utf-8")
-        ).get("image")
-        for name, folder in zip(names, folders, strict=True)
+    sources = {
+        name: retrained_network.load_retrained(path)
+        for name, path in zip(names, options.runs, strict=True)
     }
+    with options.claim_folder(options.output) as draft:
+        if options.frames:
+            values, text = _read_own_frames(
+                options.frames, options.settings, sources, draft.path
+            )
+        else:
+            values, text = _simulate(options, sources, draft.path)
+        store.write_text(draft.path / JSON, json.dumps(values, indent=1) + "\n")
+    return options.console.judged(
+        values, f"{text}\nopen {options.output / PAGE}", values["failures"]
+    )
+
+
+def _read_own_frames(
+    frames: Path,
+    config: ExperimentConfig,
+    sources: dict[str, FinishedRun],
+    folder: Path,
+) -> tuple[dict[str, Any], str]:
+    """Predictions of every run for own frames, a table a run, and a page of their
+    errors; the numbers, and the table as text.
+    """
+    rows = []
+    for name, source in sources.items():
+        table = own_frames.predict_own_frames(source, frames, config)
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerows([table, *zip(*table.values(), strict=True)])
+        store.write_text(folder / f"{name}.csv", text.getvalue())
+        errors = {k: v for k, v in table.items() if "error" in k or k == "iou"}
+        rows.append(
+            {"name": name, "frames": len(table["file"])}
+            | {k: float(np.nanmean(v)) for k, v in errors.items()}
+        )
+    head = [report.in_words(name) for name in rows[0]]
+    shown = report.Table(head, [list(row.values()) for row in rows], digits=3)
+    words = (
+        "Mean absolute errors over the frames whose targets are given. Gaze is calibrated on "
+        f"{config.share:.0%} of each subject's stimuli and judged on the others; the prior of its map comes "
+        f"from {config.people} simulated people. Predictions of every frame: a table a run."
+    )
+    section = report.Section("Errors", words, [shown])
+    report.write_report(folder / PAGE, "Own frames", [section])
+    return {"frames": str(frames), "runs": rows, "failures": []}, shown.text
+
+
+def _simulate(
+    options: Options, sources: dict[str, FinishedRun], folder: Path
+) -> tuple[dict[str, Any], str]:
+    """The virtual experiment of all runs, with files, plots and page in the folder; the
+    numbers, and their tables as text.
+    """
+    config, names = options.settings, list(sources)
+    results: list[RunResult] = []
+    steps = run_experiment(list(sources.values()), config, names=names)
+    for _, latest in options.console.track(
+        steps, total=config.subjects, label="subjects"
+    ):
+        results = latest
+    paths = dict(zip(names, options.runs, strict=True))
+    values = experiment_summary(results, config) | {
+        "images": {name: _image_record(path) for name, path in paths.items()},
+        "lenses": {n: retrained_network.lens_of(path) for n, path in paths.items()},
+        "beyond_training_mm": {
+            name: _beyond_training(source, config) for name, source in sources.items()
+        },
+        "failures": [
+            f"{result.name}: {result.above}" for result in results if result.above
+        ],
+    }
+    figures = []
+    for name, picture in (
+        ("errors.png", plots.plot_gaze_errors(results)),
+        ("ambiguity.png", plots.plot_ambiguity(results[0])),
+    ):
+        store.write_bytes(folder / name, picture)
+        figures.append(report.Figure(picture, CAPTIONS[name], wide=True))
+    for number, result in enumerate(results, 1):
+        if isinstance(result.how, PopulationPrior):
+            run_settings = sources[result.name].settings
+            origin = store.Provenance(
+                config=f"{settings.dumps(run_settings)}\n{settings.dumps(config)}",
+                seed=run_settings.inner.seed,
+            )
+            people_file.save_people(
+                folder / f"people_{number}.h5", result.how, provenance=origin
+            )
+    tables, remarks = experiment_tables(values), _remarks(values)
+    sections = [
+        report.Section("Numbers", ". ".join([_method_text(config), *remarks]), tables),
+        report.Section("Figures", "", figures),
+    ]
+    report.write_report(folder / PAGE, "Virtual experiment", sections)
+    images = [
+        f"{name}: {image_formation.describe_image_text(image)}"
+        for name, image in values["images"].items()
+        if image
+    ]
+    return values, "\n".join([*(table.text for table in tables), *remarks, *images])
+
+
+def _image_record(folder: Path) -> Any:
+    """Image model and error of a run, or of the run of a retraining, from its
+    result.json; None where it has none.
+    """
+    path = retrained_network.run_of(folder) / "result.json"
+    return json.loads(path.read_text("utf-8")).get("image")
 
 
 def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -131,6 +184,9 @@ def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
     )
 
 
+FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
+
+
 def experiment_summary(
     results: Sequence[RunResult], config: ExperimentConfig
 ) -> dict[str, Any]:
@@ -149,39 +205,24 @@ def experiment_summary(
             row[quantity] = float(values.mean())
             if len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap_interval(values))
-        rows.append(row | _finer_image_errors(result, row))
+        fine = None if result.finer is None else _subject_means(result.finer)
+        for name in FINER:
+            row[f"finer_{name}"] = None if fine is None else float(fine[name].mean())
+        row["finer_ratio"] = (
+            None if fine is None else row[f"finer_{FINER[0]}"] / row[FINER[0]]
+        )
+        rows.append(row)
     ratios = []
     for other, means in zip(results[1:], subject_means[1:], strict=True):
-        for quantity in (
-            "gaze_axial_deg",
-            "gaze_lateral_deg",
-            "slip_mm",
-            "slip_axial_mm",
-        ):
+        for quantity in FINER[:4]:
             value, low, high = bootstrap_ratio(
                 subject_means[0][quantity], means[quantity]
             )
             ratios.append({
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
-                "goal": GOALS.get(quantity, ""),
             })  # fmt: skip
     about = {**asdict(config), "frames": config.frames}
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
-
-
-FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
-
-
-def _finer_image_errors(result: RunResult, row: dict[str, Any]) -> dict[str, Any]:
-    """Mean errors on the finer image, and the ratio of its gaze error; None without
-    one.
-    """
-    if result.finer is None:
-        return {f"finer_{name}": None for name in (*FINER, "ratio")}
-    means = _subject_means(result.finer)
-    errors = {f"finer_{name}": float(means[name].mean()) for name in FINER}
-    ratio = errors["finer_gaze_axial_deg"] / row["gaze_axial_deg"]
-    return errors | {"finer_ratio": ratio}
 
 
 def _beyond_training(
@@ -248,31 +289,6 @@ def _remarks(values: dict[str, Any]) -> list[str]:
     return made
 
 
-def experiment_text(values: dict[str, Any]) -> str:
-    """The tables and remarks as text.
-
-    Args:
-        values: content of experiment.json.
-    """
-    images = [
-        f"{name}: {image_formation.describe_image_text(image)}"
-        for name, image in values["images"].items()
-        if image
-    ]
-    tables = [table.text for table in experiment_tables(values)]
-    return "\n".join([*tables, *_remarks(values), *images])
-
-
-def _write_files(
-    folder: Path, values: dict[str, Any], pictures: dict[str, bytes]
-) -> None:
-    """Write pictures, page and experiment.json."""
-    for name, picture in pictures.items():
-        store.write_bytes(folder / name, picture)
-    _page(folder / PAGE, values, pictures)
-    store.write_text(folder / JSON, json.dumps(values, indent=1) + "\n")
-
-
 # what the numbers are called in the result, and in tables
 COLUMNS = {
     "name": "run",
@@ -293,53 +309,22 @@ CAPTIONS = {
 }
 
 
-def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
-    """Write report.html."""
-    figures = [
-        report.Figure(pictures[name], caption, wide=True)
-        for name, caption in CAPTIONS.items()
-    ]
-    keys = [
-        report.KeyFigure(
-            f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°"
-        )
-        for r in values["runs"]
-    ]
-    words = [
-        _method_text(values["settings"]),
-        *(f"{line}." for line in _remarks(values)),
-    ]
-    sections = [
-        report.Section("Numbers", " ".join(words), experiment_tables(values)),
-        report.Section("Figures", "", figures),
-    ]
-    report.write_report(path, "Virtual experiment", sections, key_figures=keys)
-
-
-def _method_text(about: dict[str, Any]) -> str:
-    """Paragraph on subjects, calibration and intervals."""
-    return (
-        f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each is calibrated on "
-        f"{about['share']:.0%} of the stimuli, drawn at random, and judged on the rest: what is read (axis, "
-        f"pupil, slippage) becomes gaze by a linear mixed model learned from {about['people']} other people, or, of a "
-        "network that tells no axis, by a sphere and a regressor of one hidden layer. Subjects "
-        f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. Intervals are over subjects. "
-        f"{_light_text(about)}"
-    )
-
-
-def _light_text(about: dict[str, Any]) -> str:
-    """Sentences on light level and image model of the frames."""
-    image = {"true": "the true image", "trained": "the image of training"}
+def _method_text(config: ExperimentConfig) -> str:
+    """Sentences on subjects, calibration, intervals, light and image model."""
     light = (
         "in good light"
-        if about["snr_db"] is None
-        else f"in dim light under a bright background, {about['snr_db']:g} dB in a "
+        if config.snr_db is None
+        else f"in dim light under a bright background, {config.snr_db:g} dB in a "
         "pixel of the first run behind a lens that images all light; exposure and "
         "background are the same for every run"
     )
     return (
-        f"Frames are {image[about['image']]} {light}. The finer image is formed at a "
+        f"{config.subjects} subjects whom training never saw, {config.frames} frames. Each is calibrated on "
+        f"{config.share:.0%} of the stimuli, drawn at random, and judged on the rest: what is read (axis, "
+        f"pupil, slippage) becomes gaze by a linear mixed model learned from {config.people} other people, or, of a "
+        "network that predicts no axis, by a sphere and a regressor of one hidden layer. Subjects "
+        f"fixate with {config.fixation_deg} degrees of scatter, which counts as error. Intervals are over subjects. "
+        f"Frames are the {config.image} image {light}. The finer image is formed at a "
         "quarter of the run's tolerance; a ratio near 1 says that results do not "
-        "depend on it."
+        "depend on it"
     )

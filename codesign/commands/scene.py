@@ -18,6 +18,7 @@ from codesign.eye import (
     dataset,
     landmarks,
 )
+from codesign.settings import LEAST, check_ranges
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
@@ -57,34 +58,19 @@ class SceneSettings:
     layer_mm: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 1 <= self.frames <= 100_000:
-            raise ConfigError(f"frames = {self.frames}: need 1 to 100000")
-        if not 0 < self.layer_mm <= 0.5:
-            raise ConfigError(
-                f"layer_mm = {self.layer_mm}: need a thickness above 0 and at most 0.5 mm"
-            )
-        if not (
-            8 <= self.pixels <= 8192
-            and 0 < self.pitch_um < 1e4
-            and 0 < self.distance_mm < 1e4
-        ):
-            raise ConfigError(
-                f"pixels = {self.pixels}, pitch_um = {self.pitch_um}, distance_mm = {self.distance_mm}: need 8 to 8192 "
-                "pixels, and a pitch and a distance above 0"
-            )
-        if (
-            abs(self.elevation_deg) >= 90
-            or not all(0 <= v < 90 for v in self.gaze_deg)
-            or min(self.slip_mm) < 0
-        ):
-            raise ConfigError(
-                f"elevation_deg = {self.elevation_deg}, gaze_deg = {self.gaze_deg}, slip_mm = {self.slip_mm}: need "
-                "angles below 90, ranges of 0 or more"
-            )
-        if not 0 <= self.scale < 0.5:
-            raise ConfigError(f"scale = {self.scale}: need 0 to 0.5")
-        if not 0 <= self.variety <= 4:
-            raise ConfigError(f"variety = {self.variety}: need 0 to 4")
+        check_ranges(
+            self,
+            frames=(1, 100_000),
+            pixels=(8, 8192),
+            pitch_um=(LEAST, 1e4),
+            elevation_deg=(-89, 89),
+            distance_mm=(LEAST, 1e4),
+            gaze_deg=(0, 89),
+            slip_mm=(0, 1e4),
+            scale=(0, 0.49),
+            variety=(0, 4),
+            layer_mm=(LEAST, 0.5),
+        )
 
     @property
     def rig(self) -> CameraRig:
@@ -99,7 +85,8 @@ class SceneSettings:
     def motion(self) -> MotionRanges:
         """Ranges in um and rad."""
         x, y = (math.radians(angle) for angle in self.gaze_deg)
-        slip = (self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3)
+        x_mm, y_mm, z_mm = self.slip_mm
+        slip = (x_mm * 1e3, y_mm * 1e3, z_mm * 1e3)
         return replace(
             widen_motion(self.variety),
             gaze_x_rad=x,

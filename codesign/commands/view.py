@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from codesign.commands import budget as budgets
-from codesign.network import Architecture
-from codesign.train import EvaluatedCandidate, pareto_front
 from metalens.core import report, store
 from metalens.core.arrays import Array
 from metalens.core.errors import StoreError
@@ -91,22 +89,18 @@ def _training_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     steps = [entry for entry in entries if entry.get("kind") == "step"]
     if len(steps) < 2:
         return []
+    panels: list[Panel] = []
     x = np.array([entry["step"] for entry in steps], float)
-    names = [
-        k
-        for k, v in steps[0].items()
-        if k not in ("kind", "step") and isinstance(v, (int, float))
-    ]
-    values = {
-        name: np.array([entry.get(name, np.nan) for entry in steps], float)
-        for name in names
-    }
-    return [
-        CurvePanel(f"Training: {title}", x, "step", {title: curve}, "")
-        for name, curve in values.items()
-        if np.ptp(curve) > 0
-        for title in [report.in_words(name)]
-    ]
+    for name in steps[0]:
+        if name in ("kind", "step"):
+            continue
+        curve = np.array([entry.get(name, np.nan) for entry in steps], float)
+        if np.ptp(curve) > 0:
+            title = report.in_words(name)
+            panels.append(
+                CurvePanel(f"Training: {title}", x, "step", {title: curve}, "")
+            )
+    return panels
 
 
 def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
@@ -117,32 +111,25 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     births = [
         e
         for e in entries
-        if e.get("kind") == "birth"
-        and {"error", "mmacs", "budget_mmacs"} <= set(e)
-        and math.isfinite(e["error"])
+        if e.get("kind") == "birth" and np.isfinite(e.get("error", math.nan))
     ]
     if not births:
         return []
-    whichever = Architecture((), (), ())  # the front asks for error and cost alone
-    candidates = [EvaluatedCandidate(whichever, e["error"], e["mmacs"]) for e in births]
-    front = [
-        next(i for i, candidate in enumerate(candidates) if candidate is best)
-        for best in pareto_front(candidates)
-    ]
-    notes = [
-        dict(_layer_rows(e["architecture"])) if e.get("architecture") else {}
-        for e in births
-    ]
+    costs, errors = ([e[name] for e in births] for name in ("mmacs", "error"))
+    # of equal costs the lower error comes first
+    order = sorted(range(len(births)), key=lambda i: (costs[i], errors[i]))
+    best = np.minimum.accumulate([math.inf, *(errors[i] for i in order)])
+    front = [i for i, before in zip(order, best, strict=False) if errors[i] < before]
     return [
         PointPanel(
             "Networks of the searches",
-            [e["mmacs"] for e in births],
-            [e["error"] for e in births],
+            costs,
+            errors,
             "million MACs",
             "gaze error / deg",
             [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
             front,
-            notes=notes,
+            notes=[dict(_layer_rows(e["architecture"])) for e in births],
             caption="Errors are of the validation frames. Pick a network to read its layers.",
         )
     ]
@@ -202,13 +189,9 @@ def prediction_panels(path: Path) -> list[Panel]:
     panels.append(_pixels("Pupil", pair, axes, "share of the pixel"))
     rows = []
     for i, name in enumerate(names):
-        slips = np.stack(
-            [arrays["slip_um"], arrays["told_slip_um"][i]], axis=2
-        ).reshape(count, 6)
-        half_widths = (1e-3 * arrays["interval_um"][i]).tolist()
-        rows += [
-            (name, k, *(1e-3 * slips[k]).tolist(), half_widths[k]) for k in range(count)
-        ]
+        pairs = np.stack([arrays["slip_um"], arrays["told_slip_um"][i]], axis=2)
+        values = np.c_[pairs.reshape(count, 6), arrays["interval_um"][i]] * 1e-3
+        rows += [(name, k, *row) for k, row in enumerate(values.tolist())]
     columns = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]
     caption = "Slippage of the eye; z is along the axis of the camera."
     return [
@@ -226,21 +209,13 @@ def _network_panels(result: dict[str, Any]) -> list[Panel]:
     """Table of the results; [] without a result."""
     if not result:
         return []
-    rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
+    rows = result.get("rows", [])
     names = sorted(
-        {
-            name
-            for row in rows
-            for name, value in row.items()
-            if isinstance(value, (int, float, str))
-        }
+        {n for row in rows for n, v in row.items() if isinstance(v, (int, float, str))}
     )
+    head = [report.in_words(name) for name in names]
     table = [[row.get(name, "") for name in names] for row in rows]
-    return [
-        TablePanel(
-            "Networks of the run", [report.in_words(name) for name in names], table
-        )
-    ]
+    return [TablePanel("Networks of the run", head, table)] if rows else []
 
 
 def _pixels(
@@ -267,17 +242,11 @@ def scene_panels(path: Path) -> list[Panel]:
     depth_mm = 1e-3 * np.where(
         is_far, arrays["depth_um"][:, 1], arrays["depth_um"][:, 0]
     )
-    labels = {
-        name: arrays[f"labels/{name}"].reshape(count, -1)
-        for name in ("slip_um", "pupil_um", "visible")
-    }
-    columns = [
-        report.in_words(name) + (f", {axis}" if len(values[0]) > 1 else "")
-        for name, values in labels.items()
-        for axis, _ in zip("xyz", values[0], strict=False)
-    ]
-    table = np.concatenate(list(labels.values()), 1).tolist()
-    rows = [(i, *row) for i, row in enumerate(table)]
+    columns, labels = ["frame"], [np.arange(count)[:, None]]
+    for name in ("slip_um", "pupil_um", "visible"):
+        labels.append(arrays[f"labels/{name}"].reshape(count, -1))
+        axes = [f", {axis}" for axis in "xyz"] if labels[-1].shape[1] > 1 else [""]
+        columns += [report.in_words(name) + axis for axis in axes]
     radiance = arrays["radiance"].sum(1, dtype=float) / full
     pupil = arrays["pupil"] / full
     return [
@@ -286,8 +255,8 @@ def scene_panels(path: Path) -> list[Panel]:
         _pixels("Pupil", pupil, frames, "share of the pixel"),
         TablePanel(
             "Labels",
-            ("frame", *columns),
-            rows,
+            columns,
+            np.concatenate(labels, 1).tolist(),
             "Positions in the camera's axes; labels.csv holds all of them.",
         ),
     ]

@@ -2,6 +2,7 @@ from . import error_budget as error_budget
 from . import field_page as field_page
 from . import gaze_experiment as gaze_experiment
 from . import optics as optics
+from . import own_frames as own_frames
 from . import paper as paper
 from . import plots as plots
 from . import reader as reader

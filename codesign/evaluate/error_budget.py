@@ -10,9 +10,10 @@ import torch
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, process_state_of
 from codesign.adapt import FinishedRun
+from codesign.adapt.source import check_lens
 from codesign.batches import EXPERIMENT
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.eye import PinholeCamera, RenderedFrames, render
+from codesign.eye import RenderedFrames
 from codesign.gaze import NetworkReadings, PersonCalibrator, angle_deg
 from codesign.optics import MadeLens, OpticsConfig, image_formation
 from codesign.settings import ExperimentConfig
@@ -30,7 +31,6 @@ NONE = math.nan
 TOTAL, MEASURED = "all links", "measured, all at once"
 SOLVED = 12  # diameters at which pillars are solved again
 FINER = 30.0  # factor by which the tolerance of those solutions is smaller
-LABELS = 64  # pixels of renderings of which only the labels are used
 THINNED = 320  # frames on which small changes of the optics are judged
 
 
@@ -51,11 +51,6 @@ class BudgetEntry:
     counted: bool = True
 
 
-def quadrature_difference(error: float, before: float) -> float:
-    """Growth of an ``error`` over that ``before`` it, in quadrature; 0 where smaller."""
-    return math.sqrt(max(error**2 - before**2, 0.0))
-
-
 def quadrature_total(rows: list[BudgetEntry]) -> BudgetEntry:
     """Root of the sum of squares of the counted rows, column by column.
 
@@ -67,17 +62,12 @@ def quadrature_total(rows: list[BudgetEntry]) -> BudgetEntry:
         finite = [value for value in values if math.isfinite(value)]
         return math.hypot(*finite) if finite else NONE
 
-    without_gaze = [
-        row.link for row in rows if row.counted and math.isnan(row.gaze_rad)
-    ]
-    suffix = f"; gaze without {', '.join(without_gaze)}" if without_gaze else ""
-    return BudgetEntry(
-        TOTAL,
-        root_sum_square("phase_rad"),
-        root_sum_square("psf"),
-        root_sum_square("gaze_rad"),
-        f"root of the sum of squares{suffix}",
-    )
+    method = "root of the sum of squares"
+    without_gaze = [r.link for r in rows if r.counted and math.isnan(r.gaze_rad)]
+    if without_gaze:
+        method += f"; gaze without {', '.join(without_gaze)}"
+    columns = (root_sum_square(name) for name in ("phase_rad", "psf", "gaze_rad"))
+    return BudgetEntry(TOTAL, *columns, method)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,40 +114,6 @@ def image_through(optics: Optics, base: Imager) -> Imager:
     return with_psfs(base, *normalise_psfs(light, optics, base.plan))
 
 
-@torch.no_grad()
-def both_polarisations(optics: Optics, base: Imager) -> Imager:
-    """Imager by the flux of both polarisations through the sensor, in place of the
-    intensity of a scalar field.
-
-    The difference of the two is small and smooth: it is computed at 5 x 5 field points
-    at most, interpolated bilinearly, and added to the scalar PSFs.
-
-    Args:
-        optics: lens plane, films and sensor distance. base: its scalar imager.
-    """
-    plan = base.plan
-    if plan.window.components:
-        return base
-    coarse = [
-        torch.linspace(float(a[0]), float(a[-1]), min(5, len(a)), dtype=a.dtype)
-        for a in (plan.y_um, plan.x_um)
-    ]
-    at_coarse = replace(plan, y_um=coarse[0], x_um=coarse[1])
-    scalar, vectorial = (
-        node_light(
-            optics, replace(at_coarse, window=replace(plan.window, components=count))
-        )
-        for count in (0, plan.window.whole)
-    )
-    weights = [
-        (1 - (fine[:, None] - few).abs() / (few[1] - few[0])).clamp_min(0).to(scalar)
-        for fine, few in zip((plan.y_um, plan.x_um), coarse, strict=True)
-    ]
-    change = torch.einsum("ya,xb,abzhw->yxzhw", *weights, vectorial - scalar)
-    light = node_light(optics, plan) + change
-    return with_psfs(base, *normalise_psfs(light, optics, plan))
-
-
 class NetworkReading:
     """A run's network with the frames of the virtual experiment, and the calibrated
     persons.
@@ -185,8 +141,15 @@ class NetworkReading:
             trials.append(trial)
         self.trial = experiment.join_subjects(trials)
         calibration = experiment.calibration_frames(self.trial, config)
-        judged = ~np.isin(np.arange(len(self.trial.subject)), calibration)
-        self.judged = judged & self.trial.group(experiment.AXIAL)
+        self.judged = self.trial.group(experiment.AXIAL)
+        self.judged[calibration] = False
+        rows = np.flatnonzero(self.judged)
+        self._rows = rows[:: max(1, len(rows) // THINNED)]
+        self._thinned = [
+            frames.rows(torch.from_numpy(self._rows[of_subject] % len(states)))
+            for subject, frames in enumerate(self.subjects)
+            for of_subject in [self.trial.subject[self._rows] == subject]
+        ]
         self.measured_rad = NONE
 
     def path(self, image: Imager, settings: OpticsConfig) -> Iterator[BudgetEntry]:
@@ -200,9 +163,7 @@ class NetworkReading:
             settings: optics that ``image`` was formed by.
         """
         config, source = self.config, self.source
-        sphere = experiment.sphere_calibrator(source, config)
-        exact = self._true_readings(config)
-        exact_fixed = self._true_readings(replace(config, fixation_deg=0.0))
+        exact = NetworkReadings(self._true_pupil_mm(), self.trial.slip_mm)
         trained_imager = experiment.prepare_run(source, image="trained")
         calibrator = experiment.run_calibrator(
             source, trained_imager, config, self.sensor
@@ -211,42 +172,33 @@ class NetworkReading:
             self._read(self.subjects, trained_imager, quiet=is_quiet)
             for is_quiet in (True, False)
         )
-        quiet_error = self._error_rad(quiet, calibrator)
-        # a network that reads the optic axis depends less on the pupil than the sphere
-        pupil_error = self._error_rad(
-            NetworkReadings(quiet.pupil_mm, exact.slip_mm), sphere
-        )
-        net = f"network of {source.row['mmacs']:.3g} MMACs, noiseless frames as in training"
-        people = (
-            f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
-        )
+        sphere = experiment.sphere_calibrator(source, config)
         states = [
-            ("subject and calibration", self._error_rad(exact_fixed, sphere),
-             f"true pupil and slippage; {people}"),
-            ("fixation", self._error_rad(exact, sphere),
-             f"scatter of {config.fixation_deg:g} deg about the stimulus"),
-            ("reader, pupil", min(pupil_error, quiet_error), net),
-            ("reader, slippage", quiet_error, net),
-            ("sensor noise", self._error_rad(noisy, calibrator), "frames with noise"),
+            ("subject and calibration", exact, sphere,
+             f"true pupil and slippage; fixation scatters by {config.fixation_deg:g} deg; {config.subjects} subjects, "
+             f"{config.share:.0%} of their stimuli calibrate"),
+            ("reader", quiet, calibrator,
+             f"network of {source.row['mmacs']:.3g} MMACs, noiseless frames as in training"),
+            ("sensor noise", noisy, calibrator, "frames with noise"),
         ]  # fmt: skip
         trained = source.run.trainer.optics
         if (trained.image, trained.fwhm_nm) != (settings.image, settings.fwhm_nm):
             calibrator = experiment.run_calibrator(source, image, config, self.sensor)
             noisy = self._read(self.subjects, image)
-            method = "the whole field in light of {:g} nm; training had {} in {:g} nm"
-            method = method.format(
-                settings.fwhm_nm,
-                "one PSF for all" if trained.image == "uniform" else "it",
-                trained.fwhm_nm,
-            )
-            error = self._error_rad(noisy, calibrator)
-            states.append(("image of training", error, method))
-        before = 0.0
-        for link, error, method in states:
-            added = quadrature_difference(error, before)
-            yield BudgetEntry(link, NONE, NONE, added, method)
-            before = error
-        self._store_people(noisy, calibrator)
+            had = "one PSF for all" if trained.image == "uniform" else "it"
+            states.append((
+                "image of training", noisy, calibrator,
+                f"the whole field in light of {settings.fwhm_nm:g} nm; training had {had} in {trained.fwhm_nm:g} nm",
+            ))  # fmt: skip
+        error_rad = 0.0
+        for link, read, how, method in states:
+            before_rad, error_rad = error_rad, self._error_rad(read, how)
+            growth = math.sqrt(max(error_rad**2 - before_rad**2, 0.0))
+            yield BudgetEntry(link, NONE, NONE, growth, method)
+        self.measured_rad = error_rad
+        self._people = experiment.calibrate_subjects(
+            noisy, self.trial, config, calibrator
+        )
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
         """Mean angle in rad between the gaze predicted from noiseless frames through
@@ -256,59 +208,31 @@ class NetworkReading:
             optics: imager after the change.
             base: imager before the change.
         """
-        trial = experiment.rows_of_trial(self.trial, self._rows)
         one, other = (
             experiment.predicted_gaze(
-                self._people, self._read(self._thin, imager, quiet=True), trial
+                self._people,
+                self._read(self._thinned, imager, quiet=True),
+                self.trial[self._rows],
             )
             for imager in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
-    def _true_readings(self, config: ExperimentConfig) -> NetworkReadings:
-        """True pupil (mm) and slippage (mm) of all frames of an experiment, from labels
-        of small renderings.
-        """
-        pupil, slip = [], []
-        pitch = self.scenes.camera.pitch_um * self.scenes.camera.pixels / LABELS
-        for subject in range(config.subjects):
-            states, _ = experiment.states_of(config, subject, self.scenes)
-            camera = PinholeCamera(LABELS, pitch)
-            labels = render(states, rig=self.scenes.rig, camera=camera).labels
-            pupil.append((labels.pupil_px - (LABELS - 1) / 2) * (pitch * 1e-3))
-            slip.append(labels.slip_um * 1e-3)
-        return NetworkReadings(
-            *(torch.cat(values).double().numpy() for values in (pupil, slip))
-        )
-
-    def _store_people(
-        self, read: NetworkReadings, calibrator: PersonCalibrator
-    ) -> None:
-        """Store the calibrated persons, the measured gaze error, and every n-th of the
-        judged frames, ``THINNED`` or more.
-        """
-        self._people = experiment.calibrate_subjects(
-            read, self.trial, self.config, calibrator
-        )
-        self.measured_rad = self._error_rad(read, calibrator)
-        rows = np.flatnonzero(self.judged)
-        self._rows = rows[:: max(1, len(rows) // THINNED)]
-        each = len(self.trial.subject) // len(self.subjects)
-        self._thin = [
-            rendered.rows(
-                torch.from_numpy(self._rows[self._rows // each == n] - n * each)
-            )
-            for n, rendered in enumerate(self.subjects)
-        ]
+    def _true_pupil_mm(self) -> Array:
+        """(n, 2) true pupil on the sensor from the labels of the frames."""
+        camera = self.scenes.camera
+        pupil_px = torch.cat([frames.labels.pupil_px for frames in self.subjects])
+        centred = pupil_px.double().numpy() - (camera.pixels - 1) / 2
+        return np.asarray(centred * camera.pitch_um * 1e-3)
 
     def _error_rad(self, read: NetworkReadings, calibrator: PersonCalibrator) -> float:
         """Mean gaze error in rad under axial slippage, with calibrations from the same
         readings.
         """
-        answers, _ = experiment.calibrated_gaze(
+        predicted, _ = experiment.calibrated_gaze(
             read, self.trial, self.config, calibrator
         )
-        angles = angle_deg(answers, self.trial.stimulus_deg)[self.judged]
+        angles = angle_deg(predicted, self.trial.stimulus_deg)[self.judged]
         return float(np.radians(angles.mean()))
 
     @torch.no_grad()
@@ -318,13 +242,17 @@ class NetworkReading:
         """Readings of the network from frames through an imager, with the noise of the
         experiment's seeds or ``quiet``.
         """
-        predictions = []
-        for subject, rendered in enumerate(subjects):
-            frames = experiment.image_frames(
-                self.source, rendered, optics, seed=experiment.NOISE + subject,
-                sensor=self.sensor, quiet=quiet,
-            )  # fmt: skip
-            predictions.append(experiment.predict_of_run(self.source, frames))
+        predictions = [
+            experiment.predict_rendered(
+                self.source,
+                rendered,
+                optics,
+                seed=experiment.NOISE + subject,
+                sensor=self.sensor,
+                quiet=quiet,
+            )
+            for subject, rendered in enumerate(subjects)
+        ]
         return experiment.read_from(predictions, self.source)
 
 
@@ -391,7 +319,7 @@ class ErrorBudget:
         """The budget, link by link from gaze back to the pillars, ending with the sum.
 
         Raises:
-            LensError: the as-built file is of another lens.
+            FitError: the as-built file is of another lens.
         """
         rows: list[BudgetEntry] = []
         parts = (
@@ -481,7 +409,10 @@ class ErrorBudget:
             method = f"{len(layers.films)} films of the lens file taken away"
             yield self._entry("glass", image_through(bare, self.image), method)
         method = "flux of both polarisations through the sensor in place of one scalar"
-        image = both_polarisations(self.optics, self.image)
+        plan = self.image.plan
+        window = replace(plan.window, components=plan.window.whole)
+        vectorial = replace(self.image, plan=replace(plan, window=window))
+        image = image_through(self.optics, vectorial)
         yield self._entry("polarisation", image, method)
 
     def _solver(self) -> Iterator[BudgetEntry]:
@@ -524,27 +455,21 @@ class ErrorBudget:
             yield self._changed(link, description, factor=pillar_factor)
 
     def _neighbours(self) -> Iterator[BudgetEntry]:
-        """Entry of the local periodic approximation.
-
-        Rows of unequal pillars are solved as one cell. A lens that includes them has
-        the entry of their open choices instead: the rms over all of these.
+        """Entry of the local periodic approximation: rows of unequal pillars, solved as
+        one cell.
         """
-        lens = self.lens
-        if lens.neighbours is not None:
-            doubted = lens.neighbours.doubted(turning_sine(lens))
-            entries = [self._of_rows(other, "") for other in doubted]
-            method = "rows of the lens file: another truncation, a row left out, zones that get shorter"
-            total = quadrature_total(entries)
-            yield replace(total, link="neighbours", method=method)
+        if self.coupling is not None:
+            method = (
+                "rows of the lens file; what they leave open: budget of metalens psf"
+            )
+            yield BudgetEntry("neighbours", NONE, NONE, NONE, method)
             return
         try:
-            rows_of = supercell.estimate_neighbour_coupling(lens)
+            rows_of = supercell.estimate_neighbour_coupling(self.lens)
         except CellError:
             return  # films or tilted walls: rows of those are not solved
-        yield self._of_rows(rows_of, "rows of unlike pillars solved as one cell")
-
-    def _of_rows(self, rows: NeighbourRows, method: str) -> BudgetEntry:
-        return self._changed("neighbours", method, factor=self._coupling(rows))
+        method = "rows of unlike pillars solved as one cell"
+        yield self._changed("neighbours", method, factor=self._coupling(rows_of))
 
     def _mask(self) -> Iterator[BudgetEntry]:
         """Entry of rounding the diameters to the grid of the mask, with a mask."""
@@ -577,15 +502,7 @@ class ErrorBudget:
         fitted = self.given.asbuilt
         if fitted is None:
             return
-        own_um, fitted_um = (
-            lens.diameters.diameter_um for lens in (self.lens, fitted.design)
-        )
-        if own_um.shape != fitted_um.shape or not np.allclose(
-            own_um, fitted_um, atol=1e-6
-        ):
-            raise LensError(
-                "the as-built file is of another lens than the one given; give the lens that was captured"
-            )
+        check_lens(self.lens, fitted, insist=True)
         best = fitted.parameters()
         lenses = []
         for row in fitted.lens_samples(self.given.draws, seed=3):
@@ -605,13 +522,8 @@ class ErrorBudget:
             for state, shift in lenses
         ]
         total, root = quadrature_total(rows), math.sqrt(len(rows))
-        return BudgetEntry(
-            link,
-            total.phase_rad / root,
-            total.psf / root,
-            total.gaze_rad / root,
-            method,
-        )
+        columns = total.phase_rad, total.psf, total.gaze_rad
+        return BudgetEntry(link, *(value / root for value in columns), method)
 
 
 def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:
@@ -694,14 +606,3 @@ def stored_response(
         for part in (np.abs(t), np.unwrap(np.angle(t)))
     )
     return np.asarray(level * np.exp(1j * phase))
-
-
-def turning_sine(lens: Lens) -> Array:
-    """(y, x) sum of the sines of incidence and exit of light through a ``lens``, from
-    its design source to the middle of the sensor.
-    """
-    diameters = lens.diameters
-    r = np.hypot(diameters.x_um, diameters.y_um[:, None])
-    source_um = lens.source_distance_um
-    source_sine = 0.0 if math.isinf(source_um) else np.sin(np.arctan(r / source_um))
-    return np.asarray(np.sin(np.arctan(r / lens.sensor_distance_um)) + source_sine)

@@ -15,12 +15,11 @@ from metalens.core.errors import ConfigError
 from metalens.core.report import Table, figure_png, make_figure
 from metalens.lens import Lens
 
-CAPTIONS = {
-    "field": "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays, "
-    "tangential (drawn through) and sagittal (dashed); relative illumination and, dotted, vignetting.",
-    "mtf": "Modulation transfer over the field angle, of all light through the lens, a frequency each: tangential "
-    "drawn through, sagittal dashed.",
-}
+CAPTION = (
+    "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays, tangential (drawn "
+    "through) and sagittal (dashed); relative illumination and, dotted, vignetting; modulation transfer of all light "
+    "through the lens, tangential drawn through, sagittal dashed."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,25 +102,17 @@ def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
         "vignetting / %", "illumination",
     )  # fmt: skip
     rows, mtf_rows = [], []
-    for name, aberrations in field_aberrations.items():
-        for k, angle in enumerate(aberrations.angles_deg):
-            label = name if k == 0 else ""
-            focus = [_format_value(value, 1) for value in aberrations.close_um[k]]
-            distortion, vignetting = (
-                _format_value(100 * value[k], 2)
-                for value in (aberrations.distortion, aberrations.vignetting)
-            )
-            chief_ray = _format_value(aberrations.chief_um[k, 0], 2)
-            light = _format_value(aberrations.illumination[k], 3)
-            rows.append(
-                (label, f"{angle:g}", chief_ray, distortion, *focus, vignetting, light)
-            )
-            mtf = [
-                _format_value(value, 3)
-                for pair in aberrations.mtf[k].T
-                for value in pair
-            ]
-            mtf_rows.append((label, f"{angle:g}", *mtf))
+    for name, one in field_aberrations.items():
+        for k, angle in enumerate(one.angles_deg):
+            begin = name if k == 0 else "", f"{angle:g}"
+            numbers = (
+                (one.chief_um[k, 0], 2), (100 * one.distortion[k], 2),
+                *((focus, 1) for focus in one.close_um[k]),
+                (100 * one.vignetting[k], 2), (one.illumination[k], 3),
+            )  # fmt: skip
+            rows.append((*begin, *(_format_value(*number) for number in numbers)))
+            mtf = (_format_value(value, 3) for value in one.mtf[k].T.ravel())
+            mtf_rows.append((*begin, *mtf))
     frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
     columns = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
     return [
@@ -157,72 +148,39 @@ def _format_value(value: float, digits: int) -> str:
 
 
 def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:
-    """PNG of distortion, field curvature, illumination and vignetting over the field
-    angle.
-
-    Args:
-        field_aberrations: aberrations over the field by name of the lens.
-    """
-    figure, panels = make_figure(1, 3, size=(10.5, 3.4))
-    for name, aberrations in field_aberrations.items():
-        order = np.argsort(aberrations.angles_deg)
-        angle = aberrations.angles_deg[order]
-        colour = (
-            panels[0]
-            .plot(angle, 100 * aberrations.distortion[order], ".-", label=name)[0]
-            .get_color()
-        )
-        for axis, style in ((0, "-"), (1, "--")):
-            panels[1].plot(
-                angle, aberrations.close_um[order, axis], style, color=colour
-            )
-        panels[2].plot(angle, aberrations.illumination[order], ".-", color=colour)
-        panels[2].plot(angle, aberrations.vignetting[order], ":", color=colour)
-    panels[0].set(title="distortion", ylabel="distortion / %")
-    panels[1].set(title="field curvature", ylabel="focus from the sensor / µm")
-    panels[2].set(
-        title="illumination and vignetting", ylabel="share", ylim=(-0.03, None)
-    )
-    panels[0].legend(fontsize=7)
-    for panel in panels:
-        panel.set_xlabel("field angle / °")
-    return figure_png(figure)
-
-
-def mtf_picture(field_aberrations: Mapping[str, OverField]) -> bytes:
-    """PNG of the MTF over the field angle, a panel for each frequency.
+    """PNG of distortion, field curvature, illumination with vignetting, and the MTF of
+    every frequency, over the field angle.
 
     Args:
         field_aberrations: aberrations over the field by name of the lens.
     """
     frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
-    figure, panels = make_figure(
-        1,
-        len(frequencies),
-        size=(1 + 3.2 * len(frequencies), 3.2),
-        squeeze=False,
-        sharey=True,
-    )
-    for name, aberrations in field_aberrations.items():
-        order = np.argsort(aberrations.angles_deg)
-        for k, panel in enumerate(panels[0]):
-            line = panel.plot(
-                aberrations.angles_deg[order],
-                aberrations.mtf[order, 0, k],
-                ".-",
+    titles = [
+        "distortion / %",
+        "focus from the sensor / µm",
+        "illumination, vignetting",
+        *(f"MTF at {frequency:g} / mm" for frequency in frequencies),
+    ]
+    figure, panels = make_figure(1, len(titles), size=(3.4 * len(titles), 3.4))
+    for number, (name, one) in enumerate(field_aberrations.items()):
+        order = np.argsort(one.angles_deg)
+        pairs = [one.close_um, *np.moveaxis(one.mtf, 2, 0)]
+        curves = [
+            (0, 100 * one.distortion, ".-"),
+            (2, one.illumination, ".-"),
+            (2, one.vignetting, ":"),
+        ]
+        for panel, pair in zip((1, *range(3, len(titles))), pairs, strict=True):
+            curves += [(panel, pair[:, 0], ".-"), (panel, pair[:, 1], ".--")]
+        for panel, curve, style in curves:
+            panels[panel].plot(
+                one.angles_deg[order],
+                curve[order],
+                style,
+                color=f"C{number}",
                 label=name,
             )
-            colour = line[0].get_color()
-            panel.plot(
-                aberrations.angles_deg[order],
-                aberrations.mtf[order, 1, k],
-                ".--",
-                color=colour,
-            )
-    for panel, frequency in zip(panels[0], frequencies, strict=True):
-        panel.set(
-            title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1)
-        )
-    panels[0, 0].set_ylabel("modulation")
-    panels[0, 0].legend(fontsize=7)
+    panels[0].legend(fontsize=7)
+    for panel, title in zip(panels, titles, strict=True):
+        panel.set(title=title, xlabel="field angle / °")
     return figure_png(figure)

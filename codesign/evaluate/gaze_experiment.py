@@ -58,6 +58,11 @@ class ExperimentTrials:
     stimulus_deg: Array
     slip_mm: Array
 
+    def __getitem__(self, rows: Array) -> "ExperimentTrials":
+        return ExperimentTrials(
+            *(getattr(self, name)[rows] for name in ExperimentTrials.__slots__)
+        )
+
     def group(self, kind: str) -> Array:
         """(n,) True for frames of the axial or lateral states; both hold the origin.
 
@@ -225,33 +230,44 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
     return replace(turned, mount_rad=states.mount_rad)
 
 
-def image_frames(
+def predict_rendered(
     source: FinishedRun,
     rendered: RenderedFrames,
-    prepared: Imager,
+    imager: Imager,
     *,
     seed: int,
-    sensor: Sensor | None = None,
+    sensor: Sensor,
     quiet: bool = False,
-) -> SensorFrames:
-    """Sensor frames of rendered scenes through a run's lens.
+) -> Predictions:
+    """Pupil, slippage and axis that a run's network predicts from rendered scenes
+    through its lens.
 
     Args:
         source: finished run: its network, lens and sensor.
         rendered: rendered frames.
-        prepared: imager of the run's lens.
+        imager: imager of the run's lens.
         seed: seed of the noise.
-        sensor: sensor of :func:`experiment_sensors`; the run's own without it.
+        sensor: sensor of :func:`experiment_sensors`.
         quiet: no noise.
     """
-    margin = source.settings.scenes.margin
-    return assess.read_batch(
-        source.run.trainer,
-        as_batch(rendered, margin),
-        prepared,
-        seed=seed,
-        sensor=sensor,
-        quiet=quiet,
+    batch = as_batch(rendered, source.settings.scenes.margin)
+    return predict_frames(
+        source,
+        assess.read_batch(
+            source.run.trainer, batch, imager, seed=seed, sensor=sensor, quiet=quiet
+        ),
+    )
+
+
+def predict_frames(source: FinishedRun, frames: SensorFrames) -> Predictions:
+    """Pupil, slippage and axis that a run's network predicts from sensor frames.
+
+    Args:
+        source: finished run: its network, lens and sensor.
+        frames: of the sensor.
+    """
+    return assess.predict_frames(
+        source.run.trainer.model.net, source.architecture, frames, source.settings.inner
     )
 
 
@@ -281,21 +297,19 @@ def experiment_sensors(
         float(frames.pinhole().mean()),
         snr_db=config.snr_db,
     )
-    areas = [source.settings.optics.aperture_mm**2 for source in sources]
-    scaled = []
-    for sensor, area in zip(sensors, areas, strict=True):
-        pitch_ratio = (
-            sensor.base_pitch_um / dim.base_pitch_um
-        ) ** 2  # counts of a base pixel
-        scale = pitch_ratio * area / areas[0]
-        scaled.append(
-            replace(
-                sensor,
-                exposure_e=dim.exposure_e * scale,
-                ambient_e=dim.ambient_e * scale,
-            )
+    # electrons of a base pixel behind the aperture
+    collected = [
+        (sensor.base_pitch_um * source.settings.optics.aperture_mm) ** 2
+        for sensor, source in zip(sensors, sources, strict=True)
+    ]
+    return [
+        replace(
+            sensor,
+            exposure_e=dim.exposure_e * share / collected[0],
+            ambient_e=dim.ambient_e * share / collected[0],
         )
-    return scaled
+        for sensor, share in zip(sensors, collected, strict=True)
+    ]
 
 
 @torch.no_grad()
@@ -326,57 +340,46 @@ def run_experiment(
     _check_sources(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[ExperimentTrials] = []
-    images = [
-        (prepare_run(source, image=config.image), finer_imager(source))
-        for source in sources
-    ]
-    predictions: list[tuple[list[Predictions], list[Predictions]]] = [
-        ([], []) for _ in sources
-    ]
     sensors = experiment_sensors(sources, config)
-    calibrators = [
-        run_calibrator(source, imager, config, sensor)
-        for source, (imager, _), sensor in zip(sources, images, sensors, strict=True)
+    devices = []
+    for source, sensor in zip(sources, sensors, strict=True):
+        imager = prepare_run(source, image=config.image)
+        calibrator = run_calibrator(source, imager, config, sensor)
+        images = [image for image in (imager, finer_imager(source)) if image]
+        devices.append((source, sensor, calibrator, images))
+    # of every run, image and subject
+    predictions: list[list[list[Predictions]]] = [
+        [[] for _ in images] for *_, images in devices
     ]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         rendered = render_subject(states, config, subject, scenes)
         trials.append(trial)
-        for source, imagers, outputs, sensor in zip(
-            sources, images, predictions, sensors, strict=True
+        for (source, sensor, _, images), outputs in zip(
+            devices, predictions, strict=True
         ):
-            for imager, output in zip(imagers, outputs, strict=True):
-                if imager is not None:
-                    frames = image_frames(
+            for imager, output in zip(images, outputs, strict=True):
+                output.append(
+                    predict_rendered(
                         source, rendered, imager, seed=NOISE + subject, sensor=sensor
                     )
-                    output.append(predict_of_run(source, frames))
+                )
         if subject + 1 < config.subjects:
             yield subject + 1, []
-    all_trials = join_subjects(trials)
+    joined = join_subjects(trials)
     results = []
-    for i, (source, calibrator) in enumerate(zip(sources, calibrators, strict=True)):
-        name = names[i] if names else f"run {i + 1}"
-        about = all_trials, config, calibrator
-        result = _result(name, source, predictions[i][0], *about)
-        fine = None
-        if predictions[i][1]:
-            fine = _result(name, source, predictions[i][1], *about)
-        settings = source.run.trainer.optics
-        above = image_formation.image_tolerance_problem(settings, images[i][0])
-        results.append(replace(result, above=above, finer=fine))
+    for number, ((source, _, calibrator, images), outputs) in enumerate(
+        zip(devices, predictions, strict=True)
+    ):
+        name = names[number] if names else f"run {number + 1}"
+        result, *finer = (
+            _result(name, source, output, joined, config, calibrator)
+            for output in outputs
+        )
+        optics = source.run.trainer.optics
+        above = image_formation.image_tolerance_problem(optics, images[0])
+        results.append(replace(result, above=above, finer=finer[0] if finer else None))
     yield config.subjects, results
-
-
-def predict_of_run(source: FinishedRun, frames: SensorFrames) -> Predictions:
-    """Pupil, slippage and axis that a run's network reads from sensor frames.
-
-    Args:
-        source: finished run: its network, lens and sensor. frames: of the sensor.
-    """
-    return assess.predict_frames(
-        source.run.trainer.model.net, source.architecture, frames, source.settings.inner
-    )
 
 
 def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
@@ -391,17 +394,6 @@ def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
             for name in ExperimentTrials.__slots__
         )
     )
-
-
-def rows_of_trial(trial: ExperimentTrials, rows: Array) -> ExperimentTrials:
-    """Records of some of the frames.
-
-    Args:
-        trial: subject, stimulus and slippage of every frame.
-        rows: numbers of the frames to take.
-    """
-    parts = (getattr(trial, name)[rows] for name in ExperimentTrials.__slots__)
-    return ExperimentTrials(*parts)
 
 
 def _check_sources(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
@@ -446,9 +438,10 @@ def prepare_run(
     """
     trainer = source.run.trainer
     assess.recalibrate_network(trainer, source.architecture)
-    if image == "trained":
-        return _imager_of(source, trainer.optics)
-    return _imager_of(source, replace(trainer.optics, image="true"))
+    trained = trainer.optics
+    return _imager_of(
+        source, trained if image == "trained" else replace(trained, image="true")
+    )
 
 
 def finer_imager(source: FinishedRun) -> Imager | None:
@@ -462,19 +455,19 @@ def finer_imager(source: FinishedRun) -> Imager | None:
     """
     settings = assess.finer_image(source.run.trainer.optics)
     try:
-        return None if settings is None else _imager_of(source, settings)
+        return settings and _imager_of(source, settings)
     except (SceneError, PropagationError):
         return None
 
 
 def _imager_of(source: FinishedRun, settings: OpticsConfig) -> Imager:
     """Imager of the lens of a run or retraining, formed as the settings say."""
-    scenes = source.settings.scenes
+    margin = source.settings.scenes.margin
     return image_formation.make_imager(
         settings,
         source.run.trainer.model.coefficients_rad,
-        scenes.pixels + 2 * scenes.margin,
-        margin=scenes.margin,
+        source.settings.scenes.pixels + 2 * margin,
+        margin=margin,
         made=source.made,
     )
 
@@ -527,16 +520,15 @@ def run_calibrator(
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
         chosen_states = states[torch.from_numpy(rows)]
         rendered = render_subject(chosen_states, person_config, BEFORE + person, scenes)
-        sensor_frames = image_frames(
-            source, rendered, imager, seed=2 * NOISE + person, sensor=sensor
+        predictions.append(
+            predict_rendered(
+                source, rendered, imager, seed=2 * NOISE + person, sensor=sensor
+            )
         )
-        predictions.append(predict_of_run(source, sensor_frames))
         stimuli_deg.append(trial.stimulus_deg[rows])
         if predictions[0].axis is None:
             return sphere_calibrator(source, config)
-    person_of_frame = np.repeat(
-        np.arange(config.people), [len(angles) for angles in stimuli_deg]
-    )
+    person_of_frame = np.repeat(np.arange(config.people), list(map(len, stimuli_deg)))
     return shared.learn_population(
         read_from(predictions, source), np.concatenate(stimuli_deg), person_of_frame
     )
@@ -552,18 +544,18 @@ def read_from(
         predictions: predictions of every subject, in their order.
         source: finished run: its network, lens and sensor.
     """
-    centre, slip_mm = (
-        torch.cat([getattr(prediction, name) for prediction in predictions])
-        .double()
-        .numpy()
-        for name in ("centre", "slip_mm")
-    )
-    axes = [
-        prediction.axis for prediction in predictions if prediction.axis is not None
-    ]
-    rig = source.run.scenes(EXPERIMENT).rig
-    angles = face_angles(torch.cat(axes).double().numpy(), rig) if axes else None
+    centre, slip_mm = (_joined(predictions, name) for name in ("centre", "slip_mm"))
+    angles = None
+    if predictions[0].axis is not None:
+        rig = source.run.scenes(EXPERIMENT).rig
+        angles = face_angles(_joined(predictions, "axis"), rig)
     return NetworkReadings(centre * source.run.window_um * 1e-3, slip_mm, angles)
+
+
+def _joined(predictions: Sequence[Predictions], name: str) -> Array:
+    """(n, ...) float64 values of a field of all predictions."""
+    values = torch.cat([getattr(prediction, name) for prediction in predictions])
+    return np.asarray(values.double().numpy())
 
 
 def _result(
@@ -581,19 +573,13 @@ def _result(
     readings = read_from(predictions, source)
     predicted, judged = calibrated_gaze(readings, trial, config, calibrator)
     error = np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
-    centre, iou = (
-        torch.cat([getattr(prediction, f) for prediction in predictions])
-        .double()
-        .numpy()
-        for f in ("centre", "iou")
-    )
     return RunResult(
         name,
         float(source.row["mmacs"]),
         trial,
         readings.slip_mm,
-        centre,
-        iou,
+        _joined(predictions, "centre"),
+        _joined(predictions, "iou"),
         error,
         calibrator,
     )
@@ -634,14 +620,11 @@ def calibrate_subjects(
         how: way to calibrate a person.
     """
     calibration = calibration_frames(trial, config)
-    rows_of = {
-        int(subject): calibration[trial.subject[calibration] == subject]
-        for subject in np.unique(trial.subject)
-    }
-    return {
-        subject: how.person(read[rows], trial.stimulus_deg[rows])
-        for subject, rows in rows_of.items()
-    }
+    people = {}
+    for subject in np.unique(trial.subject):
+        rows = calibration[trial.subject[calibration] == subject]
+        people[int(subject)] = how.person(read[rows], trial.stimulus_deg[rows])
+    return people
 
 
 def predicted_gaze(

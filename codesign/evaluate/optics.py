@@ -17,6 +17,7 @@ from codesign.eye import (
     moved_states,
     render,
 )
+from codesign.settings import LARGEST, LEAST, check_ranges
 from codesign.train import bootstrap_ratio
 from metalens.core.errors import ConfigError, SceneError
 from metalens.core.report import Table
@@ -58,28 +59,14 @@ class MeasurementSettings:
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm or (1.0, 1.0)
-        if not (
-            0 < low <= high
-            and self.count >= 1
-            and self.angles_deg
-            and self.binnings
-            and min(self.binnings) >= 1
-        ):
+        if not (low <= high and self.angles_deg and self.binnings):
             raise ConfigError(
-                f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
-                f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
+                f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}, binnings = {self.binnings}: need the "
+                "nearest depth first, and at least one angle and binning"
             )
-        sample_um = 1e-6 if self.sample_um is None else self.sample_um
-        wide_enough = self.window_um is None or self.window_um >= 4 * sample_um
-        lengths = [
-            1.0 if length is None else length
-            for length in (self.pixel_um, self.radius_um)
-        ]
-        if not (wide_enough and sample_um > 0 and min(lengths) > 0):
-            raise ConfigError(
-                f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
-                f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
-            )
+        lengths = ("depths_mm", "pixel_um", "window_um", "sample_um", "radius_um")
+        check_ranges(self, **dict.fromkeys(lengths, (LEAST, LARGEST)))
+        check_ranges(self, count=(1, LARGEST), binnings=(1, LARGEST))
 
     def about(self, lens: Lens) -> "ResolvedSettings":
         """These settings with the defaults of a lens in place of None."""
@@ -95,13 +82,10 @@ class MeasurementSettings:
         window_um = self.window_um or reach.window_um(
             lens, (nearest_um, farthest_um), airy=WINDOW
         )
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        values |= {
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
             "pixel_um": pixel_um,
             "depths_mm": (nearest_um * 1e-3, farthest_um * 1e-3),
             "radius_um": self.radius_um or reach.disc_um(lens),
-        }
-        values |= {
             "sample_um": sample_um,
             "window_um": max(4, round(window_um / sample_um)) * sample_um,
         }
@@ -144,17 +128,17 @@ class SensitivityScenes:
     image_tolerance: float = field(default=0.015, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        if not 1 <= self.count <= 100_000:
-            raise ConfigError(f"count = {self.count} scenes: need 1 to 100000")
+        check_ranges(
+            self,
+            count=(1, 100_000),
+            pitch_um=(LEAST, LARGEST),
+            pixels=(8, 4096),
+            window_um=(4 * self.pitch_um, LARGEST),
+        )
         if not (0 < abs(self.gaze_step_deg) <= 20 and 0 < abs(self.slip_step_mm) <= 5):
             raise ConfigError(
                 f"gaze_step_deg = {self.gaze_step_deg}, slip_step_mm = {self.slip_step_mm}: need steps other than 0, "
                 "up to 20 degrees and 5 mm"
-            )
-        if not (self.window_um >= 4 * self.pitch_um > 0 and 8 <= self.pixels <= 4096):
-            raise ConfigError(
-                f"window_um = {self.window_um}, pitch_um = {self.pitch_um}, pixels = {self.pixels}: need a pitch above "
-                "0, a window of four pixels or more, and 8 to 4096 pixels"
             )
 
 
@@ -166,13 +150,11 @@ class AxialInformation:
     encircled: (angles, depths) share of the light through the lens in a circle of
     ``radius_um``, placed where it holds most.
     psf_error: relative error of the PSF engine.
-    slices: (depths, x) PSF on axis summed over y, on the samples.
     """
 
     information: Tensor
     encircled: Tensor
     psf_error: float
-    slices: Tensor
 
 
 def measure_axial_information(
@@ -204,25 +186,23 @@ def measure_axial_information(
         View(tuple(all_depths), angles, resolved.window_um, samples),
         tolerance=resolved.tolerance,
     )
-    order = [
-        int(np.argmin(np.abs(all_depths - depth)))
-        for depth in (*depths, *(depths + resolved.step_um))
-    ]
+    order = np.searchsorted(
+        all_depths, np.concatenate([depths, depths + resolved.step_um])
+    )
     intensity = torch.as_tensor(stack.intensity)[..., order, :, :].reshape(
         len(angles), 2, resolved.count, samples, samples
     )
-    values = []
-    for binning in resolved.binnings:
-        values.append(
-            axial_information(
-                intensity[:, 0],
-                intensity[:, 1],
-                step_um=resolved.step_um,
-                sample_um=resolved.sample_um,
-                pixel_um=resolved.pixel_um * binning,
-                normalisation=resolved.normalisation,
-            )
+    information = [
+        axial_information(
+            intensity[:, 0],
+            intensity[:, 1],
+            step_um=resolved.step_um,
+            sample_um=resolved.sample_um,
+            pixel_um=resolved.pixel_um * binning,
+            normalisation=resolved.normalisation,
         )
+        for binning in resolved.binnings
+    ]
     energy_um2 = torch.as_tensor(stack.energy_um2)[
         ..., order[: resolved.count]
     ].reshape(len(angles), resolved.count)
@@ -232,12 +212,8 @@ def measure_axial_information(
     inside = most_encircled(
         intensity[:, 0], resolved.sample_um, radius_um=resolved.radius_um
     )
-    slices = intensity[0, 0].sum(1)
     return AxialInformation(
-        torch.stack(values, 1),
-        inside * share.clamp(max=1.0),
-        float(stack.error),
-        slices,
+        torch.stack(information, 1), inside * share.clamp(max=1.0), float(stack.error)
     )
 
 

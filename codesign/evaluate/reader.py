@@ -26,6 +26,7 @@ from codesign.evaluate.scene_image import lens_imager, margin_of
 from codesign.eye import PinholeCamera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
+from codesign.settings import LARGEST, LEAST, check_ranges
 from codesign.train import bootstrap_interval, read_out
 from metalens.core import threads
 from metalens.core.errors import ConfigError
@@ -62,25 +63,20 @@ class ReaderConfig:
     tolerance: float = field(default=0.03, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        if (
-            min(self.frames, self.pool, self.test) < BATCH
-            or self.frames % BATCH
-            or self.test % BATCH
+        if min(self.frames, self.pool, self.test) < BATCH or (
+            self.frames % BATCH or self.test % BATCH
         ):
             raise ConfigError(
                 f"reader: frames = {self.frames}, pool = {self.pool}, test = {self.test}: need {BATCH} or more, frames "
                 f"and test a multiple of {BATCH}"
             )
-        if not (
-            32 <= self.pixels <= 512
-            and self.pitch_um > 0
-            and self.electrons > 0
-            and self.fwhm_nm >= 0
-        ):
-            raise ConfigError(
-                f"reader: pixels = {self.pixels}, pitch_um = {self.pitch_um}, electrons = {self.electrons}, fwhm_nm = "
-                f"{self.fwhm_nm}: need 32 to 512 pixels, pitch and electrons above 0, a width of 0 or more"
-            )
+        check_ranges(
+            self,
+            pixels=(32, 512),
+            pitch_um=(LEAST, LARGEST),
+            electrons=(LEAST, LARGEST),
+            fwhm_nm=(0, LARGEST),
+        )
         nearest, farthest = self.depths_mm
         if not 0 < nearest < farthest < math.inf:
             raise ConfigError(

@@ -510,19 +510,15 @@ def _find_phase(
     """
     if settings.profile != "fisher":
         return settings.phase(options.config.parent), settings.focus, {}
-    from metalens.design.free_form import design_pupil, fisher_profile
+    from metalens.design.free_form import fisher_profile
 
     radius_um = settings.aperture_mm * 500
     search = settings.fisher.about(settings.focus, radius_um)
-    objective = None
-    if search.objective == "scenes":
-        pupil = design_pupil(settings.focus, radius_um, search)
-        objective = load_above("scenes").SceneObjective(pupil, search)
     options.console.say(
         f"free form: {search.starts} starts of {search.iterations} steps"
     )
     phase, free_form = fisher_profile(
-        settings.focus, radius_um=radius_um, settings=search, objective=objective
+        settings.focus, radius_um=radius_um, settings=search
     )
     figures = {
         "focus_um": free_form.focus_um,

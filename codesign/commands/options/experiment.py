@@ -26,12 +26,16 @@ class Options(CommonOptions):
             of every run that tells the optic axis, people_1.h5 ...: what calibrates a wearer of that
             device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.
+        frames: folder of own eye frames on the run's sensor, and frames.csv with a row for each: file; as far as
+            known subject, mask (an image), pupil_x_px and pupil_y_px, slip_x_mm to slip_z_mm (stage), gaze_x_deg and
+            gaze_y_deg. They are predicted in place of synthetic subjects, and compared with these targets: NAME.csv.
         settings: subjects, stimuli, slippage states, calibration.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     output: Output = Path("experiment")
     names: tuple[str, ...] = ()
+    frames: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(
         default_factory=ExperimentConfig
     )

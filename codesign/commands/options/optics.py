@@ -18,8 +18,8 @@ class Options(CommonOptions):
 
     Attributes:
         lenses: lens files; the first is what the others are compared with.
-        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png,
-            field.png, mtf.png, report.html.
+        output: folder for optics.json, tables.txt, axial.png, scenes.png, field.png,
+            report.html.
         config: OPTICS.toml with the tables [axial], [over_field], [scenes] and
             [reader]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.

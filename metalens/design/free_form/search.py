@@ -4,7 +4,7 @@ Eq. 11) at a bounded spread of light, coarse to fine.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,31 +37,13 @@ class DesignScore:
     """Figures of a phase on the quick pupil model.
 
     information: (depths,), with several field angles (angles, depths), I(z) per mm²
-        averaged over sub-pixel positions; minus Eq. 6 (one value) for scenes.
-    encircled: of the same shape (for scenes at their depths), share of the light
+        averaged over sub-pixel positions.
+    encircled: of the same shape, share of the light
         through the aperture in the radius.
     """
 
     information: Tensor
     encircled: Tensor
-
-
-class SearchObjective(Protocol):
-    """An objective of the gradient ascent."""
-
-    def loss(
-        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Loss, and encircled energy at some depths.
-
-        Args:
-            phase_rad: (nodes, nodes) phase without its focus, rad.
-            focus_um: source distance of the hyperbolic part, um.
-            generator: of random depths, fields and positions.
-        """
-
-    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """Figures of a phase without randomness."""
 
 
 class AxialObjective:
@@ -78,7 +60,7 @@ class AxialObjective:
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Loss and encircled energy at some depths, see :class:`SearchObjective`.
+        """Loss and encircled energy at some depths, see :class:`AxialObjective`.
 
         With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
         log(mean I), I per mm² of the images, the means over depths.
@@ -139,7 +121,7 @@ class AxialObjective:
         return depths, fields, torch.rand(2, 2, generator=generator) - 0.5
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """See :class:`SearchObjective`."""
+        """See :class:`AxialObjective`."""
         return score_phase(
             phase_rad, self.pupil, focus_um=focus_um, settings=self.settings
         )
@@ -264,11 +246,7 @@ class FisherPhase:
 
 
 def fisher_profile(
-    focus: Focus,
-    *,
-    radius_um: float,
-    settings: FisherSettings | None = None,
-    objective: SearchObjective | None = None,
+    focus: Focus, *, radius_um: float, settings: FisherSettings | None = None
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase in rad, focus and free form, as a function of position.
 
@@ -279,14 +257,13 @@ def fisher_profile(
             settings leave depths and foci to the lens.
         radius_um: radius of the aperture, um.
         settings: of the search; None for the defaults.
-        objective: in place of the axial information.
 
     Returns:
         The phase of x (columns,) and y (rows,) in um, and the designed phase.
     """
     resolved = (settings or FisherSettings()).about(focus, radius_um)
     pupil = design_pupil(focus, radius_um, resolved)
-    design = optimize_free_form(pupil, resolved, objective=objective)
+    design = optimize_free_form(pupil, resolved)
     base = replace(focus, source_distance_um=design.focus_um)
     extra = free_form(design.controls.numpy(), pupil, cells=design.cells)
 
@@ -348,12 +325,7 @@ def design_pupil(
     return Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes)
 
 
-def optimize_free_form(
-    pupil: Pupil,
-    settings: ResolvedFisherSettings,
-    *,
-    objective: SearchObjective | None = None,
-) -> FisherPhase:
+def optimize_free_form(pupil: Pupil, settings: ResolvedFisherSettings) -> FisherPhase:
     """Free-form phase of most information: the best of several starts of gradient
     ascent.
 
@@ -363,18 +335,8 @@ def optimize_free_form(
     Args:
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
-        objective: by default the axial information; :mod:`codesign.evaluate.scenes` has
-            Eq. 6 on scenes.
-
-    Raises:
-        ConfigError: scenes in the settings, without their objective.
     """
-    if objective is None:
-        if settings.objective != "axial":
-            raise ConfigError(
-                f"objective {settings.objective!r} needs its scenes: give objective"
-            )
-        objective = AxialObjective(pupil, settings)
+    objective = AxialObjective(pupil, settings)
     results = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
@@ -416,7 +378,7 @@ def bspline_weights(position: Array, count: int) -> Array:
 def _climb(
     pupil: Pupil,
     settings: ResolvedFisherSettings,
-    objective: SearchObjective,
+    objective: AxialObjective,
     focus_um: float,
     zones: int,
     generator: torch.Generator,

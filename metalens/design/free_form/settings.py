@@ -16,8 +16,6 @@ FOCI = (0.29, 0.71)  # of the hyperbolic part: shares of the depth range in 1/z
 class FisherSettings:
     """What a Fisher-designed lens is asked for.
 
-    objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets
-        of eyes).
     depths_mm: range of the source; left out, from 1.75 waves out of focus at the rim on
         one side of the design's source distance to as many on the other.
     angles_deg: field angles that the lens is made for, each in every direction; the
@@ -38,11 +36,8 @@ class FisherSettings:
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
         0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
-    scenes: of the objective of that name. orthogonality: its weight lambda in Eq. 6, of
-        the squared cosine of the span angle.
     """
 
-    objective: Literal["axial", "scenes"] = "axial"
     depths_mm: tuple[float, float] | None = None
     angles_deg: tuple[float, ...] = (0.0,)
     pixel_um: float | None = None
@@ -57,8 +52,6 @@ class FisherSettings:
     even: float = 0.1
     normalisation: Literal["sum", "l2"] = "l2"
     seed: int = 0
-    scenes: int = 6
-    orthogonality: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse settings out of range.
@@ -93,11 +86,8 @@ class FisherSettings:
                 f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids = {self.grids}: need 4 "
                 "or more each, or 0 as the last of several"
             )
-        if self.scenes < 1 or self.orthogonality < 0 or not self.zones:
-            raise ConfigError(
-                f"scenes = {self.scenes}, orthogonality = {self.orthogonality}, zones "
-                f"= {self.zones}: need 1 or more, 0 or more, and at least one entry"
-            )
+        if not self.zones:
+            raise ConfigError("zones = (): need at least one entry")
 
     def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":
         """Settings for one lens, with its depths, foci and disc where they were left

@@ -130,9 +130,11 @@ def test_the_path_from_the_pupil_ends_where_the_experiment_does(run):
     assert measured == pytest.approx(want, rel=1e-6)
     counted = [row.gaze_rad for row in rows if row.counted]
     assert [row.link for row in rows] == [
-        "subject and calibration", "fixation", "reader, pupil", "reader, slippage",
-        "sensor noise", "image of training",
-    ]  # fmt: skip
+        "subject and calibration",
+        "reader",
+        "sensor noise",
+        "image of training",
+    ]
     assert math.degrees(math.hypot(*counted)) >= measured * (1 - 1e-9)
     whole = budget.image
     assert error_budget.image_difference(whole, whole) == 0.0
