@@ -5,14 +5,13 @@ the next mask should draw.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from characterize.next_mask import NextMask, table_rows
 from codesign.adapt.train import RetrainingOutcome
 from metalens.core import report
-from metalens.core.report import Figure, KeyFigure, Section, Table
+from metalens.core.report import Figure, Section, Table
 
 CASES = {
     "designed": "nominal lens, network as it came",
@@ -47,16 +46,6 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
         path: of the file. story: everything that the page shows.
     """
     outcome = story.outcome
-    keys = [
-        KeyFigure("slippage error, nominal lens", f"{outcome.nominal.slip_mm:.3f} mm"),
-        KeyFigure("made lens, before", f"{outcome.before.slip_mm:.3f} mm"),
-        KeyFigure("made lens, after", f"{outcome.after.slip_mm:.3f} mm"),
-        KeyFigure(
-            "share of the gap won back",
-            _recovered_text(outcome),
-            None if outcome.recovered is None else outcome.recovered >= 0.9,
-        ),
-    ]
     judge = (
         "the true lens of the virtual bench"
         if story.known
@@ -68,7 +57,8 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
         "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
         "is formed at a quarter of the run's tolerance: a ratio near 1 says that results do not depend on it.\n\nPSFs of "
         f"the fitted lens differ from the nominal ones by {story.psf_errors[0]:.1%} (relative L2 over all depths), those "
-        f"of the lens that judges by {story.psf_errors[1]:.1%}. Training drew {story.drawn} lenses from the posterior."
+        f"of the lens that judges by {story.psf_errors[1]:.1%}. Training drew {story.drawn} lenses from the posterior; "
+        f"{gap_text(outcome)}."
     )
     bars = Figure(plot_error_bars(outcome), "Slippage error, with its 95 % interval.")
     sections = [
@@ -77,13 +67,23 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     ]
     if story.cautions:
         sections.append(Section("Read with care", "\n\n".join(story.cautions)))
-    report.write_report(
-        path, "Retrained on the lens as built", sections, lead=lead, key_figures=keys
+    report.write_report(path, "Retrained on the lens as built", sections, lead=lead)
+
+
+def gap_text(outcome: RetrainingOutcome) -> str:
+    """The gap that the made lens opens, with its standard error, and the share of it
+    that retraining wins back.
+
+    Args:
+        outcome: accuracy of all cases.
+    """
+    recovered = outcome.recovered
+    won = (
+        "nothing to win back beyond chance"
+        if recovered is None
+        else f"{recovered:.0%} won back"
     )
-
-
-def _recovered_text(o: RetrainingOutcome) -> str:
-    return "no gap beyond chance" if o.recovered is None else f"{o.recovered:.0%}"
+    return f"gap {outcome.gap_mm:.3f} +- {outcome.gap_sigma_mm:.3f} mm, {won}"
 
 
 def accuracy_table(outcome: RetrainingOutcome) -> Table:
@@ -92,32 +92,21 @@ def accuracy_table(outcome: RetrainingOutcome) -> Table:
     Args:
         outcome: accuracy of all cases.
     """
-    head = (
-        "case",
-        "slippage error / mm",
-        "95 % interval",
-        "on a finer image / mm",
-        "ratio",
-        "axial / mm",
-        "lateral / mm",
-        "pupil IoU",
-    )
-    rows: list[tuple[Any, ...]] = []
-    for name, v in outcome.rows().items():
-        interval = f"{v['slip_low_mm']:.3f} to {v['slip_high_mm']:.3f}"
-        rows.append(
-            (
-                CASES[name],
-                v["slip_mm"],
-                interval,
-                v.get("finer_slip_mm", "–"),
-                v.get("finer_ratio", "–"),
-                v["axial_mm"],
-                v["lateral_mm"],
-                v["iou"],
-            )
-        )
-    return Table(head, rows, digits=3)
+    columns = {
+        "slippage error / mm": "slip_mm",
+        "from": "slip_low_mm",
+        "to (95 %)": "slip_high_mm",
+        "on a finer image / mm": "finer_slip_mm",
+        "ratio": "finer_ratio",
+        "axial / mm": "axial_mm",
+        "lateral / mm": "lateral_mm",
+        "pupil IoU": "iou",
+    }
+    rows = [
+        [CASES[name], *(values.get(key, "–") for key in columns.values())]
+        for name, values in outcome.rows().items()
+    ]
+    return Table(["case", *columns], rows, digits=3)
 
 
 def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
@@ -128,22 +117,13 @@ def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
     """
     rows = outcome.rows()
     figure, axes = report.make_figure(size=(6.4, 2.6))
-    position = np.arange(len(rows))[::-1]
-    values = [v["slip_mm"] for v in rows.values()]
-    intervals = [
-        [v["slip_mm"] - v["slip_low_mm"] for v in rows.values()],
-        [v["slip_high_mm"] - v["slip_mm"] for v in rows.values()],
-    ]
-    colours = {"before": "#d1495b", "after": "#2a9d8f"}
-    axes.barh(
-        position,
-        values,
-        xerr=intervals,
-        color=[colours.get(n, "#9db4d8") for n in rows],
-        height=0.62,
-        ecolor="#444",
+    middle, low, high = (
+        np.array([values[f"slip_{end}mm"] for values in rows.values()])
+        for end in ("", "low_", "high_")
     )
-    axes.set_yticks(position, [CASES[n] for n in rows])
+    names = [CASES[name] for name in rows]
+    axes.barh(names, middle, xerr=[middle - low, high - middle], ecolor="#444")
+    axes.invert_yaxis()
     axes.set(xlabel="slippage error / mm")
     axes.grid(axis="y", visible=False)
     return report.figure_png(figure)

@@ -112,13 +112,13 @@ def load_retrained(path: Path) -> FinishedRun:
     )
     made = MadeLens(design, source.settings.optics, response=built.response)
     psfs = retraining.lens_psfs(made, built, recipe.settings, truth)
-    jobs = retraining.available_jobs(psfs)
-    if job not in jobs or not (folder / f"{job}.safetensors").is_file():
-        available = ", ".join(f"{name}.safetensors" for name in jobs)
+    stacks = retraining.training_stacks(psfs)
+    if job not in stacks or not (folder / f"{job}.safetensors").is_file():
+        available = ", ".join(f"{name}.safetensors" for name in stacks)
         raise TrainingError(
             f"{path}: no network of this retraining; it holds {available}"
         )
-    trainer = retraining.make_job(source, recipe.settings, psfs, job)
+    trainer = retraining.make_trainer(source, recipe.settings, stacks[job])
     state = checkpoint.load(folder / f"{job}.safetensors", settings=recipe)
     trainer.restore(state["trainer"])
     stack = psfs.judges[0] if psfs.known else psfs.best

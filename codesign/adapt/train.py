@@ -30,11 +30,6 @@ from codesign.train import (
 from metalens import lens as lenses
 
 APART = 7919  # difference of the seeds of retrainings, so that their steps differ
-JOBS = (
-    "nominal",
-    "retrained",
-    "known",
-)  # networks that are trained on: for the design, the fit, and the truth
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,36 +54,23 @@ class NetworkAccuracy:
         """Mean over frames and axes."""
         return float(self.error_mm.mean())
 
-    @property
-    def axial_mm(self) -> float:
-        """Mean error of the distance."""
-        return float(self.error_mm[:, 2].mean())
-
-    @property
-    def lateral_mm(self) -> float:
-        """Mean error across."""
-        return float(self.error_mm[:, :2].mean())
-
     def values(self) -> dict[str, float]:
         """The numbers by name, for tables and JSON: ``slip_mm`` with its 95 % interval
         by a bootstrap over frames, and errors on the finer images with their ratio.
         """
         low, high = assess.bootstrap_interval(self.error_mm.mean(1).double().numpy())
-        fine = {}
-        if self.finer is not None:
-            fine = {
-                "finer_slip_mm": self.finer.slip_mm,
-                "finer_axial_mm": self.finer.axial_mm,
-                "finer_ratio": self.finer.slip_mm / self.slip_mm,
-            }
-        return fine | {
+        values = {
             "slip_mm": self.slip_mm,
             "slip_low_mm": low,
             "slip_high_mm": high,
-            "axial_mm": self.axial_mm,
-            "lateral_mm": self.lateral_mm,
+            "axial_mm": float(self.error_mm[:, 2].mean()),
+            "lateral_mm": float(self.error_mm[:, :2].mean()),
             "iou": float(self.iou.mean()),
         }
+        if self.finer is not None:
+            values["finer_slip_mm"] = self.finer.slip_mm
+            values["finer_ratio"] = self.finer.slip_mm / self.slip_mm
+        return values
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -147,17 +129,13 @@ class RetrainingOutcome:
     @property
     def above(self) -> str:
         """Why the error of the images of some case is too large, the made lens first;
-        else
-        empty.
+        else empty.
         """
         return self.after.above or self.designed.above
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Numbers by name of the case."""
-        cases = {
-            n: getattr(self, n)
-            for n in ("designed", "nominal", "before", "after", "known")
-        }
+        cases = {name: getattr(self, name) for name in RetrainingOutcome.__slots__}
         return {name: case.values() for name, case in cases.items() if case is not None}
 
 
@@ -179,14 +157,12 @@ def lens_psfs(
             result, config.draws + config.judge, seed=config.seed
         )
     )
-    drawn = tuple(lens_model.stack(x) for x in rows[: config.draws])
-    judge_rows = rows[config.draws :] if truth is None else [truth.vector()]
-    best = lens_model.stack(result.parameters())
+    judge_rows = [truth.vector()] if truth else rows[config.draws :]
     return LensPsfs(
         lens_model.stack(),
-        best,
-        drawn,
-        tuple(lens_model.stack(x) for x in judge_rows),
+        lens_model.stack(result.parameters()),
+        tuple(lens_model.stack(row) for row in rows[: config.draws]),
+        tuple(lens_model.stack(row) for row in judge_rows),
         truth is not None,
     )
 
@@ -232,30 +208,27 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
     )  # fmt: skip
 
 
+def training_stacks(psfs: LensPsfs) -> dict[str, tuple[PixelPsfStack, ...]]:
+    """{job: PSFs that it trains on}: for the design, for the fit, and for the truth
+    where it is known.
+
+    Args:
+        psfs: of the lenses in question.
+    """
+    stacks = {"nominal": (psfs.nominal,), "retrained": psfs.drawn}
+    return stacks | ({"known": psfs.judges} if psfs.known else {})
+
+
 def make_job(
-    source: FinishedRun, config: RetrainConfig, training_psfs: LensPsfs, name: str
+    source: FinishedRun, config: RetrainConfig, psfs: LensPsfs, name: str
 ) -> Trainer:
-    """Trainer of one of :data:`JOBS`, on the PSFs that belong to it.
+    """Trainer of one job of :func:`training_stacks`.
 
     Args:
         source: finished run: its network, lens and sensor. config: of the retraining.
-        training_psfs: PSFs of the lenses in question. name: of the job.
+        psfs: of the lenses in question. name: of the job.
     """
-    stacks = {
-        "nominal": (training_psfs.nominal,),
-        "retrained": training_psfs.drawn,
-        "known": training_psfs.judges,
-    }
-    return make_trainer(source, config, stacks[name])
-
-
-def available_jobs(training_psfs: LensPsfs) -> tuple[str, ...]:
-    """Networks that can be trained: with the truth only where it is known.
-
-    Args:
-        training_psfs: PSFs of the lenses in question.
-    """
-    return JOBS if training_psfs.known else JOBS[:2]
+    return make_trainer(source, config, training_stacks(psfs)[name])
 
 
 def run_job(
@@ -325,25 +298,21 @@ def judge_network(
     """
     assess.recalibrate_network(trainer, source.architecture)
     frames = frames or render_test_frames(source, config)
-    own = []
-    fine = []
-    for made in stacks[: config.judge]:
-        seen = assess.sensor_frames(trainer, frames, config.test_batches, stack=made)
-        own.append(_frame_errors(trainer, source, seen))
-        if finer:
-            exact = assess.finer_frames(
-                trainer, frames, config.test_batches, stack=made
-            )
-            if exact is not None:
-                fine.append(_frame_errors(trainer, source, exact))
+    own, fine = [], []
+    for stack in stacks[: config.judge]:
+        given = trainer, frames, config.test_batches
+        own.append(
+            _accuracy(source, trainer, assess.sensor_frames(*given, stack=stack))
+        )
+        exact = assess.finer_frames(*given, stack=stack) if finer else None
+        if exact is not None:
+            fine.append(_accuracy(source, trainer, exact))
     accuracy = _mean(own)
-    if len(fine) < len(own):
-        return accuracy
-    return replace(accuracy, finer=_mean(fine))
+    return accuracy if len(fine) < len(own) else replace(accuracy, finer=_mean(fine))
 
 
-def _frame_errors(
-    trainer: Trainer, source: FinishedRun, frames: SensorFrames
+def _accuracy(
+    source: FinishedRun, trainer: Trainer, frames: SensorFrames
 ) -> NetworkAccuracy:
     """Errors of a trainer's network on each of the sensor frames."""
     predictions = assess.predict_frames(
@@ -355,10 +324,8 @@ def _frame_errors(
 
 def _mean(parts: Sequence[NetworkAccuracy]) -> NetworkAccuracy:
     """Errors frame by frame, each the mean over lenses."""
-    error, iou = (
-        torch.stack([getattr(p, name) for p in parts]).mean(0)
-        for name in ("error_mm", "iou")
-    )
+    error = torch.stack([part.error_mm for part in parts]).mean(0)
+    iou = torch.stack([part.iou for part in parts]).mean(0)
     return NetworkAccuracy(error, iou, next((p.above for p in parts if p.above), ""))
 
 
@@ -431,7 +398,8 @@ def retrain(
         truth,
     )
     trained = {
-        name: make_job(source, config, psfs, name) for name in available_jobs(psfs)
+        name: make_trainer(source, config, stacks)
+        for name, stacks in training_stacks(psfs).items()
     }
     for trainer in trained.values():
         for _ in trainer.run():

@@ -5,7 +5,10 @@
 ``paper``.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+
+from metalens.core import reading
 
 # sub-verb: (module that holds ``Options`` and names that of ``run``, one line of help)
 PARTS: dict[str, tuple[str, str]] = {
@@ -32,3 +35,16 @@ def part_of(word: str) -> str | None:
     if path.is_dir():
         return "paper"
     return "optics" if path.suffix == ".h5" or path.is_file() else None
+
+
+def distinct_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of runs or lenses, numbered where they repeat.
+
+    Args:
+        names: stems of files and names of folders.
+    """
+    valid = [reading.to_valid_utf8(name) for name in names]
+    return tuple(
+        name if valid.count(name) == 1 else f"{name} {number}"
+        for number, name in enumerate(valid, 1)
+    )

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from codesign.commands.evaluate import distinct_names
 from codesign.commands.options.optics import Options
 from codesign.evaluate import (
     FieldSetting,
@@ -25,9 +26,9 @@ from codesign.evaluate import optics as evaluate_optics
 from codesign.eye import states_at
 from metalens import design
 from metalens import lens as lenses
-from metalens.core import config, reading, store
+from metalens.core import config, store
 from metalens.core.errors import ConfigError, PropagationError
-from metalens.core.report import Figure, Section, Table, write_report
+from metalens.core.report import Figure, Section, write_report
 from metalens.design import DoubleHelix
 from metalens.design.free_form import FisherSettings, design_pupil, tune_baselines
 from metalens.lens import Lens
@@ -59,19 +60,15 @@ def run(options: Options) -> int:
     """
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
-    settings = (
-        OpticsSettings()
-        if options.config is None
-        else config.load(options.config, OpticsSettings, empty=False)
-    )
+    settings = OpticsSettings()
+    if options.config is not None:
+        settings = config.load(options.config, OpticsSettings, empty=False)
     if options.scenes is not None:
         settings = dataclasses.replace(
             settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes)
         )
     made = [lenses.load_plain(path) for path in options.lenses]
-    names = distinct_lens_names(
-        [reading.to_valid_utf8(path.stem) for path in options.lenses]
-    )
+    names = list(distinct_names([path.stem for path in options.lenses]))
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)
@@ -123,10 +120,15 @@ def _measure(
             "field": field_page.field_values(result),
         }
     if options.reader:
-        table, values["reader"] = _reader_table(
-            options, settings.reader, dict(zip(names, compared, strict=True))
+        judged = judge_lenses(dict(zip(names, compared, strict=True)), settings.reader)
+        results = dict(
+            options.console.track(judged, total=len(compared), label="reader")
         )
-        tables.append(table)
+        values["reader"] = {
+            "settings": dataclasses.asdict(settings.reader),
+            "lenses": {name: result.values() for name, result in results.items()},
+        }
+        tables.append(reader.reader_table(results, settings.reader))
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
@@ -148,22 +150,6 @@ def _measure(
     return values, text
 
 
-def _reader_table(
-    options: Options, setting: ReaderConfig, compared: dict[str, Lens]
-) -> tuple[Table, dict[str, Any]]:
-    """Table and numbers of the reference reader for every lens."""
-    results = dict(
-        options.console.track(
-            judge_lenses(compared, setting), total=len(compared), label="reader"
-        )
-    )
-    numbers = {name: result.values() for name, result in results.items()}
-    return reader.reader_table(results, setting), {
-        "settings": dataclasses.asdict(setting),
-        "lenses": numbers,
-    }
-
-
 def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:
     """Tuned hyperbolic lens and double helix with the pillars and aperture of a lens.
 
@@ -181,26 +167,14 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
         radius_um=measured.radius_um,
         normalisation="sum" if setting.normalisation == "sum" else "l2",
     ).about(focus, radius)
-    named_lenses = []
+    tuned = []
     for baseline in tune_baselines(design_pupil(focus, radius, fisher), fisher):
         refocused = dataclasses.replace(focus, source_distance_um=baseline.focus_um)
         helix = DoubleHelix(zones=baseline.zones) if baseline.zones else None
         phase = design.phase_of(helix, refocused, radius_um=radius)
-        kind = "double-helix" if baseline.zones else "hyperbolic"
-        tuned, _ = design.make(
-            phase, refocused, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind
+        made = design.make(
+            phase, refocused, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy,
+            profile="double-helix" if helix else "hyperbolic",
         )  # fmt: skip
-        named_lenses.append((baseline.name, tuned))
-    return named_lenses
-
-
-def distinct_lens_names(names: list[str]) -> list[str]:
-    """Names of lenses, numbered where two files have the same stem.
-
-    Args:
-        names: stems of the files.
-    """
-    return [
-        name if names.count(name) == 1 else f"{name} ({i + 1})"
-        for i, name in enumerate(names)
-    ]
+        tuned.append((baseline.name, made[0]))
+    return tuned

@@ -13,21 +13,15 @@ from typing import Any
 import numpy as np
 
 from codesign.adapt import FinishedRun, retrained_network
+from codesign.commands.evaluate import distinct_names
 from codesign.commands.options.experiment import Options
-from codesign.evaluate import (
-    AXIAL,
-    LATERAL,
-    RunResult,
-    own_frames,
-    plots,
-    run_experiment,
-)
+from codesign.evaluate import RunResult, own_frames, plots, run_experiment
 from codesign.gaze import PopulationPrior, people_file
 from codesign.optics import image_formation
 from codesign.settings import ExperimentConfig
 from codesign.train import bootstrap_interval, bootstrap_ratio
 from metalens.core import config as settings
-from metalens.core import reading, report, store
+from metalens.core import report, store
 from metalens.core.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
@@ -44,7 +38,11 @@ def run(options: Options) -> int:
     """
     if not options.runs:
         raise ConfigError("no run to evaluate; give one run folder or more")
-    names = options.names or distinct_run_names(options.runs)
+    stems = [
+        p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}"
+        for p in (path.resolve() for path in options.runs)
+    ]
+    names = options.names or distinct_names(stems)
     if len(names) != len(options.runs):
         raise ConfigError(
             f"{len(names)} names for {len(options.runs)} runs; give one a run"
@@ -117,11 +115,23 @@ def _simulate(
     ):
         results = latest
     paths = dict(zip(names, options.runs, strict=True))
+    run_results = {
+        name: retrained_network.run_of(path) / "result.json"
+        for name, path in paths.items()
+    }
     values = experiment_summary(results, config) | {
-        "images": {name: _image_record(path) for name, path in paths.items()},
+        "images": {
+            name: json.loads(path.read_text("utf-8")).get("image")
+            for name, path in run_results.items()
+        },
         "lenses": {n: retrained_network.lens_of(path) for n, path in paths.items()},
         "beyond_training_mm": {
-            name: _beyond_training(source, config) for name, source in sources.items()
+            name: sorted(
+                slip
+                for slip in config.slips_mm.tolist()
+                if np.any(np.abs(slip) > source.settings.scenes.slip_mm)
+            )
+            for name, source in sources.items()
         },
         "failures": [
             f"{result.name}: {result.above}" for result in results if result.above
@@ -158,32 +168,6 @@ def _simulate(
     return values, "\n".join([*(table.text for table in tables), *remarks, *images])
 
 
-def _image_record(folder: Path) -> Any:
-    """Image model and error of a run, or of the run of a retraining, from its
-    result.json; None where it has none.
-    """
-    path = retrained_network.run_of(folder) / "result.json"
-    return json.loads(path.read_text("utf-8")).get("image")
-
-
-def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Folder names of runs, with that of a network file, numbered where they repeat.
-
-    Args:
-        paths: of runs or retrainings.
-    """
-    resolved = (path.resolve() for path in paths)
-    stems = [
-        reading.to_valid_utf8(
-            p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}"
-        )
-        for p in resolved
-    ]
-    return tuple(
-        s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems)
-    )
-
-
 FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
 
 
@@ -197,59 +181,32 @@ def experiment_summary(
     Args:
         results: one a run. config: subjects, stimuli, slippage and calibration.
     """
-    subject_means = [_subject_means(r) for r in results]
     rows = []
-    for result, means in zip(results, subject_means, strict=True):
+    ratios = []
+    first = results[0].subject_errors
+    for result in results:
+        errors = result.subject_errors
         row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs}
-        for quantity, values in means.items():
-            row[quantity] = float(values.mean())
+        for name, values in errors.items():
+            row[name] = float(values.mean())
             if len(values) > 1:
-                row[f"{quantity}_interval"] = list(bootstrap_interval(values))
-        fine = None if result.finer is None else _subject_means(result.finer)
+                row[f"{name}_interval"] = list(bootstrap_interval(values))
+        finer = result.finer.subject_errors if result.finer else {}
         for name in FINER:
-            row[f"finer_{name}"] = None if fine is None else float(fine[name].mean())
+            row[f"finer_{name}"] = float(finer[name].mean()) if finer else None
         row["finer_ratio"] = (
-            None if fine is None else row[f"finer_{FINER[0]}"] / row[FINER[0]]
+            row["finer_gaze_axial_deg"] / row["gaze_axial_deg"] if finer else None
         )
         rows.append(row)
-    ratios = []
-    for other, means in zip(results[1:], subject_means[1:], strict=True):
-        for quantity in FINER[:4]:
-            value, low, high = bootstrap_ratio(
-                subject_means[0][quantity], means[quantity]
-            )
+        if result is results[0]:
+            continue
+        for name in FINER[:4]:
+            ratio, *interval = bootstrap_ratio(first[name], errors[name])
             ratios.append({
-                "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
+                "quantity": name, "against": result.name, "ratio": ratio, "interval": interval,
             })  # fmt: skip
     about = {**asdict(config), "frames": config.frames}
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
-
-
-def _beyond_training(
-    source: FinishedRun, config: ExperimentConfig
-) -> list[list[float]]:
-    """Slippages (x, y, z) of the experiment in mm outside the range of a run's
-    training.
-    """
-    slips = config.slips_mm
-    outside = (np.abs(slips) > source.settings.scenes.slip_mm).any(1)
-    beyond: list[list[float]] = np.unique(slips[outside], axis=0).tolist()
-    return beyond
-
-
-def _subject_means(result: RunResult) -> dict[str, Any]:
-    """(subjects,) mean of every error by name, gaze in deg and slippage in mm."""
-    error, axial = result.slip_error_mm, result.trial.group(AXIAL)
-    return {
-        "gaze_axial_deg": result.per_subject(result.gaze_deg, axial),
-        "gaze_lateral_deg": result.per_subject(
-            result.gaze_deg, result.trial.group(LATERAL)
-        ),
-        "slip_mm": result.per_subject(error.mean(1)),
-        "slip_axial_mm": result.per_subject(error[:, 2]),
-        "slip_lateral_mm": result.per_subject(error[:, :2].mean(1)),
-        "iou": result.per_subject(result.iou),
-    }
 
 
 def experiment_tables(values: dict[str, Any]) -> list[report.Table]:

@@ -25,13 +25,14 @@ from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior_parameters, psf_error
 from codesign.train import Trainer, assess, checkpoint, device_of, place_on_device
-from metalens import __version__, lens
+from metalens import lens
 from metalens.core import config, store
 from metalens.core.errors import TrainingError
 from metalens.core.transaction import OutputDraft
 from metalens.fabrication import Bias
 
 LOG = "log.jsonl"
+UNKNOWN = "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
 
 
 Given = tuple[FinishedRun, asbuilt.AsBuilt, lens.Lens, HiddenLens | None, Bias]
@@ -56,7 +57,13 @@ def run(options: Options) -> int:
     check_lens(design, result, insist=options.insist)
     truth = config.load(options.truth, HiddenLens) if options.truth else None
     old = next_mask.present_bias(options.process)
-    recipe = _recipe(options, source)
+    recipe = RetrainingRecipe(
+        options.settings,
+        store.sha256(options.asbuilt),
+        store.sha256(options.run_dir / "checkpoint.safetensors"),
+        source.settings,
+        store.sha256(options.truth) if options.truth else "",
+    )
     with options.claim_work(
         options.output, keep=("*.safetensors",), resume=options.resume
     ) as draft:
@@ -84,11 +91,9 @@ def _retrain_and_correct(
     psfs = retraining.lens_psfs(made, result, options.settings, truth)
     trained = {
         name: _train(options, folder, (recipe, source, psfs), name)
-        for name in retraining.available_jobs(psfs)
+        for name in retraining.training_stacks(psfs)
     }
-    console.say(
-        f"judging: {len(retraining.available_jobs(psfs)) + 2} cases on the same frames"
-    )
+    console.say(f"judging: {len(trained) + 2} cases on the same frames")
     outcome = retraining.retraining_outcome(source, options.settings, psfs, trained)
     if truth:
         true_parameters = truth.vector()
@@ -104,7 +109,7 @@ def _retrain_and_correct(
         len(psfs.drawn),
         psfs.known,
         mask,
-        _cautions(result, known=psfs.known),
+        (*result.problems, *result.degeneracies, *([] if psfs.known else [UNKNOWN])),
     )
     if not mask.refused:
         next_mask.write_correction(folder, mask.plan, evened=not mask.uneven)
@@ -115,16 +120,6 @@ def _retrain_and_correct(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
     return results
-
-
-def _recipe(options: Options, source: FinishedRun) -> RetrainingRecipe:
-    return RetrainingRecipe(
-        options.settings,
-        store.sha256(options.asbuilt),
-        store.sha256(options.run_dir / "checkpoint.safetensors"),
-        source.settings,
-        store.sha256(options.truth) if options.truth else "",
-    )
 
 
 def _check_recipe(
@@ -176,21 +171,6 @@ def _train(
     return trainer
 
 
-def _cautions(result: asbuilt.AsBuilt, *, known: bool) -> list[str]:
-    """Warnings about the fit and its use, in words."""
-    words = list(result.problems) + list(result.degeneracies)
-    release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
-    if release != __version__:
-        words.append(
-            f"the as-built record was made by release {release}, this is {__version__}"
-        )
-    if not known:
-        words.append(
-            "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
-        )
-    return words
-
-
 def _write_results(
     folder: Path,
     options: Options,
@@ -216,27 +196,26 @@ def _values(
 ) -> dict[str, Any]:
     """Content of result.json."""
     outcome, folder = story.outcome, options.output
-    steps = [
-        {"name": step.name, "strehl": step.strehl, "light": step.light}
-        for step in story.mask.steps
-    ]
+    cases = outcome.rows()
     return {
         "folder": str(folder),
         "given": relative_inputs(
             folder, options.run_dir, options.asbuilt, options.truth
         ),
         "rows": [
-            {"case": retrain_report.CASES[name], **row}
-            for name, row in outcome.rows().items()
+            {"case": retrain_report.CASES[name], **row} for name, row in cases.items()
         ],
-        "slip_mm": outcome.rows()["after"]["slip_mm"],
-        "cases": outcome.rows(),
+        "slip_mm": cases["after"]["slip_mm"],
+        "cases": cases,
         "gap_mm": outcome.gap_mm,
         "gap_sigma_mm": outcome.gap_sigma_mm,
         "recovered": outcome.recovered,
         "psf_error": dict(zip(("fitted", "judge"), story.psf_errors, strict=True)),
         "truth_known": story.known,
-        "next_lens": steps,
+        "next_lens": [
+            {"name": step.name, "strehl": step.strehl, "light": step.light}
+            for step in story.mask.steps
+        ],
         "correction_refused": story.mask.refused,
         "map_refused": story.mask.uneven,
     }
@@ -244,14 +223,10 @@ def _values(
 
 def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
     """Summary of a retraining for the terminal."""
-    o = story.outcome
-    lines = [retrain_report.accuracy_table(o).text]
-    won = (
-        "nothing to win back beyond chance"
-        if o.recovered is None
-        else f"{o.recovered:.0%} won back"
-    )
-    lines.append(f"gap {o.gap_mm:.3f} +- {o.gap_sigma_mm:.3f} mm, {won}")
+    lines = [
+        retrain_report.accuracy_table(story.outcome).text,
+        retrain_report.gap_text(story.outcome),
+    ]
     for step in story.mask.steps:
         lines.append(f"next lens, {step.name:<26} Strehl {step.strehl:.3f}")
     lines.append(f"next mask: {story.mask.summary}")

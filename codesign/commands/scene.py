@@ -1,5 +1,6 @@
 """SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
 
+import functools
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +25,6 @@ from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
 from metalens.core.store import Provenance
 from metalens.image import scene
-from metalens.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,15 +103,15 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     settings = (
-        SceneSettings()
-        if options.config is None
-        else config.load(options.config, SceneSettings)
+        config.load(options.config, SceneSettings)
+        if options.config
+        else SceneSettings()
     )
     if options.fwhm_nm < 0 or (options.fwhm_nm and options.lens is None):
         raise ConfigError(
             f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is"
         )
-    lens = None if options.lens is None else lenses.load(options.lens)
+    lens = lenses.load(options.lens) if options.lens else None
     folder, failures = options.output, list[str]()
     with options.claim_folder(
         folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
@@ -134,7 +134,15 @@ def run(options: Options) -> int:
                 {options.lens.name: store.sha256(options.lens)},
                 settings.seed,
             )
-            images = _image_frames(settings, lens, options.fwhm_nm)
+            images = scene_image.image_first_frames(
+                lens,
+                PinholeCamera(settings.pixels, settings.pitch_um),
+                settings.rig,
+                functools.partial(
+                    _rendered, settings, min(settings.frames, scene_image.FRAMES)
+                ),
+                fwhm_nm=options.fwhm_nm,
+            )
             scene_image.write_images(draft.path, images, provenance)
             values |= {"image_error": images.error, "light": images.light}
             failures.append(images.problem)
@@ -142,15 +150,20 @@ def run(options: Options) -> int:
     return options.console.judged(values, summary, failures)
 
 
+def _rendered(
+    settings: SceneSettings, count: int, camera: PinholeCamera, rig: CameraRig
+) -> RenderedFrames:
+    """The first frames of the settings before a camera."""
+    states = dataset.states_at(
+        torch.arange(count), settings.seed, motion=settings.motion
+    )
+    return augmented_frames(states, rig, camera, settings.variety, (settings.seed, 3))
+
+
 def _render_and_write(settings: SceneSettings, folder: Path) -> int:
     """Render frames, write scene, layers, labels and sheet; number of layers."""
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
-    states = dataset.states_at(
-        torch.arange(settings.frames), settings.seed, motion=settings.motion
-    )
-    rendered = augmented_frames(
-        states, settings.rig, camera, settings.variety, (settings.seed, 3)
-    )
+    rendered = _rendered(settings, settings.frames, camera, settings.rig)
     provenance = Provenance(config=config.dumps(settings), seed=settings.seed)
     dataset.write_shard(
         folder / "scene.h5", rendered, seed=settings.seed, provenance=provenance
@@ -163,39 +176,15 @@ def _render_and_write(settings: SceneSettings, folder: Path) -> int:
     return layer_count
 
 
-def _image_frames(
-    settings: SceneSettings, lens: Lens, fwhm_nm: float
-) -> scene_image.ImagedFrames:
-    """First frames imaged by a lens over its field."""
-    count = min(settings.frames, scene_image.FRAMES)
-    states = dataset.states_at(
-        torch.arange(count), settings.seed, motion=settings.motion
-    )
-
-    def render_with(camera: PinholeCamera, rig: CameraRig) -> RenderedFrames:
-        return augmented_frames(
-            states, rig, camera, settings.variety, (settings.seed, 3)
-        )
-
-    camera = PinholeCamera(settings.pixels, settings.pitch_um)
-    return scene_image.image_first_frames(
-        lens, camera, settings.rig, render_with, fwhm_nm=fwhm_nm
-    )
-
-
 def _write_layers(
     path: Path, rendered: RenderedFrames, step_um: float, about: Provenance
 ) -> int:
     """Write the occupied depth layers of the first frame; their number."""
-    frame = scene.Frames(
-        rendered.frames.radiance[:1],
-        rendered.frames.coverage[:1],
-        rendered.frames.depth_um[:1],
-    )
-    depths_um = frame.depth_um[frame.coverage > 0]
+    first = rendered.rows(torch.tensor([0])).frames
+    depths_um = first.depth_um[first.coverage > 0]
     low, high = float(depths_um.min()), float(depths_um.max())
     depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
-    layers = scene.cut_layers(frame, depths)
+    layers = scene.cut_layers(first, depths)
     arrays = {
         "radiance": layers.radiance[0].numpy(),
         "coverage": layers.coverage[0].numpy(),
@@ -244,7 +233,4 @@ def contact_sheet(
         tiles = torch.cat([pictures, blank]).reshape(-1, columns, size, size)
         rows.append(tiles.transpose(1, 2).reshape(-1, columns * size))
     sheet = (255 * torch.cat(rows)).numpy().astype(np.uint8)
-    encoded, coded = cv2.imencode(".png", sheet)
-    if not encoded:
-        raise OSError(f"{path}: the picture could not be encoded")
-    store.write_bytes(path, coded.tobytes())
+    store.write_bytes(path, cv2.imencode(".png", sheet)[1].tobytes())

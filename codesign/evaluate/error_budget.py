@@ -58,12 +58,13 @@ def quadrature_total(rows: list[BudgetEntry]) -> BudgetEntry:
     """
 
     def root_sum_square(name: str) -> float:
-        values = [getattr(row, name) for row in rows if row.counted]
-        finite = [value for value in values if math.isfinite(value)]
-        return math.hypot(*finite) if finite else NONE
+        values = np.array([getattr(row, name) for row in counted])
+        known = values[np.isfinite(values)]
+        return float(np.linalg.norm(known)) if len(known) else NONE
 
+    counted = [row for row in rows if row.counted]
     method = "root of the sum of squares"
-    without_gaze = [r.link for r in rows if r.counted and math.isnan(r.gaze_rad)]
+    without_gaze = [row.link for row in counted if math.isnan(row.gaze_rad)]
     if without_gaze:
         method += f"; gaze without {', '.join(without_gaze)}"
     columns = (root_sum_square(name) for name in ("phase_rad", "psf", "gaze_rad"))
@@ -299,9 +300,8 @@ class ErrorBudget:
                 self.settings, self.smooth_rad, frame, margin=margin
             )
         self.made = MadeLens(lens, self.settings)
-        self.coupling: Array | None = None
-        if lens.neighbours is not None:
-            self.coupling = self._coupling(lens.neighbours)
+        rows = lens.neighbours
+        self.coupling = None if rows is None else self._coupling(rows)
         self.base = self._pillars(self.made, State.of(), self.coupling)
         plane = self.made.plane(State.of(), factor=self.coupling)
         self.optics = Optics(plane, lens.layers, lens.sensor_distance_um)
@@ -425,18 +425,16 @@ class ErrorBudget:
         lens = self.lens
         library = self.given.library
         diameters_um = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
-        tolerance = library.sweep.bar if library else self.given.tolerance
+        tolerance = (library.sweep.bar if library else self.given.tolerance) / FINER
         engine = engines.choose_engine(lens.cell)
         solve = engines.solve_to_tolerance(
-            lens.cell, Incidence(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine
-        )  # fmt: skip
-        precise = np.array(
-            [solve(float(diameter_um)).t for diameter_um in diameters_um]
+            lens.cell, Incidence(lens.wavelength_um), tolerance=tolerance, engine=engine
         )
-        proxy = lens.proxy.transmission(diameters_um, lens.wavelength_um) * np.exp(
-            1j * lens.proxy.phase_rad(diameters_um, lens.wavelength_um)
-        )
-        method = f"{engine} solver at {tolerance / FINER:.0e}, {SOLVED} diameters"
+        precise = np.array([solve(diameter_um).t for diameter_um in diameters_um])
+        modulus = lens.proxy.transmission(diameters_um, lens.wavelength_um)
+        phase_rad = lens.proxy.phase_rad(diameters_um, lens.wavelength_um)
+        proxy = modulus * np.exp(1j * phase_rad)
+        method = f"{engine} solver at {tolerance:.0e}, {SOLVED} diameters"
         cases = [("pillar solver and proxy", precise / proxy, f"against the {method}")]
         if library is not None:
             stored = stored_response(library, diameters_um, lens.wavelength_um)
@@ -447,12 +445,10 @@ class ErrorBudget:
         for link, ratio, description in cases:
             log_ratio = np.log(np.abs(ratio)) + 1j * np.unwrap(np.angle(ratio))
             designed_um = lens.diameters.diameter_um
-            factor = np.exp(
-                np.interp(designed_um, diameters_um, log_ratio.real)
-                + 1j * np.interp(designed_um, diameters_um, log_ratio.imag)
-            )
-            pillar_factor = factor if self.coupling is None else factor * self.coupling
-            yield self._changed(link, description, factor=pillar_factor)
+            factor = np.exp(np.interp(designed_um, diameters_um, log_ratio))
+            if self.coupling is not None:
+                factor = factor * self.coupling
+            yield self._changed(link, description, factor=factor)
 
     def _neighbours(self) -> Iterator[BudgetEntry]:
         """Entry of the local periodic approximation: rows of unequal pillars, solved as
@@ -601,8 +597,6 @@ def stored_response(
     """
     nearest = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
     t = library.t[:, 0, nearest].mean(0)
-    level, phase = (
-        np.interp(at_um, library.diameter_um, part)
-        for part in (np.abs(t), np.unwrap(np.angle(t)))
-    )
-    return np.asarray(level * np.exp(1j * phase))
+    polar = np.abs(t) + 1j * np.unwrap(np.angle(t))
+    modulus_phase = np.interp(at_um, library.diameter_um, polar)
+    return np.asarray(modulus_phase.real * np.exp(1j * modulus_phase.imag))

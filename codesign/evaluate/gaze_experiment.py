@@ -107,24 +107,26 @@ class RunResult:
         return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
 
     @property
-    def slip_error_mm(self) -> Array:
-        """(n, 3) absolute errors of the slippage."""
-        return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
-
-    def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
-        """(subjects,) mean of each subject's finite values; nan for a subject without
-        any.
-
-        Args:
-            values: (n,) value of every frame.
-            chosen: (n,) True for the frames that count; all without it.
-        """
-        valid = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        groups = (
-            values[valid & (self.trial.subject == s)]
-            for s in np.unique(self.trial.subject)
-        )
-        return np.array([group.mean() if len(group) else math.nan for group in groups])
+    def subject_errors(self) -> dict[str, Array]:
+        """(subjects,) mean of every error by name, gaze in deg and slippage in mm."""
+        slip = np.abs(self.slip_mm - self.trial.slip_mm)
+        errors = {
+            "gaze_axial_deg": np.where(
+                self.trial.group(AXIAL), self.gaze_deg, math.nan
+            ),
+            "gaze_lateral_deg": np.where(
+                self.trial.group(LATERAL), self.gaze_deg, math.nan
+            ),
+            "slip_mm": slip.mean(1),
+            "slip_axial_mm": slip[:, 2],
+            "slip_lateral_mm": slip[:, :2].mean(1),
+            "iou": self.iou,
+        }
+        of_subject = [self.trial.subject == s for s in np.unique(self.trial.subject)]
+        return {
+            name: np.array([np.nanmean(values[rows]) for rows in of_subject])
+            for name, values in errors.items()
+        }
 
 
 def states_of(

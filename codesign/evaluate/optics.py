@@ -9,19 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import (
-    CameraRig,
-    EyeStates,
-    PinholeCamera,
-    RenderedFrames,
-    moved_states,
-    render,
-)
+from codesign.eye import CameraRig, EyeStates, PinholeCamera, moved_states, render
 from codesign.settings import LARGEST, LEAST, check_ranges
 from codesign.train import bootstrap_ratio
 from metalens.core.errors import ConfigError, SceneError
 from metalens.core.report import Table
-from metalens.image import Grid, Imager, Normalisation, axial_information, imager
+from metalens.image import Frames, Grid, Normalisation, axial_information, imager
 from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens, passed_um2
 
@@ -267,12 +260,12 @@ class SceneEnergy:
     above: str = ""
 
     @property
-    def angle_rad(self) -> Tensor:
-        """(scenes,) span angle of Eq. 5 between the changes with gaze and with slip."""
+    def span_angle_deg(self) -> float:
+        """Mean span angle of Eq. 5 between the changes with gaze and with slip."""
         along = (self.gaze + self.slip - self.separability) / (
             2 * torch.sqrt(self.gaze * self.slip).clamp_min(1e-300)
         )
-        return torch.arccos(along.clamp(-1, 1))
+        return float(torch.rad2deg(torch.arccos(along.clamp(-1, 1))).mean())
 
 
 def scene_energies(
@@ -303,37 +296,34 @@ def scene_energies(
                 f"for {distance_um:g} um: their images differ in size; compare lenses of one sensor distance"
             )
     views = scene_views(states, settings, sensor_distance_um=distance_um)
+    visible_um = torch.cat([f.depth_um[f.coverage > 0] for f in views])
+    # at least 5 and 6 mm
+    depths_um = max(float(visible_um.min()), 5e3), max(float(visible_um.max()), 6e3)
     window_samples = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
-    grid = Grid(
-        (settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window_samples
-    )
+    shape = (settings.pixels, settings.pixels)
+    grid = Grid(shape, settings.pitch_um, depths_um, 0, window_samples)
     results = []
     for lens in lenses:
         optics = imager(lens, grid, tolerance=settings.image_tolerance)
-        energies = energies_of(optics, views)
-        results.append(replace(energies, above=optics.above(settings.image_tolerance)))
+        images = [optics(frames) for frames in views]
+        anchor, gaze, slip = (
+            image / images[0].mean((1, 2), keepdim=True) for image in images
+        )
+        changes = [(gaze - anchor) ** 2, (slip - anchor) ** 2, (gaze - slip) ** 2]
+        results.append(
+            SceneEnergy(
+                *(change.sum((1, 2)) for change in changes),
+                optics.error,
+                torch.stack([anchor[0], changes[0][0], changes[2][0]]),
+                optics.above(settings.image_tolerance),
+            )
+        )
     return results
 
 
-def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
-    """Depths in um of the nearest and the farthest visible surface, at least 5 and 6
-    mm.
-
-    Args:
-        views: rendered views of the scenes.
-    """
-    visible_um = torch.cat(
-        [view.frames.depth_um[view.frames.coverage > 0] for view in views]
-    )
-    return max(float(visible_um.min()), 5e3), max(float(visible_um.max()), 6e3)
-
-
 def scene_views(
-    states: EyeStates,
-    settings: SensitivityScenes,
-    *,
-    sensor_distance_um: float = 2000.0,
-) -> list[RenderedFrames]:
+    states: EyeStates, settings: SensitivityScenes, *, sensor_distance_um: float
+) -> list[Frames]:
     """Rendered anchor, gaze and slip views of eye states, at the exposure of the
     anchor.
 
@@ -349,35 +339,9 @@ def scene_views(
     rig = replace(CameraRig(), sensor_distance_um=sensor_distance_um)
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     return [
-        render(moved, rig=rig, camera=camera, exposed=states)
+        render(moved, rig=rig, camera=camera, exposed=states).frames
         for moved in moved_states(states, motions)
     ]
-
-
-def energies_of(optics: Imager, views: Sequence[RenderedFrames]) -> SceneEnergy:
-    """Squared differences between the energy-matched images of three views, for any
-    imager; see :func:`scene_energies`.
-
-    Args:
-        optics: imager of the lens.
-        views: anchor, gaze and slip views.
-    """
-    images = [optics(view.frames) for view in views]
-    anchor, gaze, slip = (
-        image / images[0].mean((1, 2), keepdim=True) for image in images
-    )
-    maps = [
-        (image_a - image_b) ** 2
-        for image_a, image_b in ((gaze, anchor), (slip, anchor), (gaze, slip))
-    ]
-    sums = [change.sum((1, 2)) for change in maps]
-    return SceneEnergy(
-        sums[0],
-        sums[1],
-        sums[2],
-        optics.error,
-        torch.stack([anchor[0], maps[0][0], maps[2][0]]),
-    )
 
 
 def lens_ratios(
@@ -413,27 +377,24 @@ def table_values(
         scenes: scene sensitivity by name of the lens.
         setting: how the lenses were measured.
     """
-    values: dict[str, Any] = {
+    ratios = lens_ratios(scenes)
+    return {
         "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
         "angles_deg": list(setting.angles_deg),
         "binnings": list(setting.binnings),
         "normalisation": setting.normalisation,
-        "lenses": {},
+        "lenses": {
+            name: {
+                "information_per_mm2": measured.information.tolist(),
+                "encircled_energy": measured.encircled.tolist(),
+                "psf_error": measured.psf_error,
+                "scene_ratios": {kind: list(v) for kind, v in ratios[name].items()},
+                "span_angle_deg": scenes[name].span_angle_deg,
+                "image_error": scenes[name].image_error,
+            }
+            for name, measured in axial.items()
+        },
     }
-    ratios = lens_ratios(scenes)
-    for name, measured in axial.items():
-        energy = scenes[name]
-        values["lenses"][name] = {
-            "information_per_mm2": measured.information.tolist(),
-            "encircled_energy": measured.encircled.tolist(),
-            "psf_error": measured.psf_error,
-            "scene_ratios": {
-                kind: list(interval) for kind, interval in ratios[name].items()
-            },
-            "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
-            "image_error": energy.image_error,
-        }
-    return values
 
 
 def table_failures(
@@ -504,10 +465,16 @@ def scene_table(scenes: Mapping[str, SceneEnergy]) -> Table:
     """
     first = next(iter(scenes))
     caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for name, ratios in lens_ratios(scenes).items():
         energy = scenes[name]
         intervals = ["{:.2f} [{:.2f}, {:.2f}]".format(*r) for r in ratios.values()]
-        angle = float(torch.rad2deg(energy.angle_rad).mean())
-        rows.append((name, *intervals, f"{angle:.1f}°", f"{energy.image_error:.3f}"))
+        rows.append(
+            (
+                name,
+                *intervals,
+                f"{energy.span_angle_deg:.1f}°",
+                f"{energy.image_error:.3f}",
+            )
+        )
     return Table(("lens", *KINDS, "span angle", "image error"), rows, caption)

@@ -148,20 +148,21 @@ def image_first_frames(
         np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3]
     )
     psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
-    y_um = optics.plan.y_um.numpy()[rows]
-    x_um = optics.plan.x_um.numpy()[columns]
+    y_deg, x_deg = (
+        np.degrees(np.arctan(place_um.numpy()[nodes] / lens.reduced_um))
+        for place_um, nodes in ((optics.plan.y_um, rows), (optics.plan.x_um, columns))
+    )
+    source = diode_source(lens, fwhm_nm)
     return ImagedFrames(
         scene.numpy().astype(np.float32),
         (light * (scene.sum() / light.sum())).numpy().astype(np.float32),
         psf.numpy().astype(np.float32),
         optics.plan.depths_um.numpy()[depths],
-        np.degrees(np.arctan(y_um / lens.reduced_um)),
-        np.degrees(np.arctan(x_um / lens.reduced_um)),
+        y_deg,
+        x_deg,
         camera.pitch_um,
         optics.error,
-        spectrum.outside_library_text(
-            diode_source(lens, fwhm_nm), lens.proxy.wavelengths_um
-        ),
+        spectrum.outside_library_text(source, lens.proxy.wavelengths_um),
         optics.above(TOLERANCE),
     )
 
@@ -190,17 +191,19 @@ def plot_image(imaged: ImagedFrames) -> bytes:
         imaged: frames with their images.
     """
     figure, axes = report.make_figure(1, 3, size=(9.6, 3.3))
-    difference = imaged.image[0] - imaged.scene[0]
-    brightest = float(imaged.scene[0].max())
-    largest = float(np.abs(difference).max())
-    half_mm = imaged.pitch_um * len(difference) / 2000
-    extent = {"extent": (-half_mm, half_mm, half_mm, -half_mm)}
-    axes[0].imshow(imaged.scene[0], cmap="gray", vmin=0, vmax=brightest, **extent)
-    axes[1].imshow(imaged.image[0], cmap="gray", vmin=0, vmax=brightest, **extent)
-    drawn = axes[2].imshow(
-        difference, cmap="RdBu_r", vmin=-largest, vmax=largest, **extent
-    )
-    for panel, title in zip(axes, ("scene", "image", "image − scene"), strict=True):
+    scene, image = imaged.scene[0], imaged.image[0]
+    half_mm = imaged.pitch_um * len(scene) / 2000
+    largest = float(np.abs(image - scene).max())
+    grey = {"cmap": "gray", "vmin": 0, "vmax": float(scene.max())}
+    signed = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+    for panel, title, picture, colours in (
+        (axes[0], "scene", scene, grey),
+        (axes[1], "image", image, grey),
+        (axes[2], "image − scene", image - scene, signed),
+    ):
+        drawn = panel.imshow(
+            picture, extent=(-half_mm, half_mm, half_mm, -half_mm), **colours
+        )
         panel.set(title=title, xlabel="x on the sensor / mm")
         panel.grid(visible=False)
     figure.colorbar(drawn, ax=axes[2], label="light, as of the scene")

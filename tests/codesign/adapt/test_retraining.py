@@ -63,7 +63,9 @@ def test_bars_of_a_gap_and_of_an_accuracy():
     assert told.gap_mm == pytest.approx(0.21, abs=4 * 0.374 / math.sqrt(4000))
     # the mean of three axes scatters by sqrt(0.09 + 0.36 + 0.81) / 3 = 0.374
     assert told.gap_sigma_mm == pytest.approx(0.374 / math.sqrt(4000), rel=0.05)
-    assert better.axial_mm - better.lateral_mm == pytest.approx(4.5, rel=1e-5)
+    told_better = better.values()
+    depth = told_better["axial_mm"] - told_better["lateral_mm"]
+    assert depth == pytest.approx(4.5, rel=1e-5)
     assert better.slip_mm == pytest.approx(4.5, abs=0.05)
     low, high = (better.values()[f"slip_{end}_mm"] for end in ("low", "high"))
     assert high - low == pytest.approx(
