@@ -42,27 +42,18 @@ def run_panels(path: Path) -> list[Panel]:
     Raises:
         StoreError: a log or a result that is no JSON.
     """
-    entries = _log_entries(path / LOG)
-    result: dict[str, Any] = {}
-    if (path / RESULT).is_file():
-        text = (path / RESULT).read_text(encoding="utf-8")
-        result = _parse_table(text, path / RESULT)
-    panels = [
-        *_training_panels(entries),
-        *_search_panels(entries),
-        *_network_panels(result),
-    ]
+    log, result = path / LOG, path / RESULT
+    lines = log.read_text("utf-8").splitlines() if log.is_file() else []
+    # a last line that is still being written is left out
+    entries = [_parse_table(line, log) for line in lines if line.endswith("}")]
+    panels = [*_training_panels(entries), *_search_panels(entries)]
+    if result.is_file():
+        panels += _network_panels(_parse_table(result.read_text("utf-8"), result))
     if (path / ANSWERS).is_file():
         panels += prediction_panels(path / ANSWERS)
     if (path / LENS).is_file():
         panels += lens_panels(path / LENS)
     return panels
-
-
-def _log_entries(path: Path) -> list[dict[str, Any]]:
-    """Entries of the log; a last line that is still being written is left out."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return [_parse_table(line, path) for line in lines if line.endswith("}")]
 
 
 def _parse_table(text: str, path: Path) -> dict[str, Any]:
@@ -89,18 +80,17 @@ def _training_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     steps = [entry for entry in entries if entry.get("kind") == "step"]
     if len(steps) < 2:
         return []
-    panels: list[Panel] = []
     x = np.array([entry["step"] for entry in steps], float)
-    for name in steps[0]:
-        if name in ("kind", "step"):
-            continue
-        curve = np.array([entry.get(name, np.nan) for entry in steps], float)
-        if np.ptp(curve) > 0:
-            title = report.in_words(name)
-            panels.append(
-                CurvePanel(f"Training: {title}", x, "step", {title: curve}, "")
-            )
-    return panels
+    curves = {
+        report.in_words(name): np.array([e.get(name, np.nan) for e in steps], float)
+        for name in steps[0]
+        if name not in ("kind", "step")
+    }
+    return [
+        CurvePanel(f"Training: {title}", x, "step", {title: curve}, "")
+        for title, curve in curves.items()
+        if np.ptp(curve) > 0
+    ]
 
 
 def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
@@ -129,31 +119,32 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
             "gaze error / deg",
             [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
             front,
-            notes=[dict(_layer_rows(e["architecture"])) for e in births],
+            notes=[_layers(e["architecture"]) for e in births],
             caption="Errors are of the validation frames. Pick a network to read its layers.",
         )
     ]
 
 
-def _layer_rows(architecture: dict[str, Any]) -> list[tuple[str, str]]:
-    """(property, value) rows of a network: input scale, channels, blocks of each stage.
+def _layers(architecture: dict[str, Any]) -> dict[str, str]:
+    """{property: value} of a network: input scale, channels, blocks of each stage.
 
     A block is written kernel × kernel × expansion.
     """
     depths = architecture["depths"]
     slots = len(architecture["kernels"]) // len(depths)
-    rows = [
-        ("input scale", f"{architecture['resolution']:.3g}"),
-        ("channels, of the full ones", f"{architecture['width']:.3g}"),
-    ]
-    for stage, depth in enumerate(depths):
-        used = range(stage * slots, stage * slots + depth)
-        blocks = ", ".join(
-            f"{architecture['kernels'][i]}×{architecture['kernels'][i]} × {architecture['expansions'][i]:g}"
-            for i in used
+    blocks = [
+        f"{kernel}×{kernel} × {expansion:g}"
+        for kernel, expansion in zip(
+            architecture["kernels"], architecture["expansions"], strict=True
         )
-        rows.append((f"stage {stage + 1}", blocks))
-    return rows
+    ]
+    return {
+        "input scale": f"{architecture['resolution']:.3g}",
+        "channels, of the full ones": f"{architecture['width']:.3g}",
+    } | {
+        f"stage {stage + 1}": ", ".join(blocks[stage * slots : stage * slots + depth])
+        for stage, depth in enumerate(depths)
+    }
 
 
 def prediction_panels(path: Path) -> list[Panel]:
@@ -206,9 +197,7 @@ def prediction_panels(path: Path) -> list[Panel]:
 
 
 def _network_panels(result: dict[str, Any]) -> list[Panel]:
-    """Table of the results; [] without a result."""
-    if not result:
-        return []
+    """Table of the results; [] without any."""
     rows = result.get("rows", [])
     names = sorted(
         {n for row in rows for n, v in row.items() if isinstance(v, (int, float, str))}
@@ -242,7 +231,8 @@ def scene_panels(path: Path) -> list[Panel]:
     depth_mm = 1e-3 * np.where(
         is_far, arrays["depth_um"][:, 1], arrays["depth_um"][:, 0]
     )
-    columns, labels = ["frame"], [np.arange(count)[:, None]]
+    columns: list[str] = []
+    labels: list[Array] = []
     for name in ("slip_um", "pupil_um", "visible"):
         labels.append(arrays[f"labels/{name}"].reshape(count, -1))
         axes = [f", {axis}" for axis in "xyz"] if labels[-1].shape[1] > 1 else [""]
@@ -255,8 +245,8 @@ def scene_panels(path: Path) -> list[Panel]:
         _pixels("Pupil", pupil, frames, "share of the pixel"),
         TablePanel(
             "Labels",
-            columns,
-            np.concatenate(labels, 1).tolist(),
+            ("frame", *columns),
+            [(k, *row) for k, row in enumerate(np.concatenate(labels, 1).tolist())],
             "Positions in the camera's axes; labels.csv holds all of them.",
         ),
     ]

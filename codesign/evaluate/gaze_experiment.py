@@ -69,9 +69,8 @@ class ExperimentTrials:
         Args:
             kind: "axial" or "lateral".
         """
-        along = 2 if kind == AXIAL else 0
         other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
-        return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
+        return np.asarray((other == 0).all(1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -158,12 +157,7 @@ def states_of(
         motion=replace(scenes.settings.motion, scale=0.0),
     )
     base = person[torch.zeros(n, dtype=torch.int64)]
-    state, stimulus = (
-        indices.ravel()
-        for indices in np.meshgrid(
-            np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"
-        )
-    )
+    state, stimulus = np.divmod(np.arange(n), len(stimuli))
     gaze_deg = stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2))
     traits = base.traits.clone()
     radius = list(POPULATION).index("pupil_radius_um")
