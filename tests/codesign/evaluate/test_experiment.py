@@ -244,5 +244,5 @@ def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder
 
 @pytest.mark.parametrize("people", [0, 1])
 def test_one_person_tells_not_how_people_differ(people):
-    with pytest.raises(ConfigError, match=f"people {people}"):
+    with pytest.raises(ConfigError, match=f"people = {people}"):
         replace(SMALL, people=people)
