@@ -32,7 +32,7 @@ from codesign.gaze import (
 )
 from codesign.optics import OpticsConfig, image_formation
 from codesign.settings import ExperimentConfig
-from codesign.train import Predictions, SensorFrames, assess
+from codesign.train import FramePredictions, SensorFrames, assess
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, PropagationError, SceneError
 from metalens.image import Imager, Sensor, low_snr
@@ -234,7 +234,7 @@ def predict_rendered(
     seed: int,
     sensor: Sensor,
     quiet: bool = False,
-) -> Predictions:
+) -> FramePredictions:
     """Pupil, slippage and axis that a run's network predicts from rendered scenes
     through its lens.
 
@@ -247,7 +247,7 @@ def predict_rendered(
         quiet: no noise.
     """
     batch = as_batch(rendered, source.settings.scenes.margin)
-    return predict_frames(
+    return predict_of_run(
         source,
         assess.read_batch(
             source.run.trainer, batch, imager, seed=seed, sensor=sensor, quiet=quiet
@@ -255,7 +255,7 @@ def predict_rendered(
     )
 
 
-def predict_frames(source: FinishedRun, frames: SensorFrames) -> Predictions:
+def predict_of_run(source: FinishedRun, frames: SensorFrames) -> FramePredictions:
     """Pupil, slippage and axis that a run's network predicts from sensor frames.
 
     Args:
@@ -344,7 +344,7 @@ def run_experiment(
         images = [image for image in (imager, finer_imager(source)) if image]
         devices.append((source, sensor, calibrator, images))
     # of every run, image and subject
-    predictions: list[list[list[Predictions]]] = [
+    predictions: list[list[list[FramePredictions]]] = [
         [[] for _ in images] for *_, images in devices
     ]
     for subject in range(config.subjects):
@@ -531,7 +531,7 @@ def run_calibrator(
 
 
 def read_from(
-    predictions: Sequence[Predictions], source: FinishedRun
+    predictions: Sequence[FramePredictions], source: FinishedRun
 ) -> NetworkReadings:
     """Readings of all frames in the units of the gaze calibration: pupil and slippage
     in mm, optic axis as angles in the frame of the face.
@@ -548,7 +548,7 @@ def read_from(
     return NetworkReadings(centre * source.run.window_um * 1e-3, slip_mm, angles)
 
 
-def _joined(predictions: Sequence[Predictions], name: str) -> Array:
+def _joined(predictions: Sequence[FramePredictions], name: str) -> Array:
     """(n, ...) float64 values of a field of all predictions."""
     values = torch.cat([getattr(prediction, name) for prediction in predictions])
     return np.asarray(values.double().numpy())
@@ -557,7 +557,7 @@ def _joined(predictions: Sequence[Predictions], name: str) -> Array:
 def _result(
     name: str,
     source: FinishedRun,
-    predictions: list[Predictions],
+    predictions: list[FramePredictions],
     trial: ExperimentTrials,
     config: ExperimentConfig,
     calibrator: PersonCalibrator,

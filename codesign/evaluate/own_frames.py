@@ -66,7 +66,7 @@ def read_frames_table(path: Path) -> tuple[list[dict[str, str]], dict[str, Array
         raise ConfigError(f"{path}: {error}; every row needs its targets") from None
 
 
-def read_images(folder: Path, names: list[str], size: int) -> Tensor:
+def read_frames(folder: Path, names: list[str], size: int) -> Tensor:
     """(n, y, x) counts of images of one size.
 
     Args:
@@ -103,7 +103,7 @@ def predict_own_frames(
         config: calibration, light and image of the simulated people of the prior.
 
     Raises:
-        ConfigError, CaptureError: see :func:`read_frames_table`, :func:`read_images`.
+        ConfigError, CaptureError: see :func:`read_frames_table`, :func:`read_frames`.
         TrainingError: fewer than three frames of a subject to calibrate on.
     """
     trainer, settings = source.run.trainer, source.settings
@@ -111,15 +111,15 @@ def predict_own_frames(
     pitch_um = float(trainer.model.pitch_um.detach())
     size = pixel_count(samples, sample_um, pitch_um)
     rows, targets = read_frames_table(folder / "frames.csv")
-    counts = read_images(folder, [row["file"] for row in rows], size)
+    counts = read_frames(folder, [row["file"] for row in rows], size)
     mask = blank = torch.zeros_like(counts)
     if "mask" in rows[0]:
-        mask = (read_images(folder, [row["mask"] for row in rows], size) > 0).double()
+        mask = (read_frames(folder, [row["mask"] for row in rows], size) > 0).double()
     imager = experiment.prepare_run(source, image=config.image)
     deviation, mean = torch.std_mean(counts, (1, 2), keepdim=True)
     frames = ((counts - mean) / deviation.clamp_min(1e-6))[:, None].float()
     wide = frame_wide(samples, sample_um, pitch_um)
-    predicted = experiment.predict_frames(
+    predicted = experiment.predict_of_run(
         source, SensorFrames(frames, mask, blank, settings.inner.batch, blank, wide)
     )
     read = experiment.read_from([predicted], source)

@@ -142,15 +142,16 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     for run in content["runs"]:
         conditions = f"{settings['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {settings['seed']}"
         for name, key in QUANTITIES.items():
-            interval = run.get(f"{name}_interval", (math.nan, math.nan))
+            low, high = run.get(f"{name}_interval", (math.nan, math.nan))
             numbers[f"{key}/{run['name']}"] = MeasuredNumber(
-                run[name], *interval, conditions
+                run[name], low, high, conditions
             )
     conditions = "mid-range hyperbolic, paired subjects"
     for entry in content["ratios"]:
+        low, high = entry["interval"]
         if entry["against"] == "hyperbolic" and entry["quantity"] in QUANTITIES:
             numbers[f"{QUANTITIES[entry['quantity']]}/ratio"] = MeasuredNumber(
-                entry["ratio"], *entry["interval"], conditions
+                entry["ratio"], low, high, conditions
             )
     return numbers
 
@@ -196,10 +197,10 @@ def of_optics(path: Path) -> dict[str, MeasuredNumber]:
     lenses = content["lenses"]
     numbers = {
         f"scenes/{kind}/{name}": MeasuredNumber(
-            *ratio, "same states, images of equal light"
+            ratio, low, high, "same states, images of equal light"
         )
         for name, values in lenses.items()
-        for kind, ratio in values["scene_ratios"].items()
+        for kind, (ratio, low, high) in values["scene_ratios"].items()
     }
     if "hyperbolic" not in lenses:
         return numbers

@@ -4,7 +4,7 @@ from . import evolution as evolution
 from . import results as results
 from . import run as run
 from . import search as search
-from .assess import Predictions as Predictions
+from .assess import FramePredictions as FramePredictions
 from .assess import SensorFrames as SensorFrames
 from .assess import bootstrap_interval as bootstrap_interval
 from .assess import bootstrap_ratio as bootstrap_ratio

@@ -202,7 +202,7 @@ def displace_frames(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Predictions:
+class FramePredictions:
     """Predictions of a network for n frames.
 
     slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its centre.
@@ -227,7 +227,7 @@ class Predictions:
 @torch.no_grad()
 def predict_frames(
     net: Supernet, architecture: Architecture, seen: SensorFrames, inner: InnerConfig
-) -> Predictions:
+) -> FramePredictions:
     """Predictions of a network for frames, in evaluation mode, in mm.
 
     The batch statistics must be those of this architecture; see
@@ -247,7 +247,7 @@ def predict_frames(
     )
     scale = torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
-    return Predictions(
+    return FramePredictions(
         slip * scale,
         centre * seen.wide,
         losses.mask_iou(mask, seen.mask, pixels=pixels),

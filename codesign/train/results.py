@@ -12,7 +12,7 @@ from codesign.batches import CALIBRATION, TEST
 from codesign.gaze.bench import PeopleFrames
 from codesign.network import blur, losses, recalibrate_batch_norm
 from codesign.train import assess, evolution
-from codesign.train.assess import Predictions, SensorFrames
+from codesign.train.assess import FramePredictions, SensorFrames
 from codesign.train.evolution import EvaluatedCandidate
 from codesign.train.run import CodesignRun
 from codesign.train.search import people_of, specialise_candidate
@@ -33,7 +33,7 @@ class BudgetResult:
     row: dict[str, Any]
     trainer: Trainer
     seen: SensorFrames
-    answers: Predictions
+    answers: FramePredictions
     interval_mm: Tensor
 
 
@@ -133,7 +133,7 @@ def _evaluate_budget(
         trainer, architecture, people, frames.people
     )
 
-    def predict(seen: SensorFrames) -> Predictions:
+    def predict(seen: SensorFrames) -> FramePredictions:
         return assess.predict_frames(net, architecture, seen, inner)
 
     quantile = conformal_quantiles(predict(frames.apart), frames.apart)
@@ -171,7 +171,7 @@ def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
 
 
 def _errors(
-    prefix: str, predictions: Predictions, frames: SensorFrames
+    prefix: str, predictions: FramePredictions, frames: SensorFrames
 ) -> dict[str, float]:
     """Mean axial and lateral slippage error in mm, and mask IoU; keys begin with
     ``prefix``.
@@ -185,7 +185,7 @@ def _errors(
 
 
 def conformal_quantiles(
-    answers: Predictions, frames: SensorFrames, *, share: float = 0.9
+    answers: FramePredictions, frames: SensorFrames, *, share: float = 0.9
 ) -> float:
     """Split-conformal quantile of |axial error| / predicted standard deviation.
 
@@ -202,7 +202,7 @@ def conformal_quantiles(
 
 
 def uncertainty_summary(
-    answers: Predictions, frames: SensorFrames, half_width_mm: Tensor
+    answers: FramePredictions, frames: SensorFrames, half_width_mm: Tensor
 ) -> dict[str, float]:
     """Coverage and mean half width in mm of the 90 % intervals, and window depth error
     in mm.

@@ -37,7 +37,7 @@ def device(tmp_path_factory):
     imager = experiment.prepare_run(source)
     batch = as_batch(rendered, source.settings.scenes.margin)
     frames = assess.read_batch(trainer, batch, imager, seed=8)
-    predicted = experiment.predict_frames(source, frames)
+    predicted = experiment.predict_of_run(source, frames)
     (folder / "frames").mkdir()
     rows = []
     for k, frame in enumerate(frames.frames[:, 0].double().numpy()):
