@@ -20,6 +20,7 @@ from codesign.train import (
     BudgetResult,
     CodesignRun,
     RunConfig,
+    TrainedModel,
     assess,
     best_candidate,
     checkpoint,
@@ -30,7 +31,6 @@ from codesign.train import (
     search,
 )
 from codesign.train import run as runs
-from codesign.train.trainer import TrainedModel
 from metalens import lens
 from metalens.core import config, report, store, transaction
 from metalens.core.errors import ConfigError

@@ -15,8 +15,7 @@ from codesign.adapt import FinishedRun
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.gaze import angle_deg
 from codesign.settings import ExperimentConfig
-from codesign.train import SensorFrames
-from codesign.train.imaging import frame_wide
+from codesign.train import SensorFrames, frame_wide
 from metalens.core import reading
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError

@@ -11,6 +11,7 @@ from .assess import bootstrap_ratio as bootstrap_ratio
 from .evolution import EvaluatedCandidate as EvaluatedCandidate
 from .evolution import best_candidate as best_candidate
 from .evolution import pareto_front as pareto_front
+from .imaging import frame_wide as frame_wide
 from .imaging import read_out as read_out
 from .results import BudgetResult as BudgetResult
 from .results import finished_budgets as finished_budgets
@@ -19,6 +20,7 @@ from .run import RunConfig as RunConfig
 from .trainer import InnerConfig as InnerConfig
 from .trainer import LearningRateSchedule as LearningRateSchedule
 from .trainer import LogRecord as LogRecord
+from .trainer import TrainedModel as TrainedModel
 from .trainer import Trainer as Trainer
 from .trainer import device_of as device_of
 from .trainer import make_model as make_model
