@@ -47,24 +47,12 @@ class FramePool:
 
 def render_pool(scenes: EyeScenes, count: int) -> FramePool:
     """Pool of ``count`` frames of a stream of scenes, rendered CHUNK at a time."""
-    parts = []
-    for number, start in enumerate(range(0, count, CHUNK)):
-        parts.append(_render_part(scenes, number, min(CHUNK, count - start)))
-    nominal_um = scenes.rig.pupil_um.numpy()
-    light, depth, mask, place_um, seen_um, axis, points = (
-        np.concatenate(rows) for rows in zip(*parts, strict=True)
-    )
-    return FramePool(
-        light,
-        depth,
-        mask,
-        place_um,
-        seen_um,
-        axis,
-        points,
-        nominal_um,
-        np.array(scenes.depths_um),
-    )
+    parts = [
+        _render_part(scenes, number, min(CHUNK, count - start))
+        for number, start in enumerate(range(0, count, CHUNK))
+    ]
+    arrays = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    return FramePool(*arrays, scenes.rig.pupil_um.numpy(), np.array(scenes.depths_um))
 
 
 def _render_part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:

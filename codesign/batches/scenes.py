@@ -23,7 +23,6 @@ from codesign.eye import (
 )
 from codesign.eye import population as eye
 from metalens.core.errors import ConfigError
-from metalens.image import Frames
 
 # Streams of the random generator. Training, the search's selection, the calibration of
 # intervals and the test each have frames that no other one uses.
@@ -307,11 +306,8 @@ def as_batch(rendered: RenderedFrames, margin: int) -> FrameBatch:
         rendered: rendered frames. margin: samples around the frame.
     """
     inside = slice(margin, rendered.pupil.shape[-1] - margin)
-    frames = Frames(
-        rendered.frames.radiance, rendered.frames.coverage, rendered.frames.depth_um
-    )
     return FrameBatch(
-        frames,
+        rendered.frames,
         rendered.pupil[:, inside, inside],
         (rendered.labels.slip_um * 1e-3).float(),
         pose_of(rendered, margin),

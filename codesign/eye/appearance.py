@@ -13,7 +13,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from codesign.eye.population import CameraRig, EyeStates
-from codesign.eye.renderer import FrameLabels, PinholeCamera, RenderedFrames, render
+from codesign.eye.renderer import (
+    FrameLabels,
+    PinholeCamera,
+    RenderedFrames,
+    mask_centroid,
+    render,
+)
 from metalens.core.arrays import Array
 from metalens.image import Frames
 
@@ -358,13 +364,8 @@ def _updated_labels(labels: FrameLabels, before: Tensor, after: Tensor) -> Frame
 
     before, after: (n, y, x) masks. An empty mask has the centroid ``pupil_px``.
     """
-    area_before, area = (mask.sum((1, 2)).double() for mask in (before, after))
+    area_before, _ = mask_centroid(before, labels.pupil_px)
+    area, centroid = mask_centroid(after, labels.pupil_px)
     share = torch.where(area_before > 1e-6, area / area_before.clamp_min(1e-9), 1.0)
-    index = torch.arange(after.shape[-1], dtype=torch.float64)
-    sums = torch.stack([(after.sum(k).double() * index).sum(1) for k in (1, 2)], 1)
-    centroid = torch.where(
-        area[:, None] > 1e-6, sums / area.clamp_min(1e-9)[:, None], labels.pupil_px
-    )
-    return replace(
-        labels, visible=(labels.visible * share).clamp(max=1.0), centroid_px=centroid
-    )
+    visible = (labels.visible * share).clamp(max=1.0)
+    return replace(labels, visible=visible, centroid_px=centroid)

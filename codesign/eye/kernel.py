@@ -173,42 +173,6 @@ def _intersect_sphere(centre: Any, radius: Any, least: Any, d: Any) -> Any:
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _intersect_face(p: Any, d: Any) -> Any:
-    """Intersection of the ray s d with the face: smooth minimum of lid shell and plane.
-
-    The smooth minimum blends both distances over ``p.blend`` um.
-
-    Returns: distance in um; openness of the lids, 1 where the eye is visible; face
-    coordinates x and y in um; gap to the upper and to the lower lid margin in um, above
-    0 inside the opening; unit normal.
-    """
-    shell = _intersect_sphere(p.centre, p.lid_r, 1e6, d)[0]
-    facing = max(-_dot(d, p.face_z), f32(0.05))
-    plane = -_dot(p.plane, p.face_z) / facing
-    share = _clip01(f32(0.5) + f32(0.5) * (plane - shell) / p.blend)
-    distance = (
-        plane + (shell - plane) * share - f32(0.5) * p.blend * share * (f32(1) - share)
-    )
-    point = _add_scaled(_scaled(distance, d), f32(-1), p.centre)
-    normal = _add_scaled(_scaled(share / p.lid_r, point), f32(1) - share, p.face_z)
-    normal = _scaled(f32(1) / math.sqrt(_dot(normal, normal) + f32(1e-6)), normal)
-    gx, gy = _dot(point, p.face_x), _dot(point, p.face_y)
-    across = (gx - p.middle) / p.half
-    arch = f32(1) - across * across
-    upper = gy + arch * (p.upper + p.skew * across)
-    lower = arch * (p.lower - p.skew * across) - gy
-    edges = _smooth_step(upper / p.edge) * _smooth_step(lower / p.edge)
-    openness = edges * _smooth_step((upper + lower) / p.edge - f32(1))
-    return distance, openness, gx, gy, upper, lower, normal
-
-
-@_inlined  # type: ignore[untyped-decorator]
-def _ambient_irradiance(p: Any, n: Any) -> Any:
-    """Diffuse irradiance a (0.6 - 0.4 n·y): larger from above than from below."""
-    return p.ambient * (f32(0.6) - f32(0.4) * _dot(n, p.face_y))
-
-
-@_inlined  # type: ignore[untyped-decorator]
 def _lamp_irradiance(light: Any, at: Any, n: Any, wrap: Any) -> Any:
     """Irradiance of a surface of normal ``n`` at ``at`` by a point lamp at ``light``.
 
@@ -224,11 +188,15 @@ def _lamp_irradiance(light: Any, at: Any, n: Any, wrap: Any) -> Any:
 
 @_inlined  # type: ignore[untyped-decorator]
 def _total_irradiance(p: Any, at: Any, n: Any, wrap: Any) -> Any:
-    """Irradiance of a surface of normal ``n`` at ``at``: lamps and ambient light."""
+    """Irradiance of a surface of normal ``n`` at ``at``: lamps and ambient light.
+
+    The ambient light a (0.6 - 0.4 n·y) is stronger from above than from below.
+    """
     light = _lamp_irradiance(p.lamp_a, at, n, wrap)
     light += _lamp_irradiance(p.lamp_b, at, n, wrap)
     light += _lamp_irradiance(p.lamp_c, at, n, wrap)
-    return light / (f32(1) + wrap) + _ambient_irradiance(p, n)
+    ambient = p.ambient * (f32(0.6) - f32(0.4) * _dot(n, p.face_y))
+    return light / (f32(1) + wrap) + ambient
 
 
 @_inlined  # type: ignore[untyped-decorator]
@@ -288,26 +256,6 @@ def _refract_to_iris(p: Any, tc: Any, n: Any, d: Any) -> Any:
 
 
 @_inlined  # type: ignore[untyped-decorator]
-def _sclera_albedo(
-    p: Any, gx: Any, gy: Any, lower: Any, r: Any, cornea: Any, vein: Any
-) -> Any:
-    """Albedo of sclera, vessels, limbal ring, caruncle and tear film.
-
-    ``gx, gy``: face coordinates, um. ``lower``: gap to the lower margin, um. ``r``:
-    distance from the optic axis in the iris plane, um. ``cornea``: share of the cornea,
-    1 in front of the limbus. ``vein``: texture sample.
-    """
-    ring = f32(0.25) * cornea * _lorentzian((r - p.limbus_r) / f32(1300))
-    white = p.sclera * (f32(1) - p.veins * vein) * (f32(1) - ring)
-    x, y = gx - p.caruncle, gy - f32(500)
-    radius2 = (x * x + y * y) / f32(3.2e6)
-    red = f32(0.8) * p.skin * (f32(1) + f32(0.3) * vein)
-    white += (red - white) / (f32(1) + radius2 * radius2 * radius2)
-    tear = (lower - f32(120)) / f32(150)
-    return white + f32(0.12) * _lorentzian(tear * tear)
-
-
-@_inlined  # type: ignore[untyped-decorator]
 def _specular_lobe(light: Any, at: Any, n: Any, d: Any, sharp: Any) -> Any:
     """Reflection of a lamp by a glossy surface: 1 / (1 + sharp sin² / 2)², peak 1.
 
@@ -326,12 +274,34 @@ def _specular_lobe(light: Any, at: Any, n: Any, d: Any, sharp: Any) -> Any:
 def _shade_face(p: Any, x: Any) -> None:
     """Rays of the tile, and where they meet the face: distance, normal, lid gaps,
     openness.
+
+    The face is the smooth minimum of lid shell and face plane over ``p.blend`` um.
+    Openness is 1 where the eye is visible; a gap to a lid margin in um is above 0 inside
+    the opening.
     """
     for i in range(LANES):
         u, w = x[U + i], x[W + i]
         cosine = f32(1) / math.sqrt(u * u + w * w + f32(1))
         d = u * cosine, w * cosine, cosine
-        distance, openness, gx, gy, upper, lower, n = _intersect_face(p, d)
+        shell = _intersect_sphere(p.centre, p.lid_r, 1e6, d)[0]
+        facing = max(-_dot(d, p.face_z), f32(0.05))
+        plane = -_dot(p.plane, p.face_z) / facing
+        share = _clip01(f32(0.5) + f32(0.5) * (plane - shell) / p.blend)
+        distance = (
+            plane
+            + (shell - plane) * share
+            - f32(0.5) * p.blend * share * (f32(1) - share)
+        )
+        point = _add_scaled(_scaled(distance, d), f32(-1), p.centre)
+        n = _add_scaled(_scaled(share / p.lid_r, point), f32(1) - share, p.face_z)
+        n = _scaled(f32(1) / math.sqrt(_dot(n, n) + f32(1e-6)), n)
+        gx, gy = _dot(point, p.face_x), _dot(point, p.face_y)
+        across = (gx - p.middle) / p.half
+        arch = f32(1) - across * across
+        upper = gy + arch * (p.upper + p.skew * across)
+        lower = arch * (p.lower - p.skew * across) - gy
+        edges = _smooth_step(upper / p.edge) * _smooth_step(lower / p.edge)
+        openness = edges * _smooth_step((upper + lower) / p.edge - f32(1))
         _store(x, D + i, d)
         _store(x, N + i, n)
         x[S + i] = distance
@@ -428,7 +398,7 @@ def _shade_iris(p: Any, t: Any, x: Any, words: Any) -> None:
 
 @_inlined  # type: ignore[untyped-decorator]
 def _shade_sclera(p: Any, t: Any, x: Any, words: Any) -> None:
-    """Albedo of the white of the eye, with its vessel texture."""
+    """Albedo of sclera, vessels, limbal ring, caruncle and tear film."""
     for i in range(LANES):
         m = _load(x, M + i)
         u = _dot(m, p.iris_x) * f32(190) + p.offset_x
@@ -437,8 +407,16 @@ def _shade_sclera(p: Any, t: Any, x: Any, words: Any) -> None:
     _fetch_texels(t, words, 1)
     for i in range(LANES):
         vein = _interpolate_texel(x, words, 0, i)
-        gx, gy, lower = x[GX + i], x[GY + i], x[LOWER + i]
-        x[WHITE + i] = _sclera_albedo(p, gx, gy, lower, x[R + i], x[INSIDE + i], vein)
+        ring = (
+            f32(0.25) * x[INSIDE + i] * _lorentzian((x[R + i] - p.limbus_r) / f32(1300))
+        )
+        white = p.sclera * (f32(1) - p.veins * vein) * (f32(1) - ring)
+        dx, dy = x[GX + i] - p.caruncle, x[GY + i] - f32(500)
+        radius2 = (dx * dx + dy * dy) / f32(3.2e6)
+        red = f32(0.8) * p.skin * (f32(1) + f32(0.3) * vein)
+        white += (red - white) / (f32(1) + radius2 * radius2 * radius2)
+        tear = (x[LOWER + i] - f32(120)) / f32(150)
+        x[WHITE + i] = white + f32(0.12) * _lorentzian(tear * tear)
 
 
 @_inlined  # type: ignore[untyped-decorator]

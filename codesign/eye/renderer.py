@@ -186,13 +186,7 @@ def _labels(
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
-    rows, columns = mask.sum(2).double(), mask.sum(1).double()
-    visible_area = rows.sum(1)
-    index = torch.arange(camera.pixels, dtype=torch.float64)
-    sums = [
-        (line * index).sum(1) / visible_area.clamp_min(1e-9) for line in (columns, rows)
-    ]
-    centroid = torch.where(visible_area[:, None] > 1e-6, torch.stack(sums, 1), middle)
+    visible_area, centroid = mask_centroid(mask, middle)
     return FrameLabels(
         slip_um=scale * (nominal + states.slip_um) - nominal,
         shift_um=scale * (unslipped + states.slip_um) - nominal,
@@ -213,3 +207,16 @@ def _pupil_points(p: Mapping[str, Tensor], rim: int = 24) -> Tensor:
     circle = torch.stack([torch.cos(turn), torch.sin(turn)], 1)
     points = torch.cat([torch.zeros(1, 2, dtype=torch.float64), circle])
     return p["pupil_r"][:, None, None] * points
+
+
+def mask_centroid(mask: Tensor, default: Tensor) -> tuple[Tensor, Tensor]:
+    """(n,) area of masks in pixels, and (n, 2) their centroid x, y.
+
+    Args:
+        mask: (n, y, x) coverage. default: (n, 2) centroid of an empty mask.
+    """
+    area = mask.sum((1, 2)).double()
+    index = torch.arange(mask.shape[-1], dtype=torch.float64)
+    sums = torch.stack([(mask.sum(k).double() * index).sum(1) for k in (1, 2)], 1)
+    centroid = sums / area.clamp_min(1e-9)[:, None]
+    return area, torch.where(area[:, None] > 1e-6, centroid, default)

@@ -33,30 +33,13 @@ class EyeGeometry:
             )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class OpticalAxis:
-    """Result of the solver.
-
-    direction: (batch, 3) unit vector from the rotation centre through the pupil,
-    towards the camera side.
-    hit: (batch,) whether the ray meets the sphere; where it does not, ``direction``
-    points to the place on the
-        sphere that is nearest to the ray.
-    """
-
-    direction: Tensor
-    hit: Tensor
-
-
-def optical_axis(
-    pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry
-) -> OpticalAxis:
-    """Intersect the ray through the pupil's image with the sphere on which the pupil
-    moves.
+def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Tensor:
+    """(batch, 3) optical axis: the ray through the pupil's image meets the sphere on
+    which the pupil moves.
 
     The slippage moves the camera, so the eye is at C = centre - slip. With the unit ray
-    u the first intersection is at t = u·C - sqrt((u·C)² - |C|² + R²). Values and
-    gradients are finite where the ray misses.
+    u the first intersection is at t = u·C - sqrt((u·C)² - |C|² + R²). A ray that
+    misses gives the place on the sphere nearest to it, with a finite gradient.
 
     Args:
         pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the
@@ -78,7 +61,7 @@ def optical_axis(
         torch.sqrt(torch.where(hit, discriminant, torch.ones_like(discriminant))) * hit
     )
     offset = -perpendicular - depth[..., None] * ray
-    return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True), hit)
+    return offset / offset.norm(dim=-1, keepdim=True)
 
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ class PersonalGaze:
         ray = optical_axis(
             torch.from_numpy(pupil_mm), torch.from_numpy(-slip_mm), geometry
         )
-        angles = face_angles(ray.direction.numpy(), self.rig) + self.own[4:6]
+        angles = face_angles(ray.numpy(), self.rig) + self.own[4:6]
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 

@@ -125,9 +125,8 @@ def _true_imager(
 ) -> Imager:
     """True image of the lens of these coefficients and error, without gradient."""
     coefficients = torch.tensor(coefficients_rad, dtype=torch.float64)
-    wave = lens_wave(settings, coefficients, error)
     frame, margin, device = grid
-    plane = _with_surroundings(settings, wave)
+    plane = optics_of(settings, coefficients, error)
     return imager_through(settings, plane, frame, margin=margin, device=device)
 
 
@@ -236,7 +235,11 @@ def make_differentiable_imager(
     )
 
 
-def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
+def optics_of(
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    error: DrawnLensErrors | None = None,
+) -> Optics:
     """Lens plane with its films and sensor distance; without coefficients the plain
     focus.
 
@@ -246,10 +249,7 @@ def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
     """
     plain = replace(settings, polynomials=0, parameters="polynomials")
     moving = settings if coefficients_rad.numel() else plain
-    return _with_surroundings(settings, lens_wave(moving, coefficients_rad))
-
-
-def _with_surroundings(settings: OpticsConfig, wave: SmoothWave | PillarWave) -> Optics:
+    wave = lens_wave(moving, coefficients_rad, error)
     return Optics(wave, settings.layers or Layers(), settings.sensor_distance_mm * 1e3)
 
 

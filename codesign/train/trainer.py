@@ -16,7 +16,6 @@ from pytorch_optimizer import SOAP
 from torch import Tensor, nn
 
 from codesign.batches import (
-    EyePose,
     EyeScenes,
     FrameBatch,
     SceneSource,
@@ -415,8 +414,13 @@ class Trainer:
         threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        workers = renderer_threads(self.light.device)
-        for batch in compute_ahead(self._batch, range(self.step, end), workers=workers):
+        # with a GPU frames are rendered ahead; on a processor training uses its cores
+        workers = 0 if self.light.device.type == "cpu" else max(1, usable_cores() // 4)
+
+        def batch_of(step: int) -> FrameBatch:
+            return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
+
+        for batch in compute_ahead(batch_of, range(self.step, end), workers=workers):
             yield self._advance(batch)
 
     def state(self) -> dict[str, object]:
@@ -499,10 +503,6 @@ class Trainer:
         return LogRecord(
             self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
         )
-
-    def _batch(self, step: int) -> FrameBatch:
-        """The frames of a step, by its number alone."""
-        return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
 
     def _prepare_step(
         self, step: int, batch: FrameBatch, *, live: bool, read_frames: bool
@@ -596,20 +596,16 @@ class Trainer:
                 depth_weight=self.inner.depth_weight,
             )
             if pose is not None:
-                loss = loss + self._pose_loss(prediction, pose, frame_width)
+                loss = loss + losses.pose_loss(
+                    prediction,
+                    pose.axis,
+                    pose.points / frame_width,
+                    axis_weight=self.inner.axis_weight,
+                    point_weight=self.inner.point_weight,
+                )
             member_losses.append(loss)
         macs = torch.stack([macs_at(a, pitch) for a in members])
         return torch.stack(member_losses).mean(), macs
-
-    def _pose_loss(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
-        """Weighted loss of landmarks and optic axis; landmarks as fractions of the
-        frame.
-        """
-        weights = {
-            "axis_weight": self.inner.axis_weight,
-            "point_weight": self.inner.point_weight,
-        }
-        return losses.pose_loss(answer, pose.axis, pose.points / wide, **weights)
 
     def _form_images(
         self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
@@ -740,19 +736,6 @@ def compute_ahead(
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
-
-
-def renderer_threads(device: torch.device) -> int:
-    """Number of renderer threads of a process that trains on ``device``.
-
-    With a GPU half of the processor's cores, eight at most, shared by the processes of
-    ``torchrun`` on this machine. On a processor 0, since training itself uses its
-    cores.
-    """
-    if device.type == "cpu":
-        return 0
-    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return max(1, min(8, usable_cores() // (2 * processes)))
 
 
 def device_of(place: Place) -> torch.device:
