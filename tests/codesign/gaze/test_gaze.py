@@ -53,9 +53,7 @@ def test_a_ray_that_misses_gives_the_nearest_place_and_a_finite_gradient():
     assert float((found[0] @ ray).detach()) == pytest.approx(0, abs=1e-9)
     found.sum().backward()
     assert torch.isfinite(pupil.grad).all()
-    assert torch.allclose(
-        found.norm(dim=-1), torch.ones(2, dtype=torch.float64)
-    )
+    assert torch.allclose(found.norm(dim=-1), torch.ones(2, dtype=torch.float64))
 
 
 def test_gradients_agree_with_finite_differences():
