@@ -28,7 +28,6 @@ from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.settings import LARGEST, LEAST, check_ranges
 from codesign.train import bootstrap_interval, read_out
-from metalens.core import threads
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table
 from metalens.image import Imager, Sensor
@@ -225,7 +224,6 @@ def train_reader(
         scenes: scenes to train, calibrate and test on.
         config: frames, sensor and light of the reader.
     """
-    threads.keep_memory()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         reader = ReferenceReader()

@@ -264,9 +264,7 @@ def _normal(
     Mean clipped to the full well, variance mean + read noise² * reads, as
     :func:`metalens.image.expose`.
     """
-    well = sensor.full_well_e * float(
-        camera.kappa(sensor.pitch_um, sensor.base_pitch_um)
-    )
+    well = sensor.well_e
     collected = mean.clamp(max=well)
     # noise of the whole batch, of which every process takes its own frames
     size = len(mean)

@@ -45,7 +45,6 @@ from codesign.train.separability import (
     fisher_separability,
     triplet_frames,
 )
-from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.core.executor import usable_cores
 from metalens.image import Frames, Imager, Sensor, encircled_energy
@@ -411,7 +410,6 @@ class Trainer:
         Raises:
             TrainingError: no finite gradient for ``patience`` steps, with the cause.
         """
-        threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
         # with a GPU frames are rendered ahead; on a processor training uses its cores

@@ -1,11 +1,8 @@
 """Threads for compiled loops that release the interpreter lock: torch's number where it
 runs; safe after a fork.
-
-And memory that a process keeps between the steps of a long run.
 """
 
 import contextlib
-import ctypes
 import functools
 import importlib
 import itertools
@@ -154,26 +151,6 @@ def one_blas_thread() -> contextlib.AbstractContextManager[object]:
     """
     limit: contextlib.AbstractContextManager[object] = _blas().limit(limits=1)
     return limit
-
-
-@functools.lru_cache(maxsize=1)
-def keep_memory() -> bool:
-    """Let the process keep freed memory for later arrays; False where the C library is
-    not glibc.
-
-    For runs whose steps all allocate arrays of the same sizes. By default glibc returns
-    blocks of over 32 MB, and the end of its heap, to the system after every step. It
-    then gets them as new pages, which the system clears one by one.
-    """
-    mallopt = (
-        getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    )
-    # options of malloc.h; to set only one of them is slower than none
-    mmap_threshold = -3
-    trim_threshold = -1
-    return mallopt is not None and bool(
-        mallopt(mmap_threshold, 1 << 30) and mallopt(trim_threshold, (1 << 31) - 1)
-    )
 
 
 @functools.lru_cache(maxsize=1)

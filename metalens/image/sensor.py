@@ -45,6 +45,11 @@ class Sensor:
         if self.bits not in range(1, 17):
             raise SceneError(f"bits = {self.bits}: need 1 to 16")
 
+    @property
+    def well_e(self) -> float:
+        """Full well of a pixel of the effective pitch, electrons."""
+        return self.full_well_e * (self.pitch_um / self.base_pitch_um) ** 2
+
 
 def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
     """Light of a pixel relative to a base pixel: (pitch / base pitch)², the paper's
@@ -130,8 +135,7 @@ def expose(
         sensor: pixels, gain and noise of the sensor.
         generator: of the random draws; the global one without it.
     """
-    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
-    collected = photons(mean, generator).clamp(max=well)
+    collected = photons(mean, generator).clamp(max=sensor.well_e)
     noise = normal(tuple(mean.shape), mean, generator)
     return (
         collected
@@ -168,8 +172,7 @@ def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
         sensor: pixels, gain and noise of the sensor.
     """
     top = 2**sensor.bits - 1
-    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
-    level = (electrons * (top / well)).clamp(0, top)
+    level = (electrons * (top / sensor.well_e)).clamp(0, top)
     rounded: Tensor = level + (level.round() - level).detach()
     return rounded
 
@@ -183,9 +186,8 @@ def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
         mean: expected electrons.
         sensor: pixels, gain and noise of the sensor.
     """
-    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     total: Tensor = (
-        mean + sensor.read_noise_e**2 + (well / (2**sensor.bits - 1)) ** 2 / 12
+        mean + sensor.read_noise_e**2 + (sensor.well_e / (2**sensor.bits - 1)) ** 2 / 12
     )
     return total
 

@@ -166,7 +166,7 @@ class PillarWave:
         cell_width = self._block * pitch
         if cells.requires_grad:  # values of the cells, gradients of their means
             node_width = float(x_um.max() - x_um.min()) / (x_um.shape[-1] - 1)
-            smooth = _over(cells, node_width / cell_width)
+            smooth = _averaged(cells, node_width / cell_width)
             cells = smooth + (cells - smooth).detach()
         half = [n * self._block * pitch / 2 for n in cells.shape[-2:]]
         # where an odd number of rows or columns is added, the cells' centre lies half a
@@ -334,29 +334,22 @@ def interpolate_cells(
     return torch.complex(*factor.reshape(2, *at_um[0].shape).unbind(0))
 
 
-def _over(cells: Tensor, width: float) -> Tensor:
-    """(2, y, x) cells through a Lanczos low-pass of cutoff 1 / (2 ``width``) per cell.
-
-    Only cells that contain pillars count.
+def _averaged(cells: Tensor, width: float) -> Tensor:
+    """(2, y, x) cells averaged over the width of a node, those that contain pillars.
 
     Args:
         cells: (2, y, x) real and imaginary means.
-        width: of a node, in cells; 1 or less leaves the cells as they are.
+        width: of a node, in cells; less than 2 leaves the cells as they are.
     """
-    if width <= 1:
+    reach = round((width - 1) / 2)
+    if reach < 1:
         return cells
-    lobes = 2.0  # in widths of a node
-    reach = math.ceil(lobes * width) - 1
-    offset = (
-        torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64)
-        / width
-    )
-    row = (torch.sinc(offset) * torch.sinc(offset / lobes) / width).to(cells)
     filled = (cells.detach() != 0).any(0, keepdim=True).to(cells)
-    both = torch.cat([cells, filled])[:, None]
-    for shape, pad in (((1, 1, -1, 1), (reach, 0)), ((1, 1, 1, -1), (0, reach))):
-        both = torch.nn.functional.conv2d(both, row.reshape(shape), padding=pad)
-    mean: Tensor = both[:2, 0] / both[2, 0].clamp_min(0.2)
+    size, edge = 2 * reach + 1, reach
+    both = torch.nn.functional.avg_pool2d(
+        torch.cat([cells, filled])[None], size, stride=1, padding=edge
+    )[0]
+    mean: Tensor = both[:2] / both[2].clamp_min(0.2)
     return mean
 
 

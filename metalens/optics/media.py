@@ -198,20 +198,13 @@ def _with_normals(layers: Pairs, w: Any) -> list[tuple[float, Any, Any]]:
     return [(n, t, (n * n - w) ** 0.5) for n, t in layers]
 
 
-def _sum(parts: Sequence[Any]) -> Any:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
-
-
 def reach_per_direction(layers: Pairs, w: Any) -> Any:
     """reach / p = Σ t / √(n² - w), w = p².
 
     Args:
         layers: (index, thickness) of each medium.
     """
-    return _sum([t / normal for _, t, normal in _with_normals(layers, w)])
+    return sum([t / normal for _, t, normal in _with_normals(layers, w)])
 
 
 def area_spreading_of_square(layers: Pairs, w: Any) -> Any:
@@ -222,7 +215,7 @@ def area_spreading_of_square(layers: Pairs, w: Any) -> Any:
     Args:
         layers: (index, thickness) of each medium.
     """
-    reach_slope = _sum(
+    reach_slope = sum(
         [
             t * n * n / (normal * normal * normal)
             for n, t, normal in _with_normals(layers, w)
@@ -237,7 +230,7 @@ def whole_path(layers: Pairs, w: Any) -> Any:
     Args:
         layers: (index, thickness) of each medium.
     """
-    return _sum([n * n * t / normal for n, t, normal in _with_normals(layers, w)])
+    return sum([n * n * t / normal for n, t, normal in _with_normals(layers, w)])
 
 
 def solve_direction_square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
@@ -263,8 +256,8 @@ def solve_direction_square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any
     for _ in range(NEWTON):
         w = low2 * tan2 / (1 + tan2)
         inverse_normals = [(t, 1 / (n * n - w) ** 0.5) for n, t in layers]
-        reach_per_p = _sum([t * v for t, v in inverse_normals])
-        slope = _sum([t * (v * v * v) for t, v in inverse_normals])
+        reach_per_p = sum([t * v for t, v in inverse_normals])
+        slope = sum([t * (v * v * v) for t, v in inverse_normals])
         rate = (
             (reach_per_p * reach_per_p + (w - along2) * reach_per_p * slope)
             * low2
@@ -306,13 +299,11 @@ def path_difference(
     """
     w = solve_direction_square(layers, reach2 + scale * more)
     pairs = [(n, t, (n * n - w) ** 0.5, (n * n - w0) ** 0.5) for n, t in layers]
-    g = _sum([t / s for _, t, s, _ in pairs])
-    g0 = _sum([t / s0 for _, t, _, s0 in pairs])
-    slope = _sum([t / (s * s0 * (s + s0)) for _, t, s, s0 in pairs])
+    g = sum([t / s for _, t, s, _ in pairs])
+    g0 = sum([t / s0 for _, t, _, s0 in pairs])
+    slope = sum([t / (s * s0 * (s + s0)) for _, t, s, s0 in pairs])
     w_change = more / (g * g + w0 * (g + g0) * slope)
-    return w, w_change * _sum(
-        [t * n * n / (s * s0 * (s + s0)) for n, t, s, s0 in pairs]
-    )
+    return w, w_change * sum([t * n * n / (s * s0 * (s + s0)) for n, t, s, s0 in pairs])
 
 
 # nodes along u and along v; each ray takes the number that differs least from fewer

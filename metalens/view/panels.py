@@ -2,7 +2,6 @@
 numbers. Data, no drawing.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -10,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from metalens.core.arrays import Array
-from metalens.core.errors import StoreError
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +63,6 @@ class ImagePanel:
     across: str = "µm"
     from_least: bool = False
 
-    def __post_init__(self) -> None:
-        counts = tuple(len(axis.values) for axis in self.axes)
-        if self.values.shape[:-2] != counts:
-            raise StoreError(
-                f"{self.title}: sliders {counts} do not fit images of shape {self.values.shape}"
-            )
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CurvePanel:
@@ -113,12 +104,6 @@ class ClassMapPanel:
     caption: str = ""
     columns: Mapping[str, Sequence[Any] | Array] = field(default_factory=dict)
     marks: Sequence[tuple[float, float, str]] = ()
-
-    def __post_init__(self) -> None:
-        if self.index.size and int(self.index.max()) > len(self.sizes):
-            raise StoreError(
-                f"{self.title}: class {int(self.index.max())} of {len(self.sizes)}"
-            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -183,13 +168,6 @@ class PointPanel:
     front_name: str = "Pareto set"
     notes: Sequence[Mapping[str, Any]] = ()
     caption: str = ""
-
-    def __post_init__(self) -> None:
-        counts = {len(self.x), len(self.y), len(self.groups), len(self.notes or self.x)}
-        if len(counts) > 1 or not all(map(math.isfinite, [*self.x, *self.y])):
-            raise StoreError(
-                f"{self.title}: need as many finite x, finite y, groups and notes, found {sorted(counts)}"
-            )
 
 
 Panel = ImagePanel | CurvePanel | ClassMapPanel | DrawingPanel | TablePanel | PointPanel

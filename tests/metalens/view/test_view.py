@@ -17,16 +17,13 @@ import pytest
 from metalens import lens, psf
 from metalens.cell import Cell, Index
 from metalens.commands import view
-from metalens.core.errors import OutputError, StoreError
+from metalens.core.errors import OutputError
 from metalens.design import Focus, make
 from metalens.proxy import Proxy
 from metalens.view import (
     ClassMapPanel,
     CurvePanel,
-    ImagePanel,
     Panel,
-    PointPanel,
-    SliderAxis,
     TablePanel,
     artefacts,
     page,
@@ -118,22 +115,6 @@ def test_nothing_in_a_page_leads_out_of_it(folder):
     assert not outside
     assert _content(text)["title"] == "a & b </script><script>alert(1)</script>"
     assert "<script>alert" not in text
-
-
-def test_figures_that_do_not_fit_are_refused():
-    with pytest.raises(StoreError, match=r"sliders \(3,\) do not fit"):
-        ImagePanel("psf", np.zeros((2, 4, 4)), [SliderAxis("depth", [1, 2, 3])], 1.0)
-    with pytest.raises(StoreError, match="class 5 of 2"):
-        ClassMapPanel("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
-
-
-def test_points_need_a_place_and_a_name_each():
-    with pytest.raises(StoreError, match="as many finite x"):
-        PointPanel("networks", [1.0, 2.0], [0.5], "cost", "error", ["a", "b"])
-    with pytest.raises(StoreError, match="as many finite x"):
-        PointPanel(
-            "networks", [1.0, float("nan")], [0.5, 0.7], "cost", "error", ["a", "b"]
-        )
 
 
 def test_a_psf_tells_what_its_error_is_made_of(folder):
