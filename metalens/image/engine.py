@@ -340,15 +340,18 @@ def _shadow_error(
     share = contained.clip(1e-6, 1)
     unit = psfs / contained.clip(1e-6)[..., None, None]
     rads = blur_um(unit, step_um, share) / reduced
-    errors = []
-    for i, (x, y) in enumerate((at / reduced).tolist()):
-        for k, depth in enumerate(depths_um.tolist()):
-            rad = float(rads[i, k]) / math.hypot(1, x, y)
-            error = optics.layers.shadow_error(
-                (x, y), depth, wavelength_um, rad, float(share[i, k])
-            )
-            errors.append(error * contained[i, k] / brightest[k])
-    return float(max(errors))
+    worst = 0.0
+    for (i, k), light in np.ndenumerate(contained / brightest):
+        x, y = (at[i] / reduced).tolist()
+        error = optics.layers.shadow_error(
+            (x, y),
+            float(depths_um[k]),
+            wavelength_um,
+            float(rads[i, k]) / math.hypot(1, x, y),
+            float(share[i, k]),
+        )
+        worst = max(worst, error * float(light))
+    return worst
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
@@ -364,6 +367,6 @@ def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
     out = []
     for depth in depths_um.tolist():
         depth_map = torch.full((high, wide), depth).to(optics.stack)
-        weights = optics.light.interpolate(depth_map, index)
+        weights = optics.light.interpolate(depth_map)[:, index]
         out.append(torch.einsum("rn,rhw->nhw", weights, optics.light.kernels))
     return torch.stack(out, 1)

@@ -184,48 +184,31 @@ class LowRankPsfs:
     def weigh(self, content: Tensor, depth_um: Tensor) -> Tensor:
         """(rank, *batch, y, x) sources times their weights w_r(x, z).
 
-        Dark samples are skipped where no gradient is needed.
-
         Args:
             content: (*batch, y, x) light or coverage of the sources.
             depth_um: of the same shape, or one that broadcasts. Depths beyond the nodes
                 have the weights of the outermost.
         """
-        if self.uniform:
-            rows = self.interpolate(depth_um).reshape(-1, *depth_um.shape)
-            return rows * content
-        fixed = not (content.requires_grad and torch.is_grad_enabled())
-        where = torch.nonzero(content.flatten())[:, 0] if fixed else None
-        if where is None or 10 * len(where) > 9 * content.numel():
-            rows = self.interpolate(depth_um) * content.flatten()
-            return rows.reshape(-1, *content.shape)
-        rows = self.interpolate(depth_um, where) * content.flatten()[where]
-        out = rows.new_zeros(len(rows), content.numel())
-        out[:, where] = rows
-        return out.reshape(-1, *content.shape)
+        return self.interpolate(depth_um).reshape(-1, *depth_um.shape) * content
 
-    def interpolate(self, depth_um: Tensor, where: Tensor | None = None) -> Tensor:
+    def interpolate(self, depth_um: Tensor) -> Tensor:
         """(rank, samples) weights w_r(x, z) by cubic B-splines in 1/z.
 
         A uniform table is read at the nearest of its equal steps of 1/z instead.
 
         Args:
             depth_um: (*batch, y, x) depths of the sources.
-            where: (samples,) flat numbers into it; None for all.
         """
-        number = torch.arange(depth_um.numel(), device=depth_um.device)
-        depth = depth_um.flatten()
-        if where is not None:
-            number, depth = number[where], depth[where]
-        unit = depth_position(depth, self.vergence)
+        unit = depth_position(depth_um.flatten(), self.vergence)
         if self.uniform:
             code = (unit * (len(self.table) - 1) + 0.5).long()
             return self.table.mT.index_select(1, code)
         high, wide, coefficients, rank = self.table.shape
         nodes = 1 if self.vergence[0] == self.vergence[1] else coefficients - 2
         first, taps = spline_taps(unit, nodes)
-        index = (number % (high * wide)) * coefficients + first
-        indices = index[:, None] + torch.arange(TAPS, device=depth.device)
+        number = torch.arange(len(unit), device=unit.device) % (high * wide)
+        index = number * coefficients + first
+        indices = index[:, None] + torch.arange(TAPS, device=unit.device)
         table = self.table.reshape(-1, rank).to(taps)
         weights = embedding_bag(indices, table, per_sample_weights=taps, mode="sum")
         return weights.mT.contiguous()
@@ -246,8 +229,8 @@ class LowRankPsfs:
         """(frames, *sheets, y, x) blurred content, few frames at a time."""
         if content.device.type != "cpu":
             return self.convolve(self.weigh(content, depth_um))
-        # as many frames as fit in 2 MB of weighted sources, a core's cache
-        count = max(1, 2**19 // (len(self.kernels) * content[0].numel()))
+        # as many frames as fit in 8 MB of weighted sources: memory stays bounded
+        count = max(1, 2**21 // (len(self.kernels) * content[0].numel()))
         parts = zip(
             torch.split(content, count), torch.split(depth_um, count), strict=True
         )

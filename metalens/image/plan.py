@@ -30,18 +30,7 @@ MOST = 57  # nodes along an axis of the field or of 1/z
 # Largest errors of interpolation, and of aliased light, whatever the tolerance:
 # uniformly illuminated planes then vary by half a percent between the nodes.
 NODES_MOST, FOLDED_MOST = 0.005, 0.001
-# Places (x, y) in half fields, out to the rims, where a blur is widest and most light
-# is aliased.
-PLACES = (
-    (-0.95, -0.3),
-    (-0.7, 0.6),
-    (-0.45, -0.85),
-    (-0.2, 0.1),
-    (0.2, -0.55),
-    (0.45, 0.95),
-    (0.7, 0.35),
-    (0.95, -0.75),
-)
+JUDGED = 8  # places of the field at which windows are judged
 # of the tolerance: kernels, whose number is what an image costs, and each of six other
 # causes; in quadrature all of it
 KERNELS, OTHERS = 0.75, 0.27
@@ -168,7 +157,7 @@ def plan_nodes(
         optics,
         coarse,
         Window(grid.window, grid.step_um),
-        (_places(PLACES, middle_um, half), three_depths),
+        (_places(spread_places(JUDGED), middle_um, half), three_depths),
         min(share, FOLDED_MOST),
     )
 
@@ -189,10 +178,11 @@ def plan_nodes(
     depths = 1
     if grid.depths_um[0] != grid.depths_um[1]:
         depths = _node_count(along_depth, node_tolerance, "range of depths")
-    off_axis = _places(PLACES[1::4], middle_um, half), three_depths
+    two_places = spread_places(JUDGED)[1::4]
+    off_axis = _places(two_places, middle_um, half), three_depths
     if transform_error(JudgedPsfs(optics, coarse, window, off_axis)) > share:
         window = replace(window, curved=True)
-    with_middle = _places((*PLACES[1::4], (0.0, 0.0)), middle_um, half), three_depths
+    with_middle = _places([*two_places, (0.0, 0.0)], middle_um, half), three_depths
     judged = JudgedPsfs(optics, coarse, window, with_middle)
     window = choose_polarisation(judged, polarisation, within=(tolerance, share))
     y, x = (
@@ -202,6 +192,19 @@ def plan_nodes(
         for centre, length in zip(middle_um[::-1], half, strict=True)
     )
     return ImagingPlan(y, x, depth_nodes(grid, depths), waves, window)
+
+
+def spread_places(count: int) -> list[tuple[float, float]]:
+    """(x, y) places in half fields, out to 0.95 of it: equal steps of x, and y in steps
+    of the golden section.
+
+    Near the rims a blur is widest and most light is aliased.
+    """
+    golden = (math.sqrt(5) - 1) / 2
+    return [
+        (0.95 * (2 * k / (count - 1) - 1), 0.95 * (2 * (golden * (k + 1) % 1) - 1))
+        for k in range(count)
+    ]
 
 
 def depth_nodes(grid: Grid, count: int) -> Tensor:

@@ -28,18 +28,14 @@ class Media:
     the order that the light takes.
 
     Raises:
-        PropagationError: no medium, an index below 1 or not finite, a thickness below
-            0, no thickness at all.
+        PropagationError: an index below 1 or not finite, a thickness below 0, no
+            thickness at all.
     """
 
     index: tuple[float, ...]
     thickness_um: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if len(self.index) != len(self.thickness_um) or not self.index:
-            raise PropagationError(
-                f"{len(self.index)} indices for {len(self.thickness_um)} thicknesses of media"
-            )
         if not all(math.isfinite(n) and n >= 1 for n in self.index):
             raise PropagationError(
                 f"refractive indices {self.index}: need finite values of 1 or more"

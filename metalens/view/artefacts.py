@@ -82,8 +82,7 @@ def library_panels(path: Path) -> list[Panel]:
 
 
 def axes_panels(path: Path) -> list[Panel]:
-    """Images of phase, |t| and error bar over both sizes, and a table of held-out
-    pairs.
+    """Images of phase, |t| and error bar over both sizes.
 
     Excluded pairs of sizes have phase and |t| 0.
 
@@ -106,7 +105,6 @@ def axes_panels(path: Path) -> list[Panel]:
         f"{1 - library.usable.mean():.1%} is left out (error bars above {library.sweep.bar:g})."
     )
     turns = np.where(usable, np.angle(t) / (2 * math.pi) % 1, 0.0)
-    held_out = [tuple(row) for row in (library.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]
     return [
         ImagePanel("Phase", turns, names, step, "turns", words),
         ImagePanel(
@@ -119,17 +117,6 @@ def axes_panels(path: Path) -> list[Panel]:
             step,
             "|t - exact| at most",
             words,
-        ),
-        TablePanel(
-            "Pairs held out",
-            (
-                "wavelength",
-                "x / nm",
-                "y / nm",
-                "error of the interpolation",
-                "error bar",
-            ),
-            held_out,
         ),
     ]
 

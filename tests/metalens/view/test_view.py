@@ -20,14 +20,7 @@ from metalens.commands import view
 from metalens.core.errors import OutputError
 from metalens.design import Focus, make
 from metalens.proxy import Proxy
-from metalens.view import (
-    ClassMapPanel,
-    CurvePanel,
-    Panel,
-    TablePanel,
-    artefacts,
-    page,
-)
+from metalens.view import ClassMapPanel, CurvePanel, Panel, TablePanel, artefacts, page
 from tests.metalens.view.browser_page import BROWSER, told
 
 
