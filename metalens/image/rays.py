@@ -258,7 +258,8 @@ def source_paths(
         reach2 = (x - sx) ** 2 + (y - sy) ** 2
         reach2 = reach2.clamp(max=float((reach2 * (bundle.whole > 0)).max()))
         path = interpolant.chebyshev_interpolant(
-            lambda u, before=before: media.path_of_reach(before, u**0.5), reach2
+            lambda u: media.path_of_reach(before, u**0.5),  # noqa: B023 (called at once)
+            reach2,
         )
         out.append(path - chief)
     return torch.stack(out)

@@ -50,7 +50,8 @@ def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
     psf, reference = psf.double(), reference.double()
     spectra = (scene_spectrum(some) for some in (psf - reference, reference))
     error, level = (spectrum.norm(dim=-1) for spectrum in spectra)
-    return error / level
+    relative: Tensor = error / level
+    return relative
 
 
 def scene_error(psf: Tensor, reference: Tensor) -> float:
