@@ -10,7 +10,7 @@ from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
 from metalens.modal.case import ModalCase
 from metalens.modal.layer import few_modes, is_lossless, layer_modes, layer_pencil
-from metalens.modal.match import HalfSpace, half_space, scattering_matrix, zero_order
+from metalens.modal.match import half_space, scattering_matrix, zero_order
 from metalens.modal.mesh import MeshPlan, assemble_disc
 from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
 
@@ -85,34 +85,6 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return arithmetic
 
 
-def scatter_layer(
-    case: ModalCase,
-    b: HomogeneousBasis,
-    foot: HalfSpace,
-    top: HalfSpace,
-    *,
-    magnetic: bool,
-    loss: float,
-) -> tuple[np.ndarray, bool]:
-    """Scattering matrix of the layer over the ports of both half-spaces, and whether it
-    belongs to the dual unknown.
-
-    Few modes suffice where the layer is lossless and so thick that few carry light;
-    otherwise all are used.
-
-    Args:
-        case: the problem. b: homogeneous modes. foot, top: half-spaces.
-        magnetic: the form. loss: as in :func:`solve_on_mesh`.
-    """
-    layer = None
-    if foot.lossless and top.lossless and is_lossless(case):
-        pencil = layer_pencil(b, case, magnetic=magnetic)
-        layer = few_modes(pencil, case.height, weak=loss)
-    if layer is None:
-        layer = layer_modes(b, case, magnetic=magnetic)
-    return scattering_matrix(layer, case.height, foot, top), layer.dual
-
-
 def solve_form(
     case: ModalCase, plan: MeshPlan, *, magnetic: bool, loss: float
 ) -> tuple[np.ndarray, float, int]:
@@ -131,13 +103,17 @@ def solve_form(
         half_space(basis, case.k0, *side, magnetic=magnetic, bloch=case.bloch)
         for side in ((case.below, case.under), (case.above, case.over))
     )
-    all_ports, dual = scatter_layer(
-        case, basis, foot, top, magnetic=magnetic, loss=loss
-    )
+    layer = None
+    if foot.lossless and top.lossless and is_lossless(case):
+        pencil = layer_pencil(basis, case, magnetic=magnetic)
+        layer = few_modes(pencil, case.height, weak=loss)
+    if layer is None:  # it absorbs, or most modes carry light
+        layer = layer_modes(basis, case, magnetic=magnetic)
+    all_ports = scattering_matrix(layer, case.height, foot, top)
     first, second = (zero_order(basis, half, case.bloch, te=te) for half in (foot, top))
     zero_ports = [first, len(foot.ports) + second]
     matrix = all_ports[zero_ports][:, zero_ports]
-    if magnetic and not dual:
+    if magnetic and not layer.dual:
         matrix = matrix * [[-1.0, 1.0], [1.0, -1.0]]
     return matrix, float((np.abs(all_ports[:, first]) ** 2).sum()), basis.size
 

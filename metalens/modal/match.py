@@ -58,10 +58,10 @@ def half_space(
     basis: HomogeneousBasis,
     k0: float,
     permittivity: float,
-    films: Films = (),
+    films: Films,
     *,
     magnetic: bool,
-    bloch: float | None = None,
+    bloch: float,
 ) -> HalfSpace:
     """Admittances p / u: electric form i kz (TE), i k0^2 eps / kz (TM); magnetic form
     i kz / eps, i k0^2 / kz.
@@ -71,15 +71,13 @@ def half_space(
             half-space.
         films: those on it, nearest first.
         magnetic: the form.
-        bloch: if given, orders near their cut-off get the wavenumbers of the lattice
-            with this kx, see :func:`near_cutoff`.
+        bloch: kx; orders near their cut-off get the wavenumbers of the lattice, see :func:`near_cutoff`.
 
     A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance
     stays finite.
     """
     squares = np.concatenate([basis.te_exact, basis.tm_exact])
-    if bloch is not None:
-        squares = near_cutoff(squares, k0**2 * permittivity, bloch)
+    squares = near_cutoff(squares, k0**2 * permittivity, bloch)
     is_te = np.arange(len(squares)) < len(basis.te)
 
     def wave(eps: complex) -> tuple[np.ndarray, np.ndarray]:
@@ -126,21 +124,15 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     )
     if not len(close):
         return square
-    exact = lattice_wavenumbers(cutoff, bloch)
+    # the orders of the lattice at least up to twice the cutoff
+    reach = math.ceil((math.sqrt(2 * cutoff) + bloch) / math.pi) + 1
+    along = bloch + np.pi * np.arange(-reach, reach + 1)
+    exact = (along[:, None] ** 2 + (np.pi * np.arange(reach + 1)) ** 2).ravel()
     nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
     reliable = np.abs(nearest - square[close]) < KNOWN * nearest
     corrected = square.copy()
     corrected[close[reliable]] = nearest[reliable]
     return corrected
-
-
-def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
-    """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
-    reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
-    along = bloch + np.pi * np.arange(-reach, reach + 1)
-    across = np.pi * np.arange(reach + 1)
-    wavenumbers: np.ndarray = (along[:, None] ** 2 + across**2).ravel()
-    return wavenumbers
 
 
 @dataclass(frozen=True, eq=False, slots=True)

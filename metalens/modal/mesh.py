@@ -11,8 +11,7 @@ import numpy as np
 from metalens.modal.shapes import (
     IntervalBasis,
     SquareBasis,
-    polynomial_interval,
-    rim_interval,
+    interval_basis,
     square_basis,
 )
 
@@ -145,7 +144,7 @@ def build_mesh(plan: MeshPlan) -> DiscMesh:
     outer = (0.0, *plan.rings, 1.0)
     fractions = [*(1 - end for end in reversed(outer)), *outer[1:]]
     numbers = FunctionNumbering(2 * count)
-    line = polynomial_interval(plan.angular, plan.angular + 4)
+    line = interval_basis(plan.angular, plan.angular + 4)
     corners = (("centre", 0), ("a", 0), ("b", 0), ("diagonal", 0))
     vector, scalar = numbers.number_element(corners, plan.angular, plan.angular)
     elements = [
@@ -161,14 +160,14 @@ def build_mesh(plan: MeshPlan) -> DiscMesh:
             np.array([scalar]),
         )
     ]
-    angular = polynomial_interval(plan.angular, plan.angular + 5)
+    angular = interval_basis(plan.angular, plan.angular + 5)
     for ring in range(2 * count):
         inside = ring < count
         if ring in (count - 1, count):
             points = plan.radial + 24  # of the graded rule: masses to 1e-13
-            radial = rim_interval(plan.radial, points, plan.exponents, inside)
+            radial = interval_basis(plan.radial, points, plan.exponents, inside)
         else:
-            radial = polynomial_interval(plan.radial, plan.radial + 5)
+            radial = interval_basis(plan.radial, plan.radial + 5)
         start = 0.0 if ring == count else fractions[ring]
         numbered = [
             numbers.number_element(

@@ -58,29 +58,21 @@ def polynomial_basis(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 @lru_cache(maxsize=64)
-def polynomial_interval(degree: int, points: int) -> IntervalBasis:
-    """Integrated Legendre polynomials up to a ``degree`` on a Gauss rule of so many
-    ``points``.
-    """
-    s, w = gauss_rule(points)
-    return IntervalBasis(s, w, *polynomial_basis(degree, s))
-
-
-@lru_cache(maxsize=64)
-def rim_interval(
-    degree: int, points: int, exponents: tuple[float, ...], at_end: bool
+def interval_basis(
+    degree: int, points: int, exponents: tuple[float, ...] = (), at_end: bool = False
 ) -> IntervalBasis:
-    """Polynomials and singular functions ``d**tau - d``, d the distance to s = 0, or to
-    s = 1 if ``at_end``.
+    """Integrated Legendre polynomials, and singular functions ``d**tau - d`` of the
+    distance d to s = 0, or to s = 1 if ``at_end``.
 
     The slope of each singular function is made orthonormal to the slopes before it,
     which keeps the matrices well conditioned.
 
     Args:
-        degree: of the polynomials. points: of the graded rule.
-        exponents: tau of each function. at_end: where they are singular.
+        degree: of the polynomials. points: of the rule, graded where functions are
+            singular. exponents: tau of each singular function.
+        at_end: where they are singular.
     """
-    d, w = graded_rule(points)
+    d, w = graded_rule(points) if exponents else gauss_rule(points)
     value, slope = polynomial_basis(degree, 1 - d if at_end else d)
     fine, fine_weight = graded_rule(80)
     fine_slope = polynomial_basis(degree, 1 - fine if at_end else fine)[1]

@@ -1,7 +1,7 @@
 """Near field of a unit cell: E and H at any points, from the eigenmodes of every slab."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ from metalens.rcwa.basis import (
     EZ,
     Operation,
     OrderSet,
-    PlaneWaves,
     ReducedOrders,
     half_space,
     lattice_frame,
@@ -28,7 +27,7 @@ from metalens.rcwa.permittivity import (
     permittivity_coefficients,
     section_modes,
 )
-from metalens.rcwa.smatrix import FourierModes, match_layers
+from metalens.rcwa.smatrix import match_layers
 from metalens.rcwa.solver import (
     CellProblem,
     cell_problem,
@@ -281,12 +280,13 @@ def _fields(
         tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
     ]
     for operations in problem.classes:
-        solved = _solve_class(stack, light, reach, operations)
-        if solved is None:
+        space = reduced_orders(reach, lattice_frame(problem.cell, operations))
+        orders_at = _solve_class(stack, light, space)
+        if orders_at is None:
             continue
         for grid, fields in zip(grids, totals, strict=True):
-            sums = _PointSums(problem, operations, solved.space.reach, grid)
-            orders = solved.orders_at(np.asarray(grid.z_um))
+            sums = _point_sums(problem, operations, space.reach, grid)
+            orders = orders_at(np.asarray(grid.z_um))
             for field, components in zip(fields, orders, strict=True):
                 for i, (order_set, amplitude) in enumerate(components):
                     field[i] += sums(order_set, amplitude)
@@ -304,87 +304,27 @@ def _fields(
 Components = list[tuple[OrderSet, Array]]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _SolvedClass:
-    """One symmetry class: its waves, and for every slab the modes, 1/eps for Ez, and
-    the amplitudes of upward modes at its foot and of downward ones at its top.
-    """
-
-    stack: _Stack
-    space: ReducedOrders
-    waves: PlaneWaves
-    layers: list[FourierModes]
-    inverse_z: list[Array]
-    up: list[Array]
-    down: list[Array]
-
-    def orders_at(self, z_um: Array) -> tuple[Components, Components, Components]:
-        """Components of E, H (times the impedance of vacuum) and D (x and y), by (1).
-
-        u and w give the tangential fields. Ez follows from 1/eps of each medium times
-        the curl of H, Hz from the curl of E, D from Q of the slab.
-
-        Args:
-            z_um: (nz,) heights over the foot.
-
-        Returns:
-            For E, H and D a list of (order set, amplitudes (nz, k)).
-        """
-        waves = self.waves
-        space = self.space
-        u, w = self._tangential(z_um)
-        ez = np.zeros((len(z_um), len(space.ez.m)), complex)
-        d = np.zeros_like(u)
-        p_waves = slice(waves.bare, waves.p_count)
-        curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
-        for i, place in enumerate(self.stack.places(z_um)):
-            ez[i] = -self.inverse_z[place] @ (waves.kappa[p_waves] * w[i, p_waves])
-            d[i] = self.layers[place].Q @ u[i] + curl * u[i]
-        hz = (waves.kappa * u)[:, len(waves.kappa) - len(space.hz.m) :]
-        e, h, d = (values @ waves.fold.T for values in (u, w, d))
-        count = len(space.ex.m)
-        return (
-            [(space.ex, e[:, :count]), (space.ey, e[:, count:]), (space.ez, ez)],
-            [(space.ey, -h[:, count:]), (space.ex, h[:, :count]), (space.hz, hz)],
-            [(space.ex, d[:, :count]), (space.ey, d[:, count:])],
-        )
-
-    def _tangential(self, z_um: Array) -> tuple[Array, Array]:
-        """(nz, n) amplitudes u and w of the waves at every height.
-
-        In a slab u = W (up + down), w = V (up - down), with modes exp(i q z) from its
-        foot upwards and from its top downwards. z_um: (nz,) heights over the foot.
-        """
-        ends = self.stack.ends
-        feet, tops = [ends[0], *ends], [*ends, ends[-1]]
-        u, w = (np.zeros((len(z_um), len(self.waves.kappa)), complex) for _ in "uw")
-        for i, place in enumerate(self.stack.places(z_um)):
-            modes, z = self.layers[place], self.stack.k0 * z_um[i]
-            up, down = (
-                # waves that are not there may grow without bound
-                amplitude * np.exp(1j * modes.q * distance * (amplitude != 0))
-                for amplitude, distance in (
-                    (self.up[place], z - feet[place]),
-                    (self.down[place], tops[place] - z),
-                )
-            )
-            u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
-        return u, w
-
-
 def _solve_class(
-    stack: _Stack, light: Incidence, reach: int, operations: tuple[Operation, ...]
-) -> _SolvedClass | None:
-    """Waves, modes and fields of one symmetry class; None if the light excites none.
+    stack: _Stack, light: Incidence, space: ReducedOrders
+) -> Callable[[Array], tuple[Components, Components, Components]] | None:
+    """E, H (times the impedance of vacuum) and D (x and y) of one symmetry class; None
+    if the light excites none.
+
+    In a slab u = W (up + down), w = V (up - down), with modes exp(i q z) from its foot
+    upwards and from its top downwards. u and w give the tangential fields. Ez follows
+    from 1/eps of each medium times the curl of H, Hz from the curl of E, D from Q of
+    the slab.
 
     Args:
         stack: slabs and half-spaces.
         light: plane wave.
-        reach: harmonics.
-        operations: of the class.
+        space: reduced orders of the class.
+
+    Returns:
+        Function of heights (nz,) over the foot, um: for each field a list of (order
+        set, amplitudes (nz, k)).
     """
     problem, cell = stack.problem, stack.problem.cell
-    space = reduced_orders(reach, lattice_frame(cell, operations))
     waves = plane_waves(space, cell, problem.light)
     incident = np.zeros(len(waves.kappa), complex)
     for column, (zero_order, sign) in waves.zero.items():
@@ -407,9 +347,38 @@ def _solve_class(
     # the modes of the half-spaces are plane waves, in another order: W^T W = 1
     upward = substrate[0] * incident
     below, above = layers[0].W.T, layers[-1].W.T
-    up = [below @ upward, *fields.up, above @ fields.u_top]
-    down = [below @ (fields.u - upward), *fields.down, np.zeros_like(upward)]
-    return _SolvedClass(stack, space, waves, layers, inverse_z, up, down)
+    ups = [below @ upward, *fields.up, above @ fields.u_top]
+    downs = [below @ (fields.u - upward), *fields.down, np.zeros_like(upward)]
+    feet, tops = [stack.ends[0], *stack.ends], [*stack.ends, stack.ends[-1]]
+    p_waves = slice(waves.bare, waves.p_count)
+    curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
+
+    def orders_at(z_um: Array) -> tuple[Components, Components, Components]:
+        u, w, d = np.zeros((3, len(z_um), len(waves.kappa)), complex)
+        ez = np.zeros((len(z_um), len(space.ez.m)), complex)
+        for i, place in enumerate(stack.places(z_um)):
+            modes, z = layers[place], stack.k0 * z_um[i]
+            up, down = (
+                # waves that are not there may grow without bound
+                amplitude * np.exp(1j * modes.q * distance * (amplitude != 0))
+                for amplitude, distance in (
+                    (ups[place], z - feet[place]),
+                    (downs[place], tops[place] - z),
+                )
+            )
+            u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
+            ez[i] = -inverse_z[place] @ (waves.kappa[p_waves] * w[i, p_waves])
+            d[i] = modes.Q @ u[i] + curl * u[i]
+        hz = (waves.kappa * u)[:, len(waves.kappa) - len(space.hz.m) :]
+        e, h, d = (values @ waves.fold.T for values in (u, w, d))
+        count = len(space.ex.m)
+        return (
+            [(space.ex, e[:, :count]), (space.ey, e[:, count:]), (space.ez, ez)],
+            [(space.ey, -h[:, count:]), (space.ex, h[:, :count]), (space.hz, hz)],
+            [(space.ex, d[:, :count]), (space.ey, d[:, count:])],
+        )
+
+    return orders_at
 
 
 def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
@@ -427,41 +396,43 @@ def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
     return (0.0, amplitude) if column else (amplitude, 0.0)
 
 
-class _PointSums:
+def _point_sums(
+    problem: CellProblem,
+    operations: tuple[Operation, ...],
+    reach: tuple[int, int],
+    grid: FieldGrid,
+) -> Callable[[OrderSet, Array], Array]:
     """Sums of orders on the points of a grid, for one symmetry class.
 
     Reduced amplitudes are unfolded by the symmetry operations before the sum.
+
+    Args:
+        problem: cell and light. operations: of the class. reach: largest orders (m, n).
+        grid: points.
+
+    Returns:
+        Function of an order set and amplitudes (nz, k) to the field (nz, ny, nx).
     """
-
-    def __init__(
-        self,
-        problem: CellProblem,
-        operations: tuple[Operation, ...],
-        reach: tuple[int, int],
-        grid: FieldGrid,
-    ) -> None:
-        """Phases exp(i k x) of all orders up to ``reach`` on both axes of the grid."""
-        light, cell = problem.light, problem.cell
-        k0 = 2 * math.pi / light.wavelength_um
-        self.operations, self.reach = operations, reach
-        axes = np.asarray(grid.x_um), np.asarray(grid.y_um)
-        tangential = (light.kx, light.ky)
-        periods = cell.lattice.periods_um(cell.pitch_um)
-        self.along, self.across = (
-            np.exp(
-                1j
-                * (k0 * k + 2 * np.pi / period * np.arange(-r, r + 1))
-                * axis[:, None]
-            )
-            for k, period, r, axis in zip(tangential, periods, reach, axes, strict=True)
+    light, (mx, my) = problem.light, reach
+    k0 = 2 * math.pi / light.wavelength_um
+    periods = problem.cell.lattice.periods_um(problem.cell.pitch_um)
+    along, across = (
+        np.exp(
+            1j
+            * (k0 * k + 2 * np.pi / period * np.arange(-r, r + 1))
+            * np.asarray(axis)[:, None]
         )
+        for k, period, r, axis in zip(
+            (light.kx, light.ky), periods, reach, (grid.x_um, grid.y_um), strict=True
+        )
+    )
 
-    def __call__(self, orders: OrderSet, amplitude: Array) -> Array:
-        """(nz, ny, nx) field of amplitudes (nz, k), with the images of all orders."""
-        mx, my = self.reach
+    def sums(orders: OrderSet, amplitude: Array) -> Array:
         table = np.zeros((len(amplitude), 2 * my + 1, 2 * mx + 1), complex)
-        for (sx, sy, _), sign in zip(self.operations, orders.signs, strict=True):
+        for (sx, sy, _), sign in zip(operations, orders.signs, strict=True):
             table[:, sy * orders.n + my, sx * orders.m + mx] = (
                 sign * amplitude / np.sqrt(orders.size)
             )
-        return np.asarray(self.across @ table @ self.along.T)
+        return np.asarray(across @ table @ along.T)
+
+    return sums
