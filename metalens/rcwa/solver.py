@@ -451,10 +451,10 @@ def truncation_sequence(
     else:
         gap = cell.gap_um(size_um)
         spans = np.array(cell.outline(size_um).spans_um) / pitch
-    compared = max(
-        compared_truncations(gap / pitch),
-        *(compared_truncations(max(float(span), NARROWEST)) for span in spans),
-    )
+    # errors oscillate once in 1 / width orders; below NARROWEST a factor stands for it
+    widths = np.array([gap / pitch, *np.maximum(spans, NARROWEST)])
+    oscillation = _OSCILLATION / widths[widths >= NARROWEST].min()
+    compared = int(np.clip(math.ceil(oscillation), _COMPARED, MOST_COMPARED))
     last = (
         _largest_truncation(cell, problem.classes) if harmonics is None else harmonics
     )
@@ -464,18 +464,6 @@ def truncation_sequence(
     return TruncationSequence(
         range(max(1, first - compared), last + 1), compared, max(thin, touching)
     )
-
-
-def compared_truncations(width: float) -> int:
-    """How many earlier truncations the error estimate compares, 4 to 6.
-
-    Args:
-        width: narrowest of pillar, walls, holes and gaps, in pitches. Errors oscillate
-            once in 1 / width orders; below ``NARROWEST`` a factor stands for it.
-    """
-    if width < NARROWEST:
-        return _COMPARED
-    return int(np.clip(math.ceil(_OSCILLATION / width), _COMPARED, MOST_COMPARED))
 
 
 def safety_factor(reach: int) -> float:
