@@ -293,7 +293,7 @@ def _design_two_sizes(settings: DesignSettings, options: Options) -> _Outcome:
         Lens, settings as filled in, values for JSON, notes, and failures.
     """
     path = options.config.parent / (settings.library or "")
-    pillars = axes.load(path)
+    pillars = axes.load_axes_library(path)
     inputs = {path.name: store.sha256(path)}
     settings = settings.at(pillars.wavelength_um.tolist())
     pillars.at(settings.focus.wavelength_um)

@@ -358,7 +358,7 @@ def _run_two_sizes(options: Options, settings: CellFile) -> int:
         seconds = time.perf_counter() - start
         about = store.Provenance(config.dumps(settings), inputs)
         pillars = dataclasses.replace(pillars, provenance=about)
-        axes.save(draft.path, pillars)
+        axes.save_axes_library(draft.path, pillars)
     return options.console.report(
         f"{target}: library over two sizes of {settings.cell.described}",
         _two_size_values(pillars, seconds),

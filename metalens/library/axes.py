@@ -24,7 +24,7 @@ from metalens.core.store import Provenance, typed_reader
 from metalens.library import rational
 from metalens.library.curve import SolvedNodes
 from metalens.library.record import Sweep, check_light
-from metalens.library.workers import SweepJournal, Task
+from metalens.library.workers import SweepJournal, SweepTask
 
 KIND = "axes-library"
 FIT_SHARE = 0.1  # residual of the rational fits, as a share of the tolerance
@@ -199,7 +199,7 @@ def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
     )
 
 
-def save(path: str | Path, library: AxesLibrary) -> None:
+def save_axes_library(path: str | Path, library: AxesLibrary) -> None:
     """Write a library file (kind ``axes-library``).
 
     Args:
@@ -209,7 +209,7 @@ def save(path: str | Path, library: AxesLibrary) -> None:
 
 
 @typed_reader
-def load(path: str | Path) -> AxesLibrary:
+def load_axes_library(path: str | Path) -> AxesLibrary:
     """Read a library over two sizes.
 
     Args:
@@ -327,7 +327,7 @@ class _Nodes:
         sweep: Sweep,
         wavelength_um: float,
         reach: int,
-        run: Callable[[list[Task], str], list[SolvedNodes]],
+        run: Callable[[list[SweepTask], str], list[SolvedNodes]],
     ) -> None:
         self._cell = cell
         self._light = Incidence(wavelength_um)
@@ -350,7 +350,7 @@ class _Nodes:
         keys = [(float(x), float(y)) for x, y in solved]
         new = [key for key in dict.fromkeys(keys) if key not in self.known]
         tasks = [
-            Task(
+            SweepTask(
                 "jones",
                 cell_of_sizes(self._cell, x, y),
                 self._light,

@@ -17,7 +17,7 @@ from metalens.library.curve import ResponseCurve
 from metalens.library.fit import find_faults, find_runs
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
-from metalens.library.workers import SweepJournal, Task, fit_curve
+from metalens.library.workers import SweepJournal, SweepTask, fit_curve
 
 TURN = 2 * math.pi
 
@@ -156,7 +156,7 @@ def run_study(
         for wavelength, height, pitch in combinations
     ]
     tasks = [
-        Task(
+        SweepTask(
             "curve",
             cell,
             Incidence(wavelength),

@@ -18,7 +18,7 @@ from metalens.library import engines, workers
 from metalens.library.curve import ResponseCurve
 from metalens.library.geometric_phase import solve_rotations
 from metalens.library.record import PillarLibrary, Sweep, check_sweep
-from metalens.library.workers import SweepJournal, Task
+from metalens.library.workers import SweepJournal, SweepTask
 
 Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
 POINTS = 8  # entries per task when solved one by one
@@ -138,7 +138,7 @@ class _SweepRun:
         """
         waves = sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad)
         tasks = [
-            Task("curve", self.cell, wave, self.span, self.sweep.bar, self.engine)
+            SweepTask("curve", self.cell, wave, self.span, self.sweep.bar, self.engine)
             for wave in waves
         ]
         solved = self.journal.run(tasks, self.console, label)
@@ -173,7 +173,7 @@ class _SweepRun:
                 _interpolate_family(rows, family, resonances, diameters)
         return rows
 
-    def points(self, diameters: Array, rows: Rows) -> list[Task]:
+    def points(self, diameters: Array, rows: Rows) -> list[SweepTask]:
         """Tasks for the entries whose error bar exceeds the tolerance.
 
         Left out are those at the solver's finest discretisation, where a single solve
@@ -191,7 +191,9 @@ class _SweepRun:
             inaccurate = diameters[misses].tolist()
             for start in range(0, len(inaccurate), POINTS):
                 sizes = tuple(inaccurate[start : start + POINTS])
-                tasks.append(Task("points", self.cell, light, sizes, bar, self.engine))
+                tasks.append(
+                    SweepTask("points", self.cell, light, sizes, bar, self.engine)
+                )
         return tasks
 
     def record(self, diameters: Array, rows: Rows, solves: int) -> PillarLibrary:

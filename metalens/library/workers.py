@@ -22,7 +22,7 @@ SOLVE_SHARE, FIT_SHARE = 0.5, 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class SweepTask:
     """Exact solves of one cell.
 
     kind: ``curve``: t(D) over a range of sizes, at sizes that are chosen adaptively
@@ -46,7 +46,7 @@ class Task:
     harmonics: int = 0
 
 
-def run_task(task: Task) -> SolvedNodes:
+def run_task(task: SweepTask) -> SolvedNodes:
     """Solve a task: four rows of t and r of ``jones``, else a row per size."""
     cell, light = task.cell, task.light
     if task.kind == "jones":
@@ -137,7 +137,7 @@ class SweepJournal:
             return
 
     def run(
-        self, tasks: list[Task], console: CommandConsole, label: str
+        self, tasks: list[SweepTask], console: CommandConsole, label: str
     ) -> list[SolvedNodes]:
         """Solves of the tasks in order; those in the journal are not computed again.
 

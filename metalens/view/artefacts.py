@@ -89,7 +89,7 @@ def axes_panels(path: Path) -> list[Panel]:
     Args:
         path: of the library.
     """
-    library = axes.load(path)
+    library = axes.load_axes_library(path)
     names = [
         SliderAxis("polarisation", ["x", "y"]),
         SliderAxis("wavelength", (1e3 * library.wavelength_um).tolist(), "nm"),

@@ -48,7 +48,7 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
     assert status == 0
     assert told["failures"] == []
     assert told["usable"] == 1.0
-    library = axes.load(tmp_path / "axes.h5")
+    library = axes.load_axes_library(tmp_path / "axes.h5")
     assert (
         told["entries"] == library.t_error.size == 24 * 17
     )  # 17 steps of 150/23 nm are more than the 110 nm along x

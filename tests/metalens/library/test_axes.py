@@ -137,8 +137,8 @@ def test_weak_pillars_are_a_film_of_the_mean_permittivity(shape):
 
 
 def test_a_library_is_read_as_it_was_written(library, tmp_path):
-    axes.save(tmp_path / "axes.h5", library)
-    again = axes.load(tmp_path / "axes.h5")
+    axes.save_axes_library(tmp_path / "axes.h5", library)
+    again = axes.load_axes_library(tmp_path / "axes.h5")
     assert (again.cell, again.sweep, again.solves) == (CELL, SETTINGS, library.solves)
     for name in ("t", "t_error", "x_um", "held_out"):
         assert np.array_equal(getattr(again, name), getattr(library, name))
