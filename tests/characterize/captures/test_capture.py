@@ -1,7 +1,6 @@
 """Captures on disk: what is read, what is put right, what is refused and where."""
 
 import math
-import unicodedata
 
 import cv2
 import h5py
@@ -114,15 +113,6 @@ def test_dark_and_flat_are_shifted_back_with_the_frames(tmp_path, stated):
     assert capture.load(tmp_path).dark[0] == pytest.approx(average / 16)
 
 
-def test_dim_frames_beside_bright_flats_have_the_bits_of_the_flats(tmp_path):
-    flat = RNG.integers(1500, 2600, (2, 12, 16)).astype(np.uint16)
-    folder(tmp_path, frames=FRAMES // 8)
-    tifffile.imwrite(tmp_path / "flat.tif", flat, photometric="minisblack")
-    found = capture.load(tmp_path)
-    assert found.bits == 12
-    assert np.array_equal(found.flat, flat)
-
-
 def test_imagej_spacing_gives_the_positions(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.tif",
@@ -223,20 +213,6 @@ def test_one_channel_of_colour_frames_is_taken_where_it_is_named(
         capture.load(tmp_path)
 
 
-def test_colours_in_separate_planes_are_colours_where_a_channel_is_named(tmp_path):
-    colours = np.random.default_rng(7).integers(0, 900, (2, 3, 9, 14)).astype(np.uint16)
-    for i, image in enumerate(colours):
-        tifffile.imwrite(
-            tmp_path / f"f{i}.tif", image, photometric="rgb", planarconfig="separate"
-        )
-    tifffile.imwrite(tmp_path / "dark.tif", colours[:, 2])
-    (tmp_path / "capture.toml").write_text('channel = "green"\n')
-    (tmp_path / "stage.csv").write_text("file,depth_um\nf1.tif,7\nf0.tif,9\n")
-    found = capture.load(tmp_path)
-    assert np.array_equal(found.frames, colours[::-1, 1])
-    assert np.array_equal(found.dark, colours[:, 2])
-
-
 def test_a_channel_of_grey_frames_is_refused(tmp_path):
     """It changed nothing, and the corrections said that it had been used."""
     folder(tmp_path, about='channel = "green"\n')
@@ -260,33 +236,6 @@ def test_images_that_the_stage_file_does_not_name_are_told(tmp_path):
     found = capture.load(tmp_path)
     assert len(found.frames) == len(FRAMES)
     assert any("left out: darker try.tif" in words for words in found.corrections)
-
-
-def test_a_name_with_an_umlaut_is_found_in_either_spelling(tmp_path):
-    """One disk keeps a letter with its dots, another the letter and then the dots; a
-    table keeps what was typed.
-    """
-    for listed, lies in (("NFC", "NFD"), ("NFD", "NFC")):
-        at = tmp_path / listed
-        at.mkdir()
-        tifffile.imwrite(
-            at / unicodedata.normalize(lies, "Bild für 7 µm.tif"), FRAMES[2]
-        )
-        table = unicodedata.normalize(listed, "file,depth_um\nBild für 7 µm.tif,730\n")
-        (at / "stage.csv").write_text(table, encoding="utf-8")
-        found = capture.load(at)
-        assert np.array_equal(found.frames, FRAMES[2:3])
-        assert not any("left out" in words for words in found.corrections)
-
-
-def test_a_preview_beside_a_frame_is_refused_by_name(tmp_path):
-    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        file.write(FRAMES[0])
-        file.write(FRAMES[0, ::2, ::2])
-    with pytest.raises(
-        CaptureError, match=r"frame 1 is \(6, 8\), frame 0 \(12, 16\); keep one size"
-    ):
-        capture.load(tmp_path / "a.tif")
 
 
 def test_compressed_frames_of_another_program_are_read(tmp_path):

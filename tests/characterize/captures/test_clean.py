@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from characterize.captures import calibration as clean
 from characterize.captures.capture import Capture
@@ -138,18 +137,6 @@ def test_brackets_merge_to_the_true_rate_with_the_stated_variance():
     )  # the dark of one frame counts as noisy here, though it is exact
 
 
-def test_a_dark_background_of_few_bits_is_not_taken_for_dead_pixels():
-    y, x = np.mgrid[:40, :40] - 20
-    spot = 200 * np.exp(-(x**2 + y**2) / (2 * 2.0**2))
-    frames = np.stack([np.round(spot * share) for share in (0.5, 1.0, 0.7)]).astype(
-        np.uint8
-    )
-    assert (np.ptp(frames, axis=0) == 0).mean() > 0.5
-    assert not clean.bad_pixels(capture(frames)).any()
-    frames[:, 22] = 0  # a dead row through the light
-    assert clean.bad_pixels(capture(frames))[22, 16:25].all()
-
-
 @pytest.mark.parametrize("levels", [(700.0, 1900.0, 3300.0), (2600.0,)])
 def test_gain_and_its_error_bar_cover_a_gain_of_3_7(levels):
     """Sixty small flats: the deviations from the truth are as large as stated (each
@@ -174,41 +161,6 @@ def test_gain_and_its_error_bar_cover_a_gain_of_3_7(levels):
     assert np.mean(reads) == pytest.approx(
         read, rel=0.01
     )  # sqrt(1 / 9600 / 60) = 0.001; the gain's mean 0.003
-
-
-def test_gain_of_small_flats_is_not_drawn_to_their_quiet_pairs():
-    """Pairs of 8 x 8 pixels scatter by 18 % in variance: weighed by their own, the gain
-    comes out 7 % high.
-    """
-    rng, gain = np.random.default_rng(5), 3.7
-    found = []
-    for _ in range(60):
-        flat = np.round(rng.poisson(6100.0, (24, 8, 8)) / gain + 113.0)
-        dark = np.round(rng.normal(0, 3.1, (8, 8, 8)) / gain + 113.0)
-        found.append(clean.photon_transfer(flat, dark).gain_e)
-    assert np.mean(found) == pytest.approx(
-        gain, rel=0.02
-    )  # sqrt(2 / 12 / 63 / 60) = 0.7 %, three of them
-
-
-def test_gain_from_levels_alone_has_an_error_bar_that_covers():
-    """Without dark frames slope and floor come from the line through the levels."""
-    rng, gain = np.random.default_rng(12), 3.7
-    z = []
-    for _ in range(60):
-        light = np.repeat([400.0, 1900.0, 5300.0], 2)
-        flat = np.stack(
-            [
-                np.round(
-                    (rng.poisson(e, (40, 40)) + rng.normal(0, 9.2, (40, 40))) / gain
-                )
-                for e in light
-            ]
-        )
-        found = clean.photon_transfer(flat)
-        z.append((found.gain_e - gain) / found.gain_sigma_e)
-    assert abs(np.mean(z)) < 0.5
-    assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.3
 
 
 def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
@@ -267,21 +219,3 @@ def test_noise_in_the_dark_is_known_from_two_dark_frames():
     ]
     assert known == [True, False, False]
     assert not clean.photon_transfer(flat, None).coarse
-
-
-@pytest.mark.parametrize("noise_counts", [0.16, 0.27, 0.33, 0.61])
-def test_counts_are_coarse_where_rounding_is_off_by_a_twentieth_of_a_count(
-    noise_counts,
-):
-    """What rounded counts are off by on average is summed over the counts; a twentieth
-    is reached at 0.306.
-    """
-    light, whole = np.linspace(0, 1, 41), np.arange(-8, 10)
-    below, above = (
-        norm.cdf((whole[:, None] + half - light) / noise_counts) for half in (-0.5, 0.5)
-    )
-    off = np.abs((whole[:, None] * (above - below)).sum(0) - light).max()
-    gain = clean.SensorNoise(
-        gain_e=2.3, gain_sigma_e=0.01, read_noise_e=2.3 * noise_counts
-    )
-    assert gain.coarse is bool(off > 0.05)

@@ -2,7 +2,6 @@
 refused with what to do.
 """
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -74,26 +73,6 @@ def test_what_a_system_hides_is_no_frame(tmp_path):
     found = capture.load(tmp_path)
     assert found.names == ("a0.tif", "a1.tif", "a2.tif")
     assert len(found.corrections) == 1  # of bits
-
-
-def test_images_in_other_kinds_of_file_are_told_and_a_dark_refused(tmp_path):
-    frames(tmp_path)
-    (tmp_path / "a3.fits").write_bytes(b"SIMPLE")
-    cv2.imwrite(str(tmp_path / "a4.bmp"), (FRAMES[3] >> 4).astype(np.uint8))
-    found = capture.load(tmp_path)
-    assert len(found.frames) == 3
-    assert (
-        "2 files left out, of kinds that are not read: a3.fits, a4.bmp"
-        in found.corrections
-    )
-    np.save(tmp_path / "Dark.npy", FRAMES[:2])
-    with pytest.raises(
-        CaptureError,
-        match=r"Dark\.npy: cannot read \.npy, and it would not be used: save it in Python",
-    ):
-        capture.load(tmp_path)
-    tifffile.imwrite(tmp_path / "dark.tif", FRAMES[:2], photometric="minisblack")
-    assert len(capture.load(tmp_path).dark) == 2
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from characterize.captures import Capture, quantization_score, to_electrons
-from characterize.captures.calibration import photon_transfer
+from characterize.captures import quantization_score
 from characterize.captures.rounding import DarkStatistics
 from characterize.inference import leastsquares, prepare
 from characterize.inference.leastsquares import FitImages
@@ -74,26 +73,6 @@ def test_dark_frames_that_all_read_the_same_leave_the_level_open():
     assert 0.04 < found.error[0, 0] < 0.2
 
 
-def test_gain_of_flats_counts_the_rounding_that_the_dark_does_not_show():
-    """Dark frames that all read 12 have no variance; flats of 3.1 counts of noise have
-    1/12 of their own: 0.9 %.
-    """
-    rng = np.random.default_rng(8)
-    gain, read = 11.0, 0.9
-    dark = np.rint(12.0 + read / gain * rng.standard_normal((6, 60, 60)))
-    assert np.ptp(dark) == 0
-    electrons = rng.poisson(130.0, (160, 60, 60)) + read * rng.standard_normal(
-        (160, 60, 60)
-    )
-    found = photon_transfer(np.rint(12.0 + electrons / gain), dark)
-    variance = (130.0 + read**2) / gain**2 + 1 / 12
-    # variance / mean: 2.9e5 differences of 2 frames, 0.26 %; the dark noise is known to
-    # a factor of two: 1 %
-    without = (130.0 / gain) / variance
-    assert abs(without / gain - 1) > 0.06
-    assert found.gain_e == pytest.approx(gain, rel=0.02)
-
-
 def seen(rng, light, gain, read):
     electrons = rng.poisson(light) + read * rng.standard_normal(light.shape)
     return gain * np.rint(electrons / gain)
@@ -147,41 +126,3 @@ def test_fit_of_rounded_counts_ends_where_their_likelihood_is_greatest():
     assert found.chi2_per_dof == pytest.approx(
         1, abs=0.3
     )  # 338 pixels: 0.08, and their scores are no normal numbers
-
-
-def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count():
-    rng = np.random.default_rng(21)
-    gain, read, level = 31.0, 4.0, 9.3
-    light = np.zeros((3, 22, 24))
-    frames = np.rint(
-        level
-        + (rng.poisson(light + 12) + read * rng.standard_normal(light.shape)) / gain
-    )
-    dark = np.rint(level + read / gain * rng.standard_normal((8, 22, 24)))
-    flat = np.rint(
-        level
-        + (rng.poisson(3100.0, (24, 22, 24)) + read * rng.standard_normal((24, 22, 24)))
-        / gain
-    )
-    blank = np.full(3, np.nan)
-    found = to_electrons(
-        Capture(
-            frames,
-            blank,
-            np.zeros((3, 2)),
-            blank,
-            ("a", "b", "c"),
-            8,
-            dark=dark,
-            flat=flat,
-        )
-    )
-    assert found.count_e == found.gain.gain_e == pytest.approx(gain, rel=0.05)
-    assert found.gain.coarse
-    assert found.gain.read_noise_e == pytest.approx(
-        read, rel=0.4
-    )  # one level for all pixels: noise and level trade
-    zero = np.median(frames - found.electrons * found.scale / found.count_e)
-    assert (
-        abs(zero - level) < 0.15 < level - dark.mean()
-    )  # 1.6 sigma of noise that is taken for 0.17, not 0.13

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
 import test_sem
 
 from metalens import lens as lenses
-from metalens.cell import Cell, Index, Lattice
+from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Square
 from metalens.cli import main
 from metalens.lens import DiameterMap, Lens
@@ -271,48 +271,6 @@ def _lens_file(path, cell, drawn_nm):
     )
     drawn = DiameterMap(drawn_nm * 1e-3, cell.pitch_um, cell.lattice)
     lenses.save(path, Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
-
-
-def test_a_picture_of_a_hexagonal_lens_gives_its_bias_table(tmp_path):
-    """Pillars drawn 3.3 nm wider than made; blur moves either edge by less than 0.3 of
-    a pixel of 4 nm.
-    """
-    pitch_nm, pixel_nm = 400.0, 4.0
-    random = np.random.default_rng(6)
-    mask = random.uniform(170, 260, (13, 16)) * (np.indices((13, 16)).sum(0) % 2 == 0)
-    _lens_file(
-        tmp_path / "lens.h5",
-        Cell(pitch_um=0.4, pillar=Index(3.6), lattice=Lattice("hexagonal")),
-        mask,
-    )
-    rows, columns = np.nonzero(mask[3:9, 2:12])
-    y, x = np.mgrid[:480, :500]
-    image = np.full(y.shape, 0.25)
-    for row, column in zip(rows, columns, strict=True):
-        cy = (row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm
-        cx = (column + 0.7) * 0.5 * pitch_nm / pixel_nm
-        out_px = (
-            np.hypot(y - cy, x - cx) - (mask[3 + row, 2 + column] - 3.3) / 2 / pixel_nm
-        )
-        image = np.maximum(image, 0.25 + 0.6 * special.expit(-2 * out_px))
-    image += 0.02 * random.standard_normal(image.shape)
-    tifffile.imwrite(tmp_path / "sem.tif", (image * 4e4).astype(np.uint16))
-    arguments = [
-        "measure",
-        str(tmp_path / "sem.tif"),
-        "--pixel-nm",
-        "4.0",
-        "--design",
-        str(tmp_path / "lens.h5"),
-    ]
-    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
-    told = json.loads((tmp_path / "out" / "measure.json").read_text())
-    assert told["lattice"] == "hexagonal"
-    assert told["pitch_over_design"] == pytest.approx(1.0, abs=1e-3)
-    assert [bias for _, bias, *_ in told["bias_nm"]] == pytest.approx(
-        [-3.3] * len(told["bias_nm"]), abs=0.6 * pixel_nm
-    )
-    assert (tmp_path / "out" / "bias.toml").is_file()
 
 
 @pytest.mark.parametrize("shape", [Square(), Circle(hole=True)])

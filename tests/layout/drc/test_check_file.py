@@ -232,29 +232,6 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
     assert region.space_check(49, False, db.Region.Euclidian).is_empty()
 
 
-def staircase(rng):
-    steps = np.cumsum(rng.integers(60, 230, (int(rng.integers(2, 5)), 2)), axis=0)
-    points = [(0, 0), (int(steps[-1, 0]), 0)]
-    for k, (_, y) in enumerate(steps.tolist()):
-        left = int(steps[len(steps) - 2 - k, 0]) if k < len(steps) - 1 else 0
-        points += [(points[-1][0], y), (left, y)]
-    return points
-
-
-def ell(rng):
-    w, h = rng.integers(200, 900, 2).tolist()
-    a, b = int(rng.integers(40, w - 30)), int(rng.integers(40, h - 30))
-    return [(0, 0), (w, 0), (w, b), (a, b), (a, h), (0, h)]
-
-
-def fork(rng):
-    w, h = rng.integers(300, 900, 2).tolist()
-    a = int(rng.integers(40, w // 2 - 20))
-    b = int(rng.integers(40, h - 60))
-    c = int(rng.integers(a + 20, w - 40))
-    return [(0, 0), (w, 0), (w, h), (c, h), (c, b), (a, b), (a, h), (0, h)]
-
-
 def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
     """Not as its chords: KLayout's projection of edges that face each other says the
     same.
@@ -312,38 +289,6 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
     assert found["violations"]["width"] == planned.counts["width"] > 20
     assert found["violations"]["space"] == planned.counts["space"] == 0
     assert found["minimum_width_nm"] == pytest.approx(planned.minimum_width_nm)
-
-
-def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
-    """Pillars of 250 nm every 330 leave walls of 80, and 40 to the end of their
-    squares: a frame makes these whole.
-    """
-    size = np.full((5, 9), 0.25)
-    size[2, 7:] = 0.0
-    process = tmp_path / "p.toml"
-    process.write_text(
-        'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n'
-    )
-    rules = processes.load_process(process)
-    plan = layout.plan(DiameterMap(size, 0.33), rules, furnished=False)
-    layout.write_gdsii(plan, tmp_path / "m.gds")
-    assert check_plan(plan, rules.rules).ok
-    assert (
-        cli.main(
-            ["check", str(tmp_path / "m.gds"), "--process", str(process), "--json"]
-        )
-        == 0
-    )
-    assert json.loads(capsys.readouterr().out)["violations"]["space"] == 0
-    read_back = db.Layout()
-    read_back.read(str(tmp_path / "m.gds"))
-    drawn = db.Region(read_back.top_cell().begin_shapes_rec(read_back.find_layer(1, 0)))
-    assert drawn.bbox().width() == 9 * 330 + 2 * 330
-    assert drawn.width_check(79).is_empty()
-    drawn.merged_semantics = False
-    assert (
-        sum(p.area() for p in drawn.each()) == drawn.merged().area()
-    )  # no shape overlaps another
 
 
 def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):

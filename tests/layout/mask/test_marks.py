@@ -122,23 +122,6 @@ def test_verniers_keep_the_rules_and_the_grid(grid):
     assert not (np.concatenate([drawn, opened]) % grid).any()
 
 
-def test_fine_crosses_are_a_fifth_of_the_coarse_ones_beside_them():
-    made = process(mark_um=150.0, mark_width_um=10.0)
-    plan = layout.plan(lens_map(), made)
-    found = [
-        (x, y) for x, y, wide, high in job_files.marks_um(plan) if wide == high == 150.0
-    ]
-    fine = [
-        (x, y) for x, y, wide, high in job_files.marks_um(plan) if wide == high == 30.0
-    ]
-    assert len(found) == len(fine) == 4
-    # beside each in the direction of the middle: arms of 75 and 15 um and 10 um between
-    # them
-    assert {(x, round(y - np.sign(y) * 100.0, 6)) for x, y in found} == {
-        (x, round(y, 6)) for x, y in fine
-    }
-
-
 def test_verniers_are_said_on_the_job_sheet_and_can_be_left_out():
     for wanted in (True, False):
         made = process(verniers=wanted)

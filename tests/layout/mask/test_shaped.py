@@ -590,20 +590,6 @@ def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
     }  # flats of the circles stand on whole nm
 
 
-def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
-    """The ring of 260 nm has a hole of 117: a zone of 60 by 60 about its site is free,
-    one of 140 by 140 is not.
-    """
-    made = of_sizes(Ring(0.45), "square")
-    row, column = np.argwhere(made.diameters.diameter_um == 0.26)[0]
-    x, y = made.diameters.x_um[column], made.diameters.y_um[row]
-    plan = build.plan(made, PROCESS, furnished=False)
-    for side, pillars in ((0.06, 0), (0.14, 1)):
-        zone = processes.KeepOutZone(x - side / 2, y - side / 2, side, side)
-        rules = dataclasses.replace(PROCESS.rules, exclusion=(zone,))
-        assert check_plan(plan, rules).counts["exclusion"] == pillars
-
-
 @pytest.mark.parametrize("kind", ["rectangular", "hexagonal"])
 def test_dose_test_and_witness_cells_stand_on_the_lattice_of_the_lens(kind):
     """Pillars 1.1 pitches apart along y, and long along y, would touch on a square
@@ -676,19 +662,3 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
     assert (
         check_plan(plan, PROCESS.rules).shapes > (made.diameters.diameter_um > 0).sum()
     )
-
-
-def test_sizes_are_rounded_by_no_more_than_is_told():
-    """Of 961 sizes some lie half a step of 2 nm off the drawn ones, or nearly so; none
-    farther.
-    """
-    size = np.random.default_rng(8).uniform(0.12, 0.26, (31, 31))
-    made = dataclasses.replace(
-        lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4)
-    )
-    found = build.draw_mask(made, PROCESS)
-    drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[
-        found.cells.classes
-    ]
-    off = np.abs(drawn - 1e3 * size).max()
-    assert 0.95 * found.cells.rounding_nm < off <= found.cells.rounding_nm * (1 + 1e-9)

@@ -262,19 +262,6 @@ def test_a_rational_formula_ends_after_a_term_and_holds_where_an_absent_pole_wou
     )
 
 
-def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Path):
-    page = tmp_path / "falling.yml"
-    page.write_text(
-        "DATA:\n  - type: formula 2\n    wavelength_range: 0.9 0.4\n    coefficients: 0.2 0.7 0.36\n"
-    )
-    assert materials.find_material(str(page)).range_um == (0.4, 0.9)
-    assert materials.index(str(page), 0.8) == pytest.approx(
-        math.sqrt(1.2 + 0.7 * 0.64 / (0.64 - 0.36)), rel=1e-12
-    )
-    with pytest.raises(MaterialError, match=r"falling.yml, formula 2 gives n = "):
-        materials.index(str(page), 0.5)  # below the pole at 0.6 um n² is negative
-
-
 def test_noise_of_a_measured_k_below_nothing_is_no_gain(tmp_path: Path):
     """Ellipsometry has k to 1e-3; what is farther below 0 is the other sign of time."""
     page = tmp_path / "noisy.yml"
@@ -435,18 +422,6 @@ def test_a_bad_page_is_refused(tmp_path: Path, text, message):
         materials.index(str(file), 0.55)
 
 
-def test_a_page_of_lists_of_lists_by_reference_is_not_written_out(tmp_path: Path):
-    """Ten lists, each of ten times the one before: their text would have 10^10 words."""
-    lists = [
-        f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10) if i else 'x'}]"
-        for i in range(11)
-    ]
-    data = "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5 0\n        0.6 1.4 0\n"
-    file = tmp_path / "bomb.yml"
-    file.write_text("\n".join([*lists, "REFERENCES: *l10", data]))
-    assert materials.index(str(file), 0.55) == pytest.approx(1.45)
-
-
 def test_blends_and_offsets():
     """Bruggeman's equation holds for what comes out; ends of the share are the
     materials themselves.
@@ -485,14 +460,3 @@ def test_a_row_that_is_no_index_is_named_where_it_is_asked_for(tmp_path: Path, r
     assert materials.index(page, 0.75) == pytest.approx(1.45 + 0.1j, abs=1e-15)
     with pytest.raises(MaterialError, match=r"row 3: .*0\.47 um"):
         materials.index(page, 0.47)
-
-
-def test_repeated_wavelengths_of_a_page_are_one_row_or_a_step(tmp_path: Path):
-    """Between the rows values are straight lines on each side of a step."""
-    rows = ["0.4 2.0 0.4", "0.5 1.8 0.2", "0.5 1.8 0.2", "0.6 1.6 0.1", "0.6 1.2 0.3"]
-    page = write_page(tmp_path, [*rows, "0.7 1.0 0.5"])
-    assert materials.index(page, 0.5) == 1.8 + 0.2j
-    assert materials.index(page, 0.55) == pytest.approx(1.7 + 0.15j, abs=1e-15)
-    assert materials.index(page, 0.65) == pytest.approx(1.1 + 0.4j, abs=1e-15)
-    with pytest.raises(MaterialError, match=r"two rows at 0.6 um"):
-        materials.index(page, 0.6)

@@ -81,27 +81,6 @@ def test_compiled_weights_give_the_image_of_the_differentiable_path():
     )  # depths that round to the next of 4096 codes
 
 
-def test_the_published_formula_loses_light_at_edges():
-    """A near layer in strong blur before a sharp far one: epsilon = 1e-3 loses more
-    than a fifth beside the edge.
-    """
-    near = torch.zeros(1, 1, N, N, dtype=torch.float64)
-    near[..., : N // 2] = 1
-    cover = torch.cat([near, 1 - near], 1)
-    psfs = _stack(torch.tensor([7.0, 0.4]), 61)
-    lost = (
-        1
-        - layered.published(
-            Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs
-        )[0, 30:66, 20:76]
-    )
-    assert lost.max() > 0.2
-    kept = layered.image_layers(
-        Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs
-    )
-    assert (kept - 1).abs().max() < 1e-12
-
-
 def test_a_sharp_near_edge_hides_a_blurred_far_sheet():
     """Light of the hidden sheet does not bleed onto the near one; behind the edge its
     colour goes on unchanged.
