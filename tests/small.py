@@ -133,6 +133,7 @@ SETTINGS["chain.toml"] = """
     psf = "psf.toml"
     run = "run.toml"
     bench_truth = "truth.toml"
+    bench_metrology = "metrology.toml"
     budget = false
 """
 STAGES = {  # the file or folder that a command leaves, and its words

@@ -10,6 +10,7 @@ from importlib import resources
 import pytest
 
 from metalens import cli
+from tests import small
 from tests.command_line import process, run
 
 
@@ -126,30 +127,8 @@ def test_info_shows_kind_and_provenance(tmp_path):
 # The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.06 mm,
 # a network that hardly trains.
 CHAIN = {
-    "run.toml": """
-        preset = "smoke"
-        test_batches = 1
-        validation_batches = 1
-        scenes = { pixels = 32, margin = 4, pool = 4 }
-        inner = { steps = 2, batch = 2 }
-        search = { population = 2, tournament = 1, rounds = 2 }
-        run = { pitch_um = 12.0, budgets_mmacs = [4.0] }
-
-        [optics]
-        image = "uniform"
-        aperture_mm = 0.06
-        sensor_distance_mm = 0.5
-        sample_um = 12.0
-        polynomials = 0
-        depth_count = 3
-        window_samples = 9
-
-        [space]
-        widths = [0.25]
-        expansions = [3]
-        kernels = [3]
-        resolution = [0.5, 0.5]
-    """,
+    name: small.SETTINGS[name] for name in ("run.toml", "metrology.toml", "chain.toml")
+} | {
     "psf.toml": """
         depths_mm = [18.0, 23.0, 5.0]
         angles_deg = [4.0]
@@ -160,16 +139,11 @@ CHAIN = {
         depths_um = [2500.0, 4500.0, 15000.0]
         peak_e = 6000.0
         camera = { pixel_um = 2.0, pixels = 24 }
-        parameter = [{ name = "bias_nm", value = 5.0 }, { name = "distance_um", value = 12.0 }]
-    """,
-    "chain.toml": """
-        cell = "cell.toml"
-        design = "design.toml"
-        process = "process.toml"
-        psf = "psf.toml"
-        run = "run.toml"
-        bench_truth = "truth.toml"
-        budget = false
+        parameter = [
+            { name = "bias_nm", value = 5.0 },
+            { name = "distance_um", value = 12.0 },
+            { name = "crosstalk_px", value = 0.02 },
+        ]
     """,
 }
 
