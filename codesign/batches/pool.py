@@ -51,8 +51,9 @@ def render_pool(scenes: EyeScenes, count: int) -> FramePool:
         _render_part(scenes, number, min(CHUNK, count - start))
         for number, start in enumerate(range(0, count, CHUNK))
     ]
-    arrays = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    return FramePool(*arrays, scenes.rig.pupil_um.numpy(), np.array(scenes.depths_um))
+    arrays = [np.concatenate(rows) for rows in zip(*parts, strict=True)]
+    arrays += [scenes.rig.pupil_um.numpy(), np.array(scenes.depths_um)]
+    return FramePool(*arrays)
 
 
 def _render_part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:

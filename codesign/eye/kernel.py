@@ -15,6 +15,7 @@ from metalens.core.arrays import Array
 f32, i32 = np.float32, np.int32
 SETTINGS: dict[str, Any] = {"fastmath": True, "error_model": "numpy"}
 _inlined = numba.njit(forceinline=True, **SETTINGS)
+_to_tuple: Any = to_fixed_tuple
 
 COLUMNS, ROWS = 16, 4  # of a tile: vector registers, and independent work to fill them
 LANES = ROWS * COLUMNS
@@ -499,7 +500,7 @@ def render_strips(
     tile, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
     for job in range(first, end):
         frame, row = job // strips, job % strips * ROWS
-        v = to_fixed_tuple(rows[frame], COUNT)
+        v = _to_tuple(rows[frame], COUNT)
         named = Parameters(
             v[0:3], v[3:6], v[6:9], v[9:12], v[12:15], v[15:18], v[18:21], v[21:24],
             v[24:27], v[27:30], v[30:33], *v[33:],

@@ -61,7 +61,8 @@ def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Te
         torch.sqrt(torch.where(hit, discriminant, torch.ones_like(discriminant))) * hit
     )
     offset = -perpendicular - depth[..., None] * ray
-    return offset / offset.norm(dim=-1, keepdim=True)
+    direction: Tensor = offset / offset.norm(dim=-1, keepdim=True)
+    return direction
 
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:

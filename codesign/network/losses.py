@@ -60,6 +60,18 @@ def slip_loss(
     return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
 
 
+def depth_loss(predicted: Tensor, vergence: Tensor) -> Tensor:
+    """Gaussian negative log likelihood of window vergences: mean of e² / (2 σ²) + log
+    σ.
+
+    Args:
+        predicted: (batch, 2, y, x) mean and logarithm of the standard deviation σ.
+        vergence: (batch, y, x) the truth.
+    """
+    mean, log_sd = predicted.unbind(1)
+    return F.gaussian_nll_loss(mean, vergence, torch.exp(2 * log_sd))
+
+
 def task_loss(
     prediction: Prediction,
     mask: Tensor,
@@ -98,8 +110,7 @@ def depth_reading_loss(
             slippage.
         depth_weight: of the depths of windows.
     """
-    mean, log_sd = prediction.depth.unbind(1)
-    depth = F.gaussian_nll_loss(mean, vergence, torch.exp(2 * log_sd))
+    depth = depth_loss(prediction.depth, vergence)
     # the uncertainty of the slippage alone is trained
     error = (prediction.slip - slip_mm / scale_mm).detach()
     variance = torch.exp(2 * prediction.slip_log_sd)

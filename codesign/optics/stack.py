@@ -502,7 +502,8 @@ def _orthonormal_mix(pupil: Pupil, count: int, family: Family) -> Tensor:
     raw = torch.stack(families.phase_terms(x, y, count, family))
     samples = raw[:, radius(pupil) <= pupil.radius_um]
     _, upper = torch.linalg.qr(samples.T)
-    return torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
+    mix: Tensor = torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
+    return mix
 
 
 @functools.lru_cache(maxsize=8)
