@@ -129,30 +129,25 @@ def substrate_orders(
     )
 
 
-def named_orders(orders: Sequence[DiffractionOrder], most: int = 8) -> str:
-    """``orders`` in words, at most ``most`` of them: "(1, 0), (0, -1) and 3 more"."""
-    named = ", ".join(f"({order.m}, {order.n})" for order in orders[:most])
-    more = f" and {len(orders) - most} more" if len(orders) > most else ""
-    return named + more
+def named_orders(orders: Sequence[DiffractionOrder]) -> str:
+    """``orders`` in words, at most eight of them: "(1, 0), (0, -1) and 3 more"."""
+    named = ", ".join(f"({order.m}, {order.n})" for order in orders[:8])
+    return named + (f" and {len(orders) - 8} more" if len(orders) > 8 else "")
 
 
-def describe_order_loss(
-    cell: Cell, wavelength_um: float, share: float | None = None
-) -> str:
+def describe_order_loss(cell: Cell, wavelength_um: float) -> str:
     """Which orders of the substrate take light at normal incidence, in a line; empty
     where none propagates.
 
     Args:
         cell, wavelength_um: as for :func:`propagating_orders`.
-        share: of the light that they and absorption take, where it is known.
     """
     orders = substrate_orders(cell, wavelength_um)
     if not orders:
         return ""
-    share_text = "" if share is None else f", with absorption {share:.1%} in the mean"
     return (
         f"\n  diffraction orders {named_orders(orders)} propagate in the substrate and "
-        f"take light{share_text}: a loss that |T| of the pillars includes"
+        "take light: a loss that |T| of the pillars includes"
     )
 
 

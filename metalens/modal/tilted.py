@@ -55,7 +55,7 @@ def solve_tilted(
     for reach in REACHES:
         shift, misfit = _fit_shift(bare, nodes, modal_amplitudes, reach)
         shifted = dataclasses.replace(problem, shift=shift)
-        truncation = solve_problem(shifted, reach, SHARE / 2 * tolerance)
+        truncation = solve_problem(shifted, reach, tolerance)
         results.append((*truncation.both[:, column, column], truncation.energy[column]))
         unexplained.append(misfit)
         if len(results) < COMPARED:

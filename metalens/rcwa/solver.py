@@ -38,7 +38,6 @@ from metalens.rcwa.sidewall import sections_with_growth, staircase_layers, width
 from metalens.rcwa.smatrix import film_modes, scatter_zero_order
 
 _ROUNDING = 1e-13
-_STRAIGHT = 1e-15  # cos or sin of an azimuth in a mirror plane, to rounding
 # The error estimate: the largest change from four (six where a gap, wall or hole is
 # narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
 _FIRST = 3  # harmonics of the first truncation where four are compared
@@ -49,7 +48,6 @@ _OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow w
 NARROWEST = 0.02  # of the pitch: widths and gaps below it no truncation resolves
 _TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
 SAFETY = 7.0
-WALL_SHARE = 0.1  # of the tolerance, for the staircases of a tilted wall
 STEPS = (4, 6, 8, 12, 16, 24)  # of the staircases from which a wall is extrapolated
 
 
@@ -266,13 +264,12 @@ def polarization_column(light: Incidence) -> int:
         return turned if light.polarization == "p" else 1 - turned
     if light.polarization in ("s", "p"):
         return ("s", "p").index(light.polarization)
-    along_x = abs(math.sin(light.azimuth_rad)) < _STRAIGHT
-    if not along_x and abs(math.cos(light.azimuth_rad)) >= _STRAIGHT:
+    if wave.kx and wave.ky:
         raise CellError(
             f"polarization = {light.polarization!r} at angle_rad = {light.angle_rad}, "
             f"azimuth_rad = {light.azimuth_rad}: ambiguous off the axes; need 's' or 'p'"
         )
-    return int(along_x == (light.polarization == "x"))
+    return int((wave.ky == 0) == (light.polarization == "x"))
 
 
 def problem_of_light(cell: Cell, size_um: float, light: Incidence) -> CellProblem:
@@ -495,7 +492,7 @@ def _refine(
         return _response(problem, 0, film, rounding, True, "a homogeneous layer: exact")
     history: list[Array] = []
     for reach in sequence.reaches:
-        truncation = solve_problem(problem, reach, WALL_SHARE * tolerance)
+        truncation = solve_problem(problem, reach, tolerance)
         history.append(truncation.both)
         error = truncation.wall_error + sequence.factor * estimate_error(
             history, reach, sequence.compared
@@ -589,7 +586,7 @@ def solve_problem(
 
     Args:
         problem: cell and light. reach: harmonics.
-        tolerance: of the wall; 0: all of ``STEPS``.
+        tolerance: of t and r, of which the wall has a tenth; 0: all of ``STEPS``.
     """
     row: list[Array] = []  # extrapolated amplitudes, of rising order
     for i, steps in enumerate(STEPS if problem.cell.sidewall_rad else (1,)):
@@ -598,7 +595,7 @@ def solve_problem(
             ratio = (steps / STEPS[i - 1 - k]) ** 2
             row.append(row[-1] + (row[-1] - coarser) / (ratio - 1))
         error = float(np.abs(row[-1] - previous[-1])[:2].max()) if previous else 0.0
-        if previous and error <= tolerance:
+        if previous and error <= tolerance / 10:
             break
     return TruncatedSolution(row[-1][:2], row[-1][2].diagonal().real, error)
 

@@ -19,13 +19,20 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 
 
-def _polygon_outline(corners: Array, angle_rad: float, grow_um: float) -> Outline:
-    """Outline of corners (n, 2) turned by an angle, every edge moved out by grow_um /
-    2.
-    """
-    return Outline(
-        (PolygonLoop(offset_corners(rotate_corners(corners, angle_rad), grow_um)),)
-    )
+class _StraightShape:
+    """A section of corners for its size, turned by an angle."""
+
+    __slots__ = ()
+    angle_rad: float
+
+    def corners_um(self, size_um: float) -> Array:
+        """(n, 2) corners of the section of this size, before the turn."""
+        raise NotImplementedError
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this size, every edge moved out by half of ``grow_um``."""
+        corners = rotate_corners(self.corners_um(size_um), self.angle_rad)
+        return Outline((PolygonLoop(offset_corners(corners, grow_um)),))
 
 
 def _box(width_um: float, depth_um: float) -> Array:
@@ -34,7 +41,7 @@ def _box(width_um: float, depth_um: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Square:
+class Square(_StraightShape):
     """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an
     opening in a film.
 
@@ -50,13 +57,13 @@ class Square:
         """In words, for reports."""
         return "square"
 
-    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this edge, wider by ``grow_um``."""
-        return _polygon_outline(_box(size_um, size_um), self.angle_rad, grow_um)
+    def corners_um(self, size_um: float) -> Array:
+        """(4, 2) corners, um."""
+        return _box(size_um, size_um)
 
 
 @dataclass(frozen=True, slots=True)
-class Rectangle:
+class Rectangle(_StraightShape):
     """Its size is the edge along x before the turn; ratio: of the other edge to it.
     hole: an opening in a film.
 
@@ -79,15 +86,13 @@ class Rectangle:
         """In words, for reports."""
         return f"rectangle 1:{self.ratio:g}"
 
-    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this size, both edges longer by ``grow_um``."""
-        return _polygon_outline(
-            _box(size_um, self.ratio * size_um), self.angle_rad, grow_um
-        )
+    def corners_um(self, size_um: float) -> Array:
+        """(4, 2) corners, um."""
+        return _box(size_um, self.ratio * size_um)
 
 
 @dataclass(frozen=True, slots=True)
-class Cross:
+class Cross(_StraightShape):
     """Two bars of equal length at right angles; its size is the length. ratio: of the
     width of a bar to its length.
 
@@ -111,21 +116,17 @@ class Cross:
         """In words, for reports."""
         return f"cross {self.ratio:g}"
 
-    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this length, every edge moved out by half of ``grow_um``."""
+    def corners_um(self, size_um: float) -> Array:
+        """(12, 2) corners of both bars, um."""
         a, b = size_um / 2, self.ratio * size_um / 2
         corner = np.array([(b, -a), (b, -b), (a, -b)])
-        return _polygon_outline(
-            np.concatenate(
-                [rotate_corners(corner, quarter * math.pi / 2) for quarter in range(4)]
-            ),
-            self.angle_rad,
-            grow_um,
+        return np.concatenate(
+            [rotate_corners(corner, quarter * math.pi / 2) for quarter in range(4)]
         )
 
 
 @dataclass(frozen=True, slots=True)
-class RegularPolygon:
+class RegularPolygon(_StraightShape):
     """``sides`` equal edges; its size is the diameter of the circle through the
     corners, the first corner at +x.
 
@@ -148,20 +149,14 @@ class RegularPolygon:
         """In words, for reports."""
         return f"polygon of {self.sides} sides"
 
-    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this circumscribed diameter, every edge moved out by half of
-        ``grow_um``.
-        """
+    def corners_um(self, size_um: float) -> Array:
+        """(sides, 2) corners on the circumscribed circle, um."""
         turn = 2 * np.pi * np.arange(self.sides) / self.sides
-        return _polygon_outline(
-            size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1),
-            self.angle_rad,
-            grow_um,
-        )
+        return size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
-class Polygon:
+class Polygon(_StraightShape):
     """The user's own corners (x, y), in units of the size of the pillar; any order of
     turning, no crossings.
 
@@ -199,11 +194,9 @@ class Polygon:
         """In words, for reports."""
         return f"own polygon of {len(self.corners)} corners"
 
-    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this size, every edge moved out by half of ``grow_um``."""
-        return _polygon_outline(
-            size_um * np.array(self.corners, float), self.angle_rad, grow_um
-        )
+    def corners_um(self, size_um: float) -> Array:
+        """(n, 2) corners of this size, um."""
+        return size_um * np.array(self.corners, float)
 
 
 def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
