@@ -58,7 +58,7 @@ def study_sections(
         replace(section, title=f"{section.title}, light along {light}")
         for light, answer in rates.items()
         for section in _of_light(
-            lens.seen("x" if light == "x" else "y"), process, plan, answer
+            lens.for_polarization("x" if light == "x" else "y"), process, plan, answer
         )
     ]
 

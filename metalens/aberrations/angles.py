@@ -43,7 +43,7 @@ class OverField:
     frequencies_per_mm: (m,) of the MTF.
     mtf: (n, 2, m) modulation along x (tangential) and y (sagittal), of all light that
         passes the lens.
-    held: (n,) share of it in the window of the PSF; the other light has no detail.
+    window_share: (n,) share of it in the window of the PSF; the other light has no detail.
     left_out: what has no number, and why; one line each.
     """
 
@@ -58,7 +58,7 @@ class OverField:
     illumination: Array
     frequencies_per_mm: Array
     mtf: Array
-    held: Array
+    window_share: Array
     left_out: tuple[str, ...]
 
 
@@ -176,7 +176,7 @@ def _aberrations_at(
     angle, chief = (math.radians(angle_deg), 0.0), rays[1]
     unknown = np.full(2, math.nan)
     passed = float(passed_um2(lens, angle, (depth_um,))[0])
-    transfer, held = _transfer(lens, angle, depth_um, per_um, passed)
+    transfer, window_share = _transfer(lens, angle, depth_um, per_um, passed)
     close = unknown
     illumination = math.nan
     if chief is not None:
@@ -191,7 +191,7 @@ def _aberrations_at(
         "illumination": illumination,
         "vignetting": vignetted_share(lens, angle, depth_um),
         "mtf": transfer,
-        "held": min(held, 1.0),
+        "window_share": min(window_share, 1.0),
     }
 
 
@@ -221,12 +221,12 @@ def _transfer(
             if np.isinf(last).any():
                 raise
             break
-        held = float(stack.energy_um2[0, 0]) / passed_um2
-        transfer = held * mtf(stack, frequencies_per_um=per_um)[0, 0]
+        window_share = float(stack.energy_um2[0, 0]) / passed_um2
+        transfer = window_share * mtf(stack, frequencies_per_um=per_um)[0, 0]
         if np.abs(transfer - last).max() < EXACT:
             break
         last, window_um = transfer, 2 * window_um
-    return transfer, held
+    return transfer, window_share
 
 
 def _distortion(origin: ChiefRay | None, chief: ChiefRay | None) -> float:

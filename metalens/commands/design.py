@@ -315,7 +315,9 @@ def _design_two_sizes(settings: DesignSettings, options: Options) -> _Outcome:
     for i, light in enumerate(lights):
         quality = (metrics.x, metrics.y)[i]
         hyperbolic = profiles[i] == "hyperbolic"
-        own, failure = _judge(designed.seen(light), quality, options, wanted=hyperbolic)
+        own, failure = _judge(
+            designed.for_polarization(light), quality, options, wanted=hyperbolic
+        )
         failures.append(failure)
         del own["turns"]  # of a single diameter
         values[f"along_{light}"] = own | {

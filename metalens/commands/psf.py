@@ -649,7 +649,7 @@ def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens
     ):
         return device
     if device.pairs is not None:
-        return device.seen(settings.light)
+        return device.for_polarization(settings.light)
     response = (
         f"know {device.one_light} alone" if device.one_light else "treat x and y alike"
     )
@@ -685,7 +685,7 @@ def _of_design(
 
     if device.pairs is None or settings.light != "both":
         return stack_of(device)
-    x, y = device.seen("x"), device.seen("y")
+    x, y = device.for_polarization("x"), device.for_polarization("y")
     if (x.sensor_distance_um, x.source_distance_um) != (
         y.sensor_distance_um,
         y.source_distance_um,

@@ -320,7 +320,7 @@ def assign_polarization_multiplexed(
         aperture_um, limits, profile, provenance: see :func:`make`.
 
     Returns:
-        The lens (of light along x; ``lens.seen("y")`` is that of light along y), and
+        The lens (of light along x; ``lens.for_polarization("y")`` is that of light along y), and
         its quality for both.
 
     Raises:

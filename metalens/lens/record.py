@@ -319,7 +319,7 @@ class Lens:
         that leaves with the other hand. Empty: any light.
     pairs: table of pillars of two sizes in place of the proxy; None for one size.
     light: polarisation, "x" or "y", of phase, transmission and distances where pillars
-        have two sizes (:meth:`seen`).
+        have two sizes (:meth:`for_polarization`).
     neighbours: solved rows of its own non-identical pillars
         (:func:`metalens.design.neighbours`), whose factor PSFs and images then include;
         None where none was solved.
@@ -388,7 +388,7 @@ class Lens:
             else "light along x"
         )
 
-    def seen(self, light: Literal["x", "y"]) -> "Lens":
+    def for_polarization(self, light: Literal["x", "y"]) -> "Lens":
         """The lens for light polarised along x or y, with the focus distances of that
         light.
 

@@ -87,7 +87,7 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
     """Basis and sums leave 2e-3, splines over steps of 4 nm and answers held at the
     designed sizes less.
     """
-    lens = two_sizes().seen(light)
+    lens = two_sizes().for_polarization(light)
     away = {"x": 150.0, "y": 170.0}[light]
     where = focus.FocusWindow(
         np.linspace(-2, 3, 3),

@@ -66,7 +66,7 @@ def test_transfer_is_that_of_the_squared_field(case, angle, sensor_um):
         lens, (angle,), depth_um=CASES[case][1], frequencies=tuple(1e3 * PER_UM)
     )
     assert found.mtf[0] == pytest.approx(want, abs=3e-3)
-    assert 0.97 < found.held[0] <= 1.0
+    assert 0.97 < found.window_share[0] <= 1.0
 
 
 def test_an_even_round_pupil_has_the_transfer_function_of_the_books():

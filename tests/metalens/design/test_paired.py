@@ -74,7 +74,7 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
         ("x", split.x, NEAR, LEVELS[0]),
         ("y", split.y, FAR, LEVELS[1]),
     ):
-        seen = made_lens.seen(light)
+        seen = made_lens.for_polarization(light)
         assert seen.sensor_distance_um == focus.sensor_distance_um
         found = design.check_focus(seen)
         assert found.passed
@@ -82,7 +82,7 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
         assert quality.wavefront_efficiency == pytest.approx(level**2, rel=3e-3)
         assert quality.rms_phase_error_rad < 0.05
     wrong = dataclasses.replace(
-        made_lens.seen("y"), sensor_distance_um=NEAR.sensor_distance_um
+        made_lens.for_polarization("y"), sensor_distance_um=NEAR.sensor_distance_um
     )
     assert (
         design.check_focus(wrong, axial=False).figures.strehl < 0.7
@@ -142,16 +142,19 @@ def test_bands_of_long_bars_are_not_used(two):
 def test_one_phase_for_both_keeps_any_polarisation():
     made_lens, _ = made(both=False)
     phases = [
-        made_lens.seen(light).phase_rad()[made_lens.diameters.diameter_um > 0]
+        made_lens.for_polarization(light).phase_rad()[
+            made_lens.diameters.diameter_um > 0
+        ]
         for light in ("x", "y")
     ]
     apart = np.angle(np.exp(1j * (phases[0] - phases[1])))
     assert np.abs(apart).max() < 0.25  # two half steps, and the band that is left out
     assert np.sqrt((apart**2).mean()) < 0.08
-    assert design.check_focus(made_lens.seen("y")).passed
+    assert design.check_focus(made_lens.for_polarization("y")).passed
     one, other = (
         psf.from_lens(
-            made_lens.seen(v), psf.View((math.inf,), window_um=8.0, samples=16)
+            made_lens.for_polarization(v),
+            psf.View((math.inf,), window_um=8.0, samples=16),
         )
         for v in "xy"
     )
@@ -196,13 +199,14 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
     again = lens.load(tmp_path / "lens.h5")
     for light in ("x", "y"):
         assert np.array_equal(
-            again.seen(light).phase_rad(), made_lens.seen(light).phase_rad()
+            again.for_polarization(light).phase_rad(),
+            made_lens.for_polarization(light).phase_rad(),
         )
         assert (
-            again.seen(light).sensor_distance_um
-            == made_lens.seen(light).sensor_distance_um
+            again.for_polarization(light).sensor_distance_um
+            == made_lens.for_polarization(light).sensor_distance_um
         )
-    assert again.seen("y").seen("x").sensor_distance_um == 37.0
+    assert again.for_polarization("y").for_polarization("x").sensor_distance_um == 37.0
     with pytest.raises(LensError, match="of two sizes"):
         lens.load_plain(tmp_path / "lens.h5")
     with pytest.raises(DomainError, match="no proxy of one diameter"):

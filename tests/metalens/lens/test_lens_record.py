@@ -65,15 +65,15 @@ def test_pillars_of_two_sizes_have_phase_and_level_of_their_entries(
 
 def test_a_lens_seen_in_its_other_light_focuses_where_that_does_and_comes_back():
     lens = two_sizes("x")
-    assert lens.seen("x") is lens
-    other = lens.seen("y")
+    assert lens.for_polarization("x") is lens
+    other = lens.for_polarization("y")
     assert (other.light, other.sensor_distance_um, other.source_distance_um) == (
         "y",
         210.0,
         900.0,
     )
     assert np.array_equal(other.transmission(), two_sizes("y").transmission())
-    back = other.seen("x")
+    back = other.for_polarization("x")
     assert (
         back.sensor_distance_um,
         back.source_distance_um,

@@ -233,7 +233,7 @@ def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(
     )
     angle, depth = (0.11, -0.06), 1400.0
     found = from_lens(
-        lens.seen(light), View((depth,), (angle,), 41.0, 41), tolerance=1e-4
+        lens.for_polarization(light), View((depth,), (angle,), 41.0, 41), tolerance=1e-4
     )
     wanted = 2 * np.pi / steps * sizes["xy".index(light)]
     want = _lit(angle, depth, hole, there.astype(float), angle, wanted)
