@@ -4,7 +4,6 @@ diameter.
 
 import functools
 import importlib
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -94,7 +93,7 @@ def solver_at_common_discretization(
     levels = [functools.cache(solve) for solve in levels]
     probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
     for index, solve in enumerate(levels[:-1]):
-        if _meets(solve, probes, allowed=1 if modal else 0):
+        if sum(not solve(probe).converged for probe in probes) <= modal:
             return _first_converged(levels[index : index + (MESHES if modal else 1)])
     return levels[-1]
 
@@ -109,16 +108,6 @@ def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> 
         tolerance: error of t that is asked for.
     """
     return not cell.round and bool(errors[PROBES].max() > tolerance)
-
-
-def _meets(
-    solver: Callable[[float], Response], probes: list[float], allowed: int
-) -> bool:
-    """Whether at most ``allowed`` probe diameters miss the tolerance; stops solving as
-    soon as this is known.
-    """
-    misses = (probe for probe in probes if not solver(probe).converged)
-    return next(itertools.islice(misses, allowed, None), None) is None
 
 
 def _first_converged(

@@ -79,11 +79,6 @@ class CellStudy:
                 f"{self.min_gap_um} um"
             )
 
-    @property
-    def material(self) -> Material:
-        """Material of the pillars."""
-        return self.pillar if self.cell is None else self.cell.pillar
-
     def at(self, pitch_um: float, height_um: float) -> Cell:
         """One cell of the study.
 
@@ -92,8 +87,8 @@ class CellStudy:
         Raises:
             CellError: a height that the films of other materials fill.
         """
-        base = (self.cell or Cell(pitch_um)).at_height(height_um)
-        return replace(base, pitch_um=pitch_um, pillar=self.material)
+        base = self.cell or Cell(pitch_um, pillar=self.pillar)
+        return replace(base.at_height(height_um), pitch_um=pitch_um)
 
 
 @dataclass(frozen=True, slots=True)
