@@ -350,12 +350,10 @@ def _design_one_size(settings: DesignSettings, options: Options) -> _Outcome:
     settings = settings.at(proxy.wavelengths_um)
     proxy.at(settings.focus.wavelength_um)  # refused here, not after the search
     settings = _fill_limits(settings, options, cell, inputs)
-    if (
-        settings.profile == "map"
-        and settings.map
-        and (folder / settings.map.file).is_file()
-    ):
-        inputs[settings.map.file.name] = store.sha256(folder / settings.map.file)
+    if settings.profile == "map" and settings.map:
+        file = Path(folder / settings.map.file)
+        if file.is_file():
+            inputs[file.name] = store.sha256(file)
     phase, focus, values = _find_phase(settings, options)
     common = _common(settings, inputs)
     rotated = pillars.turned is not None
