@@ -7,6 +7,6 @@ from .formats.gdsii_write import write_gdsii as write_gdsii
 from .formats.oasis_read import read_oasis as read_oasis
 from .formats.oasis_write import write_oasis as write_oasis
 from .mask.build import plan as plan
-from .pec.correct import correct as correct
+from .pec.shapes import correct as correct
 from .process.process import Process as Process
 from .process.process import load_process as load_process

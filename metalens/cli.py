@@ -71,6 +71,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "layout.commands.check",
         "MASK.gds|oas + PROCESS.toml -> design rules on a mask made anywhere",
     ),
+    "dose": (
+        "layout.commands.dose",
+        "MASK.gds|oas + PROCESS.toml -> proximity-corrected doses for any polygons",
+    ),
     "capture": (
         "characterize.commands.capture_options",
         "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",

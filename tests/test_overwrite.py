@@ -34,6 +34,7 @@ CASES = {
     "budget": ("lens.h5 -o out.h5", "out.h5"),
     "demo": ("out", "out"),
     "check": ("mask.gds -o out.h5", "out.h5"),
+    "dose": ("mask.gds --process scene.toml -o out", "out"),
     "measure": ("captures -o out", "out"),
     "view": ("lens.h5 -o out.h5", "out.h5"),
 }

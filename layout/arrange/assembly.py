@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from layout.arrange.parts import UNIT_NM, DieComponent, moved_cell
-from layout.arrange.record import Placement
+from layout.arrange.record import PartInstances
 from layout.formats import job_files
 from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
 from layout.mask.fields import FieldPlan
@@ -27,14 +27,14 @@ class PartPlacement:
     """A part and where it stands on the die."""
 
     part: DieComponent
-    at: tuple[Placement, ...]
+    at: tuple[PartInstances, ...]
 
     def copies(self, top: str) -> tuple[CellReference, ...]:
         """As arrays of its cell ``top``, in database units."""
         return tuple(_copies(top, at) for at in self.at)
 
 
-def _copies(child: str, at: Placement) -> CellReference:
+def _copies(child: str, at: PartInstances) -> CellReference:
     """An array of a cell at a place of the die, in database units."""
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
     step = (

@@ -13,7 +13,7 @@ MOST_DIES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class PartInstances:
     """Where a lens or cell is placed, once or as an array.
 
     x_um, y_um: of its origin (the axis of a lens); of the first one of an array.
@@ -64,7 +64,7 @@ class LensPart:
     file: Path
     name: str
     furnished: bool | None = None
-    at: tuple[Placement, ...] = (Placement(),)
+    at: tuple[PartInstances, ...] = (PartInstances(),)
 
     def __post_init__(self) -> None:
         _named(self.name)
@@ -87,7 +87,7 @@ class CellPart:
     cell: str = ""
     relative_dose: float = field(default=1.0, metadata={"above": 0})
     checked: bool = True
-    at: tuple[Placement, ...] = (Placement(),)
+    at: tuple[PartInstances, ...] = (PartInstances(),)
 
     def __post_init__(self) -> None:
         _named(self.name)

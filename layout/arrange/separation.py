@@ -10,7 +10,7 @@ import numpy as np
 
 from layout.arrange.assembly import PER_UM, PartPlacement
 from layout.arrange.parts import APERTURE, DieComponent, box_around
-from layout.drc.report import Violation
+from layout.drc.report import RuleViolation
 from layout.formats.library import CellReference, Orientation
 from layout.pec import psf
 from layout.process.process import Process
@@ -75,7 +75,7 @@ def reach_um(process: Process) -> float:
 
 def check_separation(
     placed: Sequence[PartPlacement], process: Process
-) -> list[Violation]:
+) -> list[RuleViolation]:
     """Pairs of parts closer than the gap rule, or in reach of scattered electrons.
 
     Rectilinear shapes are taken as they are. A lattice is taken as boxes of tiles (a
@@ -96,7 +96,7 @@ def check_separation(
     gap = process.rules.minimum_gap_nm * PER_UM / 1e3
     reach = reach_um(process) * PER_UM
     boxes = np.array([first.box() for first in standing])
-    violations: list[Violation] = []
+    violations: list[RuleViolation] = []
     for i, first in enumerate(standing):
         for j in np.flatnonzero(
             box_distance(boxes[i + 1 :], boxes[i]) < max(gap, reach)
@@ -152,7 +152,7 @@ def _between(
     gap: float,
     scattered: float,
     process: Process,
-) -> Iterator[Violation]:
+) -> Iterator[RuleViolation]:
     """Violations between two parts: the closest boxes of each common exposure.
 
     Args:
@@ -186,6 +186,6 @@ def _between(
         else:
             limit_nm = limit_units * 1e3 / PER_UM
             text = f"{part_1.text} to {part_2.text}: backscatter of one that the doses of the other do not know of"
-        yield Violation(
+        yield RuleViolation(
             "clearance", (left, bottom, right, top), distance_nm, limit_nm, text
         )

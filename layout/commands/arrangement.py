@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import assembly, parts, separation, wafer
-from layout.arrange.record import CellPart, DieFloorplan, Placement, WaferSettings
+from layout.arrange.record import CellPart, DieFloorplan, PartInstances, WaferSettings
 from layout.commands import make, page
 from layout.commands.job import FloorplanWork, Options, StageTimes
 from layout.drc.klayout import write_lyp
@@ -168,7 +168,7 @@ def _parts(
     placed += files
     if record.die is not None:
         around = _frame_part(work, solved_plans[-1][0])
-        placed.append(assembly.PartPlacement(around, (Placement(),)))
+        placed.append(assembly.PartPlacement(around, (PartInstances(),)))
     return placed, mark
 
 
@@ -298,7 +298,9 @@ def _stepped(
     box_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
     steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=assembly.PER_UM)
-    at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
+    at = tuple(
+        PartInstances(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks
+    )
     marks = None if mark is None else assembly.PartPlacement(mark, at)
     return assembly.wafer_cell(work.record.name, die, steps, marks)
 

@@ -11,7 +11,7 @@ import tyro
 
 from layout.arrange import assembly, wafer
 from layout.arrange.record import DieFloorplan
-from layout.drc.report import DrcReport, Violation
+from layout.drc.report import DrcReport, RuleViolation
 from layout.formats import compare, job_files
 from layout.formats.dxf import DxfWindow
 from layout.mask import build
@@ -236,7 +236,7 @@ class FloorplanWork:
     written: dict[str, int] = field(default_factory=dict)
     dies: wafer.WaferDies | None = None
     placed: list[assembly.PartPlacement] = field(default_factory=list)
-    near: list[Violation] = field(default_factory=list)
+    near: list[RuleViolation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
     splits: dict[str, FieldPlan] = field(default_factory=dict)
     areas_um2: dict[LayerNumber, float] = field(default_factory=dict)

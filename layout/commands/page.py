@@ -28,22 +28,16 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
     """
     die_png = pictures.plot_die(job.plan, job.drc)
     (target / "die.png").write_bytes(die_png)
-    die_caption = "The whole die. Colour: share of the area that pillars cover."
     sections = [
         Section(
             "Die",
-            "Two lithography steps: the pillar layer (with marks, label, dose-test "
-            "array and witness cells) and the aperture layer, which draws the openings "
-            "of the opaque film. The F stands in the upper left corner. The mask is "
-            "seen from the pillar side, against the light, in the coordinates of the "
-            "lens: +y is up here, so the first row of the diameter map is the lowest. "
-            "metalens view shows every polygon.",
-            [Figure(die_png, die_caption, wide=True)],
+            "Seen from the pillar side, in the coordinates of the lens: +y is up, so the "
+            "first row of the diameter map is the lowest. The F stands in the upper left "
+            "corner. metalens view shows every polygon.",
+            [Figure(die_png, "The whole die.", wide=True)],
         ),
         _rules(job.drc),
-        _classes(job),
         *_exposure(job),
-        _write_fields(job),
     ]
     if job.options.study:
         from layout.study import page as study_page
@@ -58,47 +52,24 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
         for name, outcome in job.compared.items()
     }
     sections.append(_files(job.written, read_back, job.seconds))
+    drc = job.drc
+    pillars = int(job.plan.lattices[0].counts(len(job.plan.classes))[1:].sum())
+    violations = sum(drc.counts.values())
     report.write_report(
         target / "report.html",
         f"Mask {job.plan.name}",
         sections,
-        lead=_lead(job),
-        key_figures=_key_figures(job),
+        lead=f"{job.verdict} A {job.source.profile} lens for "
+        f"{job.source.wavelength_um / nm:.0f} nm, {2 * job.made.radius_um / 1e3:.4g} mm "
+        f"across, as {pillars:,} pillars ({drc.shapes:,} on the die) in "
+        f"{len(job.plan.classes)} cells; process “{job.process.name}”.",
+        key_figures=[
+            KeyFigure("pillars", f"{drc.shapes:,}"),
+            KeyFigure("smallest gap", format_size(drc.minimum_space_nm)),
+            KeyFigure("thinnest pillar", format_size(drc.minimum_width_nm)),
+            KeyFigure("violations", f"{violations:,}", violations == 0),
+        ],
     )
-
-
-def _lead(job: LayoutJob) -> str:
-    """First paragraph of the report: verdict, lens, and number of pillars."""
-    source = job.source
-    classes = job.plan.classes
-    pillars = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
-    die = ""
-    if job.drc.shapes != pillars:
-        die = f" ({job.drc.shapes:,} on the die, with its test arrays)"
-    return (
-        f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
-        f"{2 * job.made.radius_um / 1e3:.4g} mm across, as {pillars:,} pillars{die} in "
-        f"{len(classes)} cells; process “{job.process.name}”."
-    )
-
-
-def _key_figures(job: LayoutJob) -> list[KeyFigure]:
-    """Key figures of a mask: pillars, smallest sizes, violations, files."""
-    drc = job.drc
-    counts = drc.counts
-    as_planned = all(outcome.ok for outcome in job.compared.values())
-    violations = sum(counts.values())
-    too_close = counts["space"] + counts["overlap"]
-    gap, width = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
-    return [
-        KeyFigure("pillars", f"{drc.shapes:,}"),
-        KeyFigure("smallest gap", gap, too_close == 0),
-        KeyFigure("thinnest pillar", width, counts["width"] == 0),
-        KeyFigure("violations", f"{violations:,}", violations == 0),
-        KeyFigure(
-            "files read back", "as planned" if as_planned else "DIFFERENT", as_planned
-        ),
-    ]
 
 
 def _rules(drc_report: DrcReport) -> Section:
@@ -117,39 +88,14 @@ def _rules(drc_report: DrcReport) -> Section:
     if drc_report.worst:
         keys = ("rule", "layer", "cell", "count", "worst", "limit")
         rows = [[entry[key] for key in keys] for entry in drc_report.worst[:_LISTED]]
-        items.append(Table(keys, rows, "Violations by rule, layer and cell."))
-        places = [
-            [v.rule, "({:.0f}, {:.0f})".format(*v.centre), v.value, v.limit, v.text]
-            for v in drc_report.violations[:_LISTED]
-        ]
-        head = ("rule", "(x, y) / nm", "measured", "needed", "where")
-        text = "The first violations; mask.lyrdb marks up to 500 of each rule."
-        items.append(Table(head, places, text))
-    return Section("Design rules", drc_report.summary + ".", items)
-
-
-def _classes(job: LayoutJob) -> Section:
-    """Section on the drawn pillars: shape, sizes and steps."""
-    rules = job.process.rules
-    classes = job.plan.classes
-    shape = job.source.cell.shape
-    if classes[0].round:
-        kind, corners = "disc", "as a polygon of its area"
-    else:
-        two = job.source.pairs is not None
-        kind = f"{shape.kind} of its own width and length" if two else shape.name
-        corners = (
-            "with its corners on the grid; rounding by the etch is not made up for"
+        items.append(
+            Table(
+                keys,
+                rows,
+                "Violations by rule, layer and cell; mask.lyrdb marks their places.",
+            )
         )
-    turned = job.source.diameters.angle_rad is not None
-    turns = f" and turns in steps of {rules.angle_step_deg:g} degrees" * turned
-    areas = [pillar.twice_area / 2 * job.plan.unit_nm**2 for pillar in classes]
-    return Section(
-        "Pillars",
-        f"Each is a {kind}, drawn in sizes in steps of {rules.diameter_step_nm} nm"
-        f"{turns} after the bias was taken off, {corners}: {len(classes)} cells of "
-        f"{min(areas):,.0f} to {max(areas):,.0f} nm².",
-    )
+    return Section("Design rules", drc_report.summary + ".", items)
 
 
 def _exposure(job: LayoutJob) -> list[Section]:
@@ -214,18 +160,6 @@ def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
         f" The point exposure is the table {exposure.csv.name}, as "
         f"{len(point.weights)} Gaussians: the energy within any radius differs by up "
         f"to {100 * point.fit_error:.2g} % of the whole from that of the table."
-    )
-
-
-def _write_fields(job: LayoutJob) -> Section:
-    """Section on write fields."""
-    split = job.fields
-    return Section(
-        "Write fields",
-        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
-        f"by {split.size_um[1]:.1f} µm at most; no border cuts a pillar: they keep "
-        f"{split.clearance_um / nm:.0f} nm. fields.csv lists them in the order of writing; "
-        "job.txt is the sheet for the operator, with doses and charge.",
     )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from layout.arrange import assembly, separation
 from layout.arrange.record import WaferSettings
 from layout.arrange.wafer import WaferDies
-from layout.drc.report import DrcReport, Violation
-from layout.mask.plan import MaskPlan, PillarArray
+from layout.drc.report import DrcReport, RuleViolation
+from layout.mask.plan import MaskPlan
 from layout.shapes import rectilinear
 from layout.verify.report import ExposureReport
 from metalens.core import report
@@ -17,54 +17,40 @@ from metalens.core.arrays import Array
 
 _FILLED = ("marks", "label")
 _COLOURS = ("#d1495b", "#355070", "#1f6feb", "#888", "#2a9d8f")
-_POINTS = 700  # of a picture, each way
 
 
 def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
-    """Everything on the die as PNG; lattices as the share of the area that pillars
-    cover, violations as crosses.
+    """Everything on the die as PNG: figures by layer number, lattices as boxes.
 
     Args:
-        plan: of the die.
-        drc_report: its design-rule check.
+        plan: of the mask.
+        drc_report: whose violations are marked by crosses.
     """
+    from matplotlib.collections import PolyCollection
+
     figure, axes = report.make_figure(size=(7.2, 6.6))
-    axes.grid(False)
     scale = plan.unit_nm * 1e-3
-    images = [_coverage(plan, lattice) for lattice in plan.lattices]
-    shares = np.concatenate([image[np.isfinite(image)] for image in images])
-    picture, reach = None, 0.0
-    for lattice, image in zip(plan.lattices, images, strict=True):
-        left = lattice.x0 - lattice.pitch / 2
-        top = lattice.y0 + lattice.down / 2
-        right = left + lattice.columns * lattice.pitch
-        bottom = top - lattice.rows * lattice.down
-        extent = np.array([left, right, bottom, top]) * scale
-        reach = max(reach, float(np.abs(extent).max()))
-        picture = axes.imshow(
-            image,
-            extent=extent.tolist(),
-            vmin=shares.min(initial=50),
-            vmax=shares.max(initial=50),
-            cmap="viridis",
-            interpolation="nearest",
-        )
-    reach = max(reach, _draw_figures(axes, plan, scale))
+    drawn: dict[str, list[Array]] = {
+        "pillars": [
+            rectilinear.box_corners(np.array(lattice.box)) for lattice in plan.lattices
+        ]
+    }
+    for cell in plan.figures:
+        for layer, polygons in sorted(cell.polygons.items()):
+            name = plan.layer_names.get(layer, "layer").split("_dose_")[0]
+            drawn.setdefault(f"{name} {layer[0]}", []).extend(polygons)
+    for n, (name, shapes) in enumerate(drawn.items()):
+        colour = _COLOURS[n % len(_COLOURS)]
+        fill = colour if name.startswith(_FILLED) else "none"
+        style: dict[str, Any] = {"facecolors": fill, "edgecolors": colour, "lw": 0.8}
+        axes.add_collection(PolyCollection([p * scale for p in shapes], **style))
+        axes.plot([], [], color=colour, label=name)
     if drc_report.violations:
-        x, y = (
-            np.array([violation.centre for violation in drc_report.violations]).T
-            * scale
-        )
-        axes.plot(x, y, "x", color="red", ms=4, mew=1, label="violations")
-    if axes.get_legend_handles_labels()[0]:
-        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.09)}
-        axes.legend(**place, ncols=6, frameon=False, fontsize=8)
-    span = (-1.03 * reach, 1.03 * reach)
-    axes.set(xlim=span, ylim=span, aspect="equal", xlabel="x / µm", ylabel="y / µm")
-    if picture is not None:
-        figure.colorbar(
-            picture, ax=axes, label="area that pillars cover / %", shrink=0.8
-        )
+        places = np.array([violation.centre for violation in drc_report.violations])
+        axes.plot(*places.T * scale, "x", color="red", ms=4, mew=1, label="violations")
+    axes.autoscale_view()
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09), ncols=6, fontsize=8)
+    axes.set(aspect="equal", xlabel="x / µm", ylabel="y / µm")
     return report.figure_png(figure)
 
 
@@ -89,56 +75,11 @@ def plot_verification(verification: ExposureReport) -> bytes:
     return report.figure_png(figure)
 
 
-def _coverage(plan: MaskPlan, lattice: PillarArray) -> Array:
-    """(rows, columns) share of the area that pillars cover, per cent, averaged over
-    squares of sites; NaN where there is none. Every n-th pillar would show moiré rings.
-    """
-    step = max(1, -(-max(lattice.rows, lattice.columns) // _POINTS))
-    areas = np.array([0.0, *(pillar.twice_area / 2 for pillar in plan.classes)])
-    percent_of_class = 100 * areas / (lattice.pitch * lattice.down)
-    edges = np.arange(0, lattice.columns, step)
-    rows = []
-    for _, block in lattice.blocks(step):
-        sites = len(block) * np.diff(np.r_[edges, lattice.columns])
-        rows.append(np.add.reduceat(percent_of_class[block].sum(0), edges) / sites)
-    covered = np.array(rows)
-    return np.where(covered > 0, covered, np.nan)
-
-
-def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
-    """Draw figures, all doses of a layer number together; how far they reach, um."""
-    from matplotlib.collections import PolyCollection
-
-    drawn: dict[int, list[Array]] = {}
-    names: dict[int, str] = {}
-    for figure in plan.figures:
-        for layer, polygons in sorted(figure.polygons.items()):
-            drawn.setdefault(layer[0], []).extend(
-                polygon * scale for polygon in polygons
-            )
-            names.setdefault(layer[0], plan.layer_names.get(layer, "layer"))
-    for n, (number, shapes) in enumerate(sorted(drawn.items())):
-        name = names[number].split("_dose_")[0]
-        colour = _COLOURS[n % len(_COLOURS)]
-        fill, edge = (colour, "none") if name in _FILLED else ("none", colour)
-        style: dict[str, Any] = {
-            "facecolors": fill,
-            "edgecolors": edge,
-            "linewidths": 0.8,
-        }
-        axes.add_collection(PolyCollection(shapes, **style))
-        axes.plot([], [], color=colour, label=f"{name} {number}")
-    reaches = [
-        float(np.abs(polygon).max()) for shapes in drawn.values() for polygon in shapes
-    ]
-    return max(reaches, default=0.0)
-
-
 # arrangements
 
 
 def plot_floorplan(
-    placed: Sequence[assembly.PartPlacement], near: Sequence[Violation]
+    placed: Sequence[assembly.PartPlacement], near: Sequence[RuleViolation]
 ) -> bytes:
     """Boxes of the parts of a die by exposure as PNG; crosses where they are too near.
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from xml.etree import ElementTree
 
-from layout.drc.report import DrcReport, Violation
+from layout.drc.report import DrcReport, RuleViolation
 from layout.formats.library import MaskLibrary
 from layout.mask.plan import MaskPlan
 from metalens.core import store
@@ -84,7 +84,7 @@ def write_lyrdb(report: DrcReport, top_cell: str, path: str | Path) -> None:
 
 
 def _add_marker(
-    items: ElementTree.Element, violation: Violation, top_cell: str, unit_nm: float
+    items: ElementTree.Element, violation: RuleViolation, top_cell: str, unit_nm: float
 ) -> None:
     """Append the marker of a violation: its category, box in um and text.
 

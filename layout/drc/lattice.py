@@ -17,7 +17,7 @@ from layout.drc.geometry import (
     measure_polygon,
     measure_separation,
 )
-from layout.drc.report import MAX_LISTED, DrcReport, Violation
+from layout.drc.report import MAX_LISTED, DrcReport, RuleViolation
 from layout.mask import tone
 from layout.mask.plan import (
     BLOCK_SITES,
@@ -293,7 +293,7 @@ class _LatticeCheck:
         vectors: Array,
         marked: Array,
         values: dict[tuple[int, int, int], float],
-    ) -> Iterator[Violation]:
+    ) -> Iterator[RuleViolation]:
         """Violations of the marked kinds of pairs, with a box around both pillars.
 
         Args:
@@ -322,7 +322,7 @@ class _LatticeCheck:
                     moved.append(shapes[1].outline + np.add((x, y), step))
                     names = " to ".join(shape.name for shape in shapes)
                     first, second = outline_of_class[list(numbers)].tolist()
-                    yield Violation(
+                    yield RuleViolation(
                         rule,
                         contour_box(moved),
                         values[vector, first, second],
@@ -545,7 +545,7 @@ def _check_density(
         y = lattice.y0 - row * tile_rows * lattice.down
         box = (x, y - height, x + width, y)
         violations.append(
-            Violation(
+            RuleViolation(
                 "density",
                 box,
                 float(density[row, column]),

@@ -22,7 +22,7 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.lattice import check_plan
-from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
+from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, RuleViolation
 from layout.formats.library import QUARTERS, MaskLibrary, Orientation, group_equal
 from layout.formats.reading import read_mask
 from layout.mask.plan import MaskPlan
@@ -475,7 +475,7 @@ class _LayerCheck:
                 worst=tally.worst,
             )
         copies = f"; in each of {len(places):,} instances" if len(places) > 1 else ""
-        violations_of_rule: dict[str, list[Violation]] = {}
+        violations_of_rule: dict[str, list[RuleViolation]] = {}
         for violation in cell_report.violations:
             violations_of_rule.setdefault(
                 names.get(violation.rule, violation.rule), []
@@ -567,7 +567,7 @@ class _LayerCheck:
 
     def _space_violations(
         self, placed: _Placements, pairs: Array, values: Array, limit: float
-    ) -> Iterator[Violation]:
+    ) -> Iterator[RuleViolation]:
         """Boxes around pairs of polygons."""
         for pair, value in zip(pairs, values.tolist(), strict=True):
             elements = [
@@ -578,7 +578,7 @@ class _LayerCheck:
                 for element, xy in zip(elements, placed.xy[pair], strict=True)
             ]
             text = f"{elements[0].cell} to {elements[1].cell}, layer {self.layer}"
-            yield Violation("space", contour_box(moved), value, limit, text)
+            yield RuleViolation("space", contour_box(moved), value, limit, text)
 
     def _merge_touching(
         self, cell: str, placed: _Placements, pairs: Array
@@ -705,8 +705,12 @@ def _merged_contours(polygons: Sequence[Array]) -> tuple[Array, ...]:
 
 
 def _instance_violations(
-    rule: str, violations: list[Violation], turn: Orientation, places: Array, text: str
-) -> Iterator[Violation]:
+    rule: str,
+    violations: list[RuleViolation],
+    turn: Orientation,
+    places: Array,
+    text: str,
+) -> Iterator[RuleViolation]:
     """Violations of a cell where its instances draw them."""
     for (x, y), violation in product(places[:MAX_LISTED].tolist(), violations):
         left, bottom, right, top = _turned_box(violation.box, turn)

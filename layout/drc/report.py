@@ -26,7 +26,7 @@ _UNITS = {"corner": " degrees", "density": ""}
 
 
 @dataclass(frozen=True, slots=True)
-class Violation:
+class RuleViolation:
     """One place where a rule is violated.
 
     rule: one of ``RULES``.
@@ -92,7 +92,7 @@ class DrcReport:
     shapes: int = 0
     layers: dict[LayerNumber, LayerCoverage] | None = None
     tallies: dict[tuple[str, int, str], ViolationTally] = field(default_factory=dict)
-    violations: list[Violation] = field(default_factory=list)
+    violations: list[RuleViolation] = field(default_factory=list)
     minimum_width_nm: float = math.inf
     minimum_space_nm: float = math.inf
     minimum_foot_space_nm: float = math.inf
@@ -180,7 +180,7 @@ class DrcReport:
         layer: int,
         cell: str,
         worst: float,
-        examples: Iterable[Violation] = (),
+        examples: Iterable[RuleViolation] = (),
     ) -> None:
         """Count violations, and list the first of them.
 
@@ -223,10 +223,12 @@ class DrcReport:
             text: the cells concerned, where these are more than ``cell``.
         """
         limit = self.limits[rule]
-        examples = (Violation(rule, box, value, limit, text or cell) for box in boxes)
+        examples = (
+            RuleViolation(rule, box, value, limit, text or cell) for box in boxes
+        )
         self.add(rule, count, layer=layer, cell=cell, worst=value, examples=examples)
 
-    def list_violations(self, rule: str, violations: Iterable[Violation]) -> None:
+    def list_violations(self, rule: str, violations: Iterable[RuleViolation]) -> None:
         """List violations of a rule as far as there is room, and generate no more.
 
         Args:

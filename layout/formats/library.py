@@ -633,3 +633,12 @@ def _turned(outlines: Array, turn: Orientation) -> Array:
     ).sum(1)
     turned[area < 0] = turned[area < 0, ::-1]
     return turned
+
+
+def flatten_polygons(library: MaskLibrary) -> Iterator[tuple[LayerNumber, Array]]:
+    """Layer and (n, 2) corners of every polygon below the top cells of a library."""
+    for top in library.tops:
+        for stack in flatten_stacks(library, top):
+            for place in zip(stack.x.tolist(), stack.y.tolist(), strict=True):
+                for outline in stack.outlines:
+                    yield stack.layer, outline + np.array(place)

@@ -29,28 +29,6 @@ _SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
 NONE = 255  # dose class of a site without pillar
 
 
-def correct(mask: MaskPlan, exposure: ExposureSettings) -> MaskPlan:
-    """Proximity effect correction: a plan with a dose for every shape.
-
-    Args:
-        mask: of a die, every dose 1.
-        exposure: point exposure, tolerance and number of doses.
-
-    Raises:
-        ProcessError: no plan; as :func:`correct_plans`.
-
-    Accuracy:
-        Edges of all shapes are at dose to size within the tolerance, as
-        :func:`layout.verify.exposure.verify_exposure` finds.
-    """
-    if not isinstance(mask, MaskPlan):
-        raise ProcessError(
-            f"{type(mask).__name__} is no plan: doses are found for plans of lenses; "
-            "lay a doses.csv beside a file made elsewhere"
-        )
-    return correct_plans([mask], exposure)[0][0]
-
-
 def correct_plans(
     plans: Sequence[MaskPlan],
     exposure: ExposureSettings,
@@ -312,7 +290,7 @@ def _backgrounds(
         for lattice in lattices
         if len(ranges.middle.widths_um)
     ]
-    field = _relaxed(far_convolution, mass, THRESHOLD * goal, marks=marks)
+    field = solve_background(far_convolution, mass, THRESHOLD * goal, marks=marks)
     middle_fields: list[Array] = []
     for _ in range(12 if middles else 0):
         middle_fields = []
@@ -323,14 +301,16 @@ def _backgrounds(
             far_field = far.at_sites(lattice, 0, 0, lattice.rows)
             per_own = table.per_own.take(classes)
             source = (THRESHOLD * table.goal.take(classes) - far_field) * per_own
-            middle_field = _relaxed(middle, per_own, source, bound_below=0.9)
+            middle_field = solve_background(middle, per_own, source, bound_below=0.9)
             middle_fields.append(middle_field.astype(np.float32))
             rows, columns = np.nonzero(classes)
             x = lattice.columns_um[columns]
             y = lattice.rows_um(0, lattice.rows)[rows]
             carried += grid.deposit(x, y, (middle_field * per_own)[rows, columns])
         previous = field
-        field = _relaxed(far_convolution, mass, THRESHOLD * goal - carried, marks=marks)
+        field = solve_background(
+            far_convolution, mass, THRESHOLD * goal - carried, marks=marks
+        )
         if np.abs(field - previous).max() < 1e-7:
             break
     return ScatterBackground(grid, field, middle_fields)
@@ -361,7 +341,7 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
     )
 
 
-def _relaxed(
+def solve_background(
     convolution: RadialConvolution,
     mass: Array,
     source: Array,

@@ -19,7 +19,7 @@ from metalens.core.units import nm
 MOST_CELLS = 500_000
 # of the tolerance, which backscatter may change along a piece: the rounding of doses
 # takes three quarters of it both ways
-_CHANGE = 0.4
+CHANGE = 0.4
 _INWARD = 0.1  # grid steps, from an edge to a place in the cell that it bounds
 
 
@@ -133,7 +133,7 @@ def cut_marks(
         grid.gather(lattice, area_um2[None], mass)
     background = grid.sample(grid.convolution(far)(mass[0]), *samples.at_um.T)
     cells, parent, cell_of_sample = _halve(
-        cells, cell_of_sample, inside, background, _CHANGE * tolerance * THRESHOLD
+        cells, cell_of_sample, inside, background, CHANGE * tolerance * THRESHOLD
     )
 
     middles, areas = _middles(cells, step_um)

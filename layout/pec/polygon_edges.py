@@ -38,7 +38,10 @@ class EdgeSamples:
 
 
 def sample_edges(
-    polygons: ExposedPolygons, range_um: float, step_um: float = 1.0
+    polygons: ExposedPolygons,
+    range_um: float,
+    step_um: float = 1.0,
+    unit_um: float = nm,
 ) -> EdgeSamples:
     """Samples along the outline of what each layer number draws.
 
@@ -48,16 +51,19 @@ def sample_edges(
         polygons: with their layers.
         range_um: of the core of the point exposure.
         step_um: between samples, about.
+        unit_um: database unit, to which the corners are rounded.
     """
     positions = [np.empty((0, 2))]
     normals = [np.empty((0, 2))]
     layers = [np.empty(0, np.int64)]
     for layer in np.unique(polygons.layer).tolist():
         drawn = zip(polygons.corners, polygons.layer.tolist(), strict=True)
-        outlines = [np.rint(corners / nm) for corners, other in drawn if other == layer]
+        outlines = [
+            np.rint(corners / unit_um) for corners, other in drawn if other == layer
+        ]
         for contour in region.union_contours(outlines):
             corners = contour[_turns(contour)]
-            start, end = corners * nm, np.roll(corners, -1, axis=0) * nm
+            start, end = corners * unit_um, np.roll(corners, -1, axis=0) * unit_um
             for corner, next_corner in zip(start, end, strict=True):
                 length = float(np.hypot(*(next_corner - corner)))
                 straight = length - 4 * range_um  # corners round off within two ranges
@@ -228,9 +234,7 @@ def equivalent_spots(
         low, high = corners.min(0), corners.max(0)
         is_small = bool((high - low).max() <= step_um)
         points = (
-            corners.mean(0)[None]
-            if is_small
-            else _inside(corners, next_corners, low, high, step_um)
+            corners.mean(0)[None] if is_small else _inside(corners, low, high, step_um)
         )
         parts.append(
             np.column_stack([points, np.full(len(points), mass / len(points))])
@@ -239,7 +243,7 @@ def equivalent_spots(
     return spots[:, 0], spots[:, 1], spots[:, 2]
 
 
-def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -> Array:
+def _inside(start: Array, low: Array, high: Array, step_um: float) -> Array:
     """(n, 2) points of a raster within a polygon, two or more along each axis.
 
     A point is inside where a ray to the right crosses the outline an odd number of
@@ -250,11 +254,24 @@ def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -
         low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k]
         for k in (0, 1)
     )
-    px, py = (grid.ravel() for grid in np.meshgrid(x, y))
-    is_inside = np.zeros(len(px), bool)
-    for (x0, y0), (x1, y1) in zip(start.tolist(), end.tolist(), strict=True):
-        if y0 != y1:
-            straddles = (py >= min(y0, y1)) & (py < max(y0, y1))
-            is_inside ^= straddles & (x0 + (py - y0) * (x1 - x0) / (y1 - y0) > px)
-    points = np.column_stack([px, py])[is_inside]
+    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    points = points[enclosed_points([start], points)]
     return points if len(points) else start.mean(0)[None]
+
+
+def enclosed_points(contours: Sequence[Array], points: Array) -> Array:
+    """(n,) whether points lie within an outline and outside its holes (even-odd rule).
+
+    Args:
+        contours: (m, 2) corners each.
+        points: (n, 2) places.
+    """
+    px, py = points.T
+    is_inside = np.zeros(len(points), bool)
+    for corners in contours:
+        ends = np.roll(corners, -1, axis=0).tolist()
+        for (x0, y0), (x1, y1) in zip(corners.tolist(), ends, strict=True):
+            if y0 != y1:
+                straddles = (py >= min(y0, y1)) & (py < max(y0, y1))
+                is_inside ^= straddles & (x0 + (py - y0) * (x1 - x0) / (y1 - y0) > px)
+    return is_inside

@@ -52,7 +52,7 @@ def total_perimeter(contours: Contours) -> float:
     )
 
 
-def points_along_edges(contours: Contours, count: int) -> Array:
+def points_along_edges(contours: Contours, count: int = 32) -> Array:
     """(count, 2) points at equal distances along all edges.
 
     Args:

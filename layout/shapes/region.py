@@ -2,11 +2,13 @@
 whole units.
 """
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from layout.shapes.rectilinear import box_corners
 from metalens.core.arrays import Array
 
 
@@ -53,6 +55,44 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
         grid: step of the places of the cuts.
     """
     return list(_cut(_section(contours, filled=False), grid))
+
+
+def separate_areas(polygons: Iterable[Array]) -> list[list[Array]]:
+    """Outline and holes of each connected area of the union of polygons."""
+    return [_contours(part) for part in _section(polygons).decompose()]
+
+
+def halve_area(contours: list[Array], axis: int) -> list[list[Array]]:
+    """Areas on both sides of a line near the middle that meets edges on whole units.
+
+    Args:
+        contours: outline and holes of an area.
+        axis: 0: the line is x = constant, 1: y; the other where there is no such line.
+
+    Returns:
+        Outline and holes of each area; empty where no line meets all edges so.
+    """
+    corners = np.concatenate(contours)
+    ends = np.array([corners.min(0), corners.max(0)])
+    is_box = len(corners) == 4 and all(len(set(values)) == 2 for values in corners.T)
+    for k in (axis, 1 - axis):
+        low, high = ends[:, k].tolist()
+        middle = (low + high) // 2
+        lines = sorted(set(corners[:, k].tolist()), key=lambda at: abs(at - middle))
+        turned = [contour[:, [k, 1 - k]] for contour in contours]
+        for at in (middle, *lines):
+            if low < at < high and (
+                is_box or all(_ends_exactly(at, contour, 1) for contour in turned)
+            ):
+                boxes = np.stack([ends, ends])
+                boxes[[0, 1], [1, 0], k] = at
+                halves = [box_corners(box.ravel()) for box in boxes]
+                if is_box:
+                    return [[half] for half in halves]
+                section = _section(contours, filled=False)
+                parts = [(section ^ _section([half])).decompose() for half in halves]
+                return [_contours(part) for part in itertools.chain(*parts)]
+    return []
 
 
 def triangulate_region(contours: Sequence[Array]) -> Array:

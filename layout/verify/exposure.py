@@ -6,15 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.formats.library import NOTHING, MaskLibrary, PolygonStack, flatten_stacks
+from layout.formats.library import (
+    NOTHING,
+    MaskLibrary,
+    PolygonStack,
+    flatten_polygons,
+    flatten_stacks,
+)
 from layout.mask.plan import MaskPlan, PillarArray
 from layout.pec import bodies, correct, nodes, polygon_edges
 from layout.pec.pillar_exposure import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.polygon_edges import ExposedPolygons
 from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
+from layout.pec.shapes import SPOTS, near_and_far
 from layout.process import isolation
-from layout.process.process import LayerNumber, Process
+from layout.process.process import ExposureSettings, LayerNumber, Process
 from layout.shapes import polygon, region
+from layout.shapes.moments import points_along_edges
 from layout.verify.report import EdgeErrors, ExposureReport, VerificationTally
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -24,7 +32,6 @@ _SAMPLES = 1000  # pillars whose exposure is summed exactly, on masks up to ...
 _PRODUCTS = 4e9  # ... so many products of samples and sites
 _NEIGHBOURS = 5  # sites on each side whose shapes are summed exactly
 _FAR = 6.0  # ranges between two shapes at which a Gaussian is below exp(-36)
-_SPOTS = 8  # along the narrowest Gaussian of the node field, of a polygon
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,7 +122,7 @@ def verify_exposure(
         pillars,
         tally,
         box,
-        _edges(scene, field),
+        _edges(scene.others, field.close, field.background.grid, field.background.far),
         float(foot - top) / 2,
         process.exposure.tolerance,
         scene.undosed,
@@ -264,7 +271,7 @@ class _Field:
             _box(scene.bodies, scene.others.corners), narrowest_um
         )
         x, y, masses = polygon_edges.equivalent_spots(
-            scene.others, narrowest_um / _SPOTS
+            scene.others, narrowest_um / SPOTS
         )
         mass = grid.deposit(x, y, masses)[None]
         mass_of_class = scene.dose * scene.kinds.area_um2
@@ -347,24 +354,72 @@ def _develop(
             yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
 
 
-def _edges(scene: WrittenMask, field: _Field) -> EdgeErrors:
-    """Exposure and position error at samples along the edges of marks and labels.
+def _edges(
+    others: ExposedPolygons,
+    close: Sequence[tuple[float, float]],
+    grid: nodes.NodeGrid,
+    far: Array,
+    unit_um: float = nm,
+) -> EdgeErrors:
+    """Exposure and position error at samples along the edges of polygons.
 
     The error is (exposure - THRESHOLD) / slope, in nm; the slope is a difference across
     the edge. Close Gaussians are summed in closed form over the polygons.
     """
-    widest_close_um = max((a for a, _ in field.close), default=0.0)
-    points = polygon_edges.sample_edges(scene.others, widest_close_um)
+    widest_close_um = max((a for a, _ in close), default=0.0)
+    points = polygon_edges.sample_edges(others, widest_close_um, unit_um=unit_um)
     positions = np.concatenate([points.at_um, *polygon_edges.points_across(points)])
-    close = polygon_edges.exposure_at_edges(positions, scene.others, field.close)
-    exposure, outside, inside = np.split(close, 3)
+    values = polygon_edges.exposure_at_edges(positions, others, close)
+    exposure, outside, inside = np.split(values, 3)
     x, y = points.at_um.T
-    background = field.background
-    exposure = exposure + background.grid.sample(background.far, x, y)
+    exposure = exposure + grid.sample(far, x, y)
     slope = np.maximum(inside - outside, 1e-12) / polygon_edges.ACROSS_UM
     return EdgeErrors(
         x, y, exposure / THRESHOLD, (exposure - THRESHOLD) / slope / nm, points.layer
     )
+
+
+def verify_polygons(
+    library: MaskLibrary, doses: Mapping[LayerNumber, float], exposure: ExposureSettings
+) -> ExposureReport:
+    """Expose the polygons of a mask that was read back, in simulation.
+
+    A shape without a straight edge counts by the mean along its edges.
+
+    Args:
+        library: cells of the file.
+        doses: of its dose table.
+        exposure: point exposure and tolerance.
+
+    Raises:
+        ProcessError: no polygon with a dose.
+    """
+    unit = library.unit_nm * nm
+    drawn = [(layer, p) for layer, p in flatten_polygons(library) if layer in doses]
+    corners = [points * unit for _, points in drawn]
+    dose = np.array([doses[layer] for layer, _ in drawn])
+    others = ExposedPolygons(corners, dose, np.zeros(len(drawn), np.int64))
+    near, _, grid, field = near_and_far(others, exposure)
+    edges = _edges(others, near.terms, grid, field, unit)
+    shortest = 4 * float(near.widths_um.max()) / unit
+    curved = [
+        points_along_edges([contour * unit])
+        for contour in region.union_contours(points for _, points in drawn)
+        if np.hypot(*np.diff(contour, axis=0, append=contour[:1]).T).max() <= shortest
+    ]
+    if curved:
+        at = np.concatenate(curved)
+        values = polygon_edges.exposure_at_edges(at, others, near.terms)
+        values = values + grid.sample(field, *at.T)
+        means = values.reshape(len(curved), -1).mean(1) / THRESHOLD
+        x, y = at.reshape(len(curved), -1, 2).mean(1).T
+        zeros = np.zeros(len(curved), np.int64)
+        present = edges.x_um, edges.y_um, edges.exposure, edges.shift_nm, edges.layer
+        edges = EdgeErrors(*map(np.append, present, (x, y, means, zeros, zeros)))
+    undosed = tuple(sorted(library.layers - doses.keys()))
+    tally = VerificationTally.empty()
+    box = _box((), corners)
+    return ExposureReport(0, tally, box, edges, 0.0, exposure.tolerance, undosed)
 
 
 # direct sums

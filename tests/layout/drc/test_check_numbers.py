@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.drc.lattice import check_plan
-from layout.drc.report import Violation
+from layout.drc.report import RuleViolation
 from layout.mask.plan import MaskPlan, PillarArray, PillarClass
 from layout.process.process import DesignRules
 
@@ -50,10 +50,10 @@ def test_a_gap_is_told_in_nanometres_with_the_box_of_both():
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=70, minimum_feature_nm=50)
     found = check_plan(plan_of(A, B), rules)
     assert [v for v in found.violations if v.rule == "space"] == [
-        Violation("space", (-790, 840, -300, 960), 55.0, 70, "A to B in L")
+        RuleViolation("space", (-790, 840, -300, 960), 55.0, 70, "A to B in L")
     ]
     assert [v for v in found.violations if v.rule == "width"] == [
-        Violation("width", (-500, 860, -300, 940), 40.0, 50, "B")
+        RuleViolation("width", (-500, 860, -300, 940), 40.0, 50, "B")
     ]
     assert (found.counts["space"], found.counts["width"], found.shapes) == (1, 1, 2)
     assert (found.minimum_space_nm, found.minimum_width_nm) == (55.0, 40.0)
@@ -64,12 +64,12 @@ def test_a_gap_from_row_to_row_and_an_overlap():
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=201)
     found = check_plan(plan_of(A, B, classes=((1, 0), (2, 0))), rules)
     assert found.violations == [
-        Violation("space", (-800, 360, -600, 960), 200.0, 201, "B to A in L")
+        RuleViolation("space", (-800, 360, -600, 960), 200.0, 201, "B to A in L")
     ]
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=8)
     found = check_plan(plan_of(A, rectangle("C", 260, 30)), rules)
     assert found.violations == [
-        Violation("overlap", (-790, 840, -140, 960), 0.0, 8, "A to C in L")
+        RuleViolation("overlap", (-790, 840, -140, 960), 0.0, 8, "A to C in L")
     ]
 
 
@@ -85,13 +85,13 @@ def test_lattices_off_the_grid_are_told_at_their_first_pillar(off):
     place = {"pitch": 300, "down": 500, "x0": -700, "y0": 900} | off
     found = check_plan(plan_of(A, B, grid=10, **place), LOOSE)
     x, y = place["x0"], place["y0"]
-    assert found.violations == [Violation("off-grid", (x, y, x, y), 0.0, 10.0, "L")]
+    assert found.violations == [RuleViolation("off-grid", (x, y, x, y), 0.0, 10.0, "L")]
 
 
 def test_shapes_off_the_grid_are_told_about_their_middle():
     found = check_plan(plan_of(A, rectangle("B", 100, 45), grid=10), LOOSE)
     assert found.violations == [
-        Violation("off-grid", (-100, -45, 100, 45), 0.0, 10.0, "B")
+        RuleViolation("off-grid", (-100, -45, 100, 45), 0.0, 10.0, "B")
     ]
 
 
@@ -162,7 +162,7 @@ def test_feet_are_told_once_a_lattice():
     found = check_plan(plan_of(A, B), rules, foot_nm=feet)
     box = (-700, -100, -100, 900)
     assert found.violations == [
-        Violation("foot", box, 72.0, 75, "feet of etched pillars in L")
+        RuleViolation("foot", box, 72.0, 75, "feet of etched pillars in L")
     ]
     assert found.counts["foot"] == 1
     assert check_plan(
@@ -171,7 +171,9 @@ def test_feet_are_told_once_a_lattice():
     bars = (rectangle("A", 90, 60, round=False), rectangle("B", 100, 40, round=False))
     found = check_plan(plan_of(*bars), rules, foot_nm=np.array([94.0, 107.0]))
     assert found.violations == [
-        Violation("foot", box, 55.0 - (4 + 7) / 2, 75, "feet of etched pillars in L")
+        RuleViolation(
+            "foot", box, 55.0 - (4 + 7) / 2, 75, "feet of etched pillars in L"
+        )
     ]
     assert check_plan(
         plan_of(*bars),
