@@ -235,8 +235,8 @@ def _section(
     """
     bias = process.bias
     angle = turn * process.rules.angle_step_deg
-    width = float(bias.made_nm(np.array(float(drawn_nm))))
-    length = float(bias.made_nm(np.array(float(length_nm)))) if length_nm else 0.0
+    width = float(bias.fabricated_nm(np.array(float(drawn_nm))))
+    length = float(bias.fabricated_nm(np.array(float(length_nm)))) if length_nm else 0.0
     shape = cell_of_sizes(cell, width, length) if length else cell
     lean_um = cell.height_um * math.tan(math.radians(process.etch.sidewall_deg))
     is_impossible = True

@@ -258,7 +258,7 @@ def _biased(cell: Cell, drawn: int, process: Process, alone: float) -> Outline:
     Raises:
         ProcessError: the bias closes a hole.
     """
-    made_um = float(process.bias.made_nm(np.array(float(drawn)), alone)) * nm
+    made_um = float(process.bias.fabricated_nm(np.array(float(drawn)), alone)) * nm
     outline = cell.outline(made_um, grow_um=drawn * nm - made_um)
     if len(outline.parts) != len(cell.outline(made_um).parts):
         raise ProcessError(

@@ -363,7 +363,7 @@ class Process:
                 :func:`layout.process.isolation.isolation_map`.
         """
         written = np.asarray(written_nm, float)
-        return self.bias.made_nm(written - self._rounding_nm(written), isolation)
+        return self.bias.fabricated_nm(written - self._rounding_nm(written), isolation)
 
     def written_diameter_nm(
         self, design_nm: Array | float, isolation: Array | float = 0.0

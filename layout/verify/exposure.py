@@ -349,7 +349,7 @@ def _develop(
                     process.bias.range_um,
                     centred=body.centred,
                 )[first - low : first - low + len(block)]
-            etch = process.made_diameter_nm if is_round else process.bias.made_nm
+            etch = process.made_diameter_nm if is_round else process.bias.fabricated_nm
             made = np.where(block > 0, etch(np.maximum(resist, 0), isolated), 0)
             yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
 

@@ -12,8 +12,7 @@ class Lattice:
     """A lattice on the pitch of the cell, the period along x.
 
     kind: square; rectangular, with ``ratio`` times the pitch along y; hexagonal, with
-    rows sqrt(3)/2 pitches apart,
-        every other one shifted by half a pitch.
+        a row spacing of sqrt(3)/2 pitches, every other row shifted by half a pitch.
     ratio: period along y over the pitch, of a rectangular lattice.
     """
 

@@ -77,7 +77,9 @@ class Bias:
             return np.asarray(np.interp(drawn, knots, values))
         return np.zeros_like(drawn)
 
-    def made_nm(self, drawn_nm: Array | float, isolation: Array | float = 0.0) -> Array:
+    def fabricated_nm(
+        self, drawn_nm: Array | float, isolation: Array | float = 0.0
+    ) -> Array:
         """Fabricated diameter in nm: drawn + bias(drawn) + isolated_nm × isolation.
 
         Args:
@@ -89,18 +91,22 @@ class Bias:
             drawn + self.at(drawn) + self.isolated_nm * np.asarray(isolation)
         )
 
-    def drawn_nm(self, made_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Drawn diameter in nm for a fabricated one, inverse of :meth:`made_nm`, to
+    def drawn_nm(
+        self, fabricated_nm: Array | float, isolation: Array | float = 0.0
+    ) -> Array:
+        """Drawn diameter in nm for a fabricated one, inverse of :meth:`fabricated_nm`, to
         1e-9 nm.
 
         Fixed point of drawn = goal - bias(drawn); each iteration at least halves the
         error.
 
         Args:
-            made_nm: diameter after fabrication.
+            fabricated_nm: diameter after fabrication.
             isolation: 0 in a full lattice, 1 alone.
         """
-        goal = np.asarray(made_nm, float) - self.isolated_nm * np.asarray(isolation)
+        goal = np.asarray(fabricated_nm, float) - self.isolated_nm * np.asarray(
+            isolation
+        )
         drawn = goal.copy()
         for _ in range(60):
             before = drawn

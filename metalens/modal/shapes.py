@@ -64,7 +64,7 @@ def interval_basis(
     """Integrated Legendre polynomials, and singular functions ``d**tau - d`` of the
     distance d to s = 0, or to s = 1 if ``at_end``.
 
-    The slope of each singular function is made orthonormal to the slopes before it,
+    The slope of each singular function is orthonormal to the slopes before it,
     which keeps the matrices well conditioned.
 
     Args:
@@ -123,7 +123,7 @@ def derivative_matrix(degree: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
-    """Curl-conforming element basis made of interval bases ``xi`` and ``eta``; vector
+    """Curl-conforming element basis, tensor products of interval bases ``xi`` and ``eta``; vector
     functions along xi come first.
     """
 

@@ -1,4 +1,11 @@
-"""Round pillars with tilted walls: RCWA corrected to the modal solution."""
+"""Round pillars with tilted walls: RCWA corrected to the modal solution.
+
+At one truncation RCWA sees a slightly different width. The shift s(D) with
+
+    t_RCWA(D + s(D)) = t_modal(D),  and likewise r,                             (1)
+
+for upright pillars of every diameter D of the wall corrects the tilted pillar.
+"""
 
 import dataclasses
 import math
@@ -9,12 +16,13 @@ import numpy as np
 from metalens.cell import Cell, Incidence, Response
 from metalens.core.arrays import Array
 from metalens.rcwa import CellProblem, problem_of_light, solve_problem
+from metalens.rcwa.basis import count_orders
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4
 NODES = 4  # diameters between foot and top at which (1) is solved
 STEPS = 3  # of Gauss-Newton for (1)
-STEP_UM = 1e-4
+STEP_UM = 1e-4  # of width, for the slope of t and r
 MOST_UM = 0.01  # of a shift
 UNEXPLAINED = 0.5  # share of the misfit of t after (1) that counts as error
 SHARE = 0.2  # of the tolerance, for the modal solves
@@ -72,11 +80,16 @@ def solve_tilted(
             break
     met = error <= tolerance
     reason = f"orders within {reach}, corrected to the modal solution"
-    m = np.arange(-reach, reach + 1)
-    orders = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
     t_error = min(error, 1 + max(1.0, abs(t), abs(r)))
     return Response(
-        complex(t), complex(r), t_error, orders, float(energy.real), "rcwa", met, reason
+        complex(t),
+        complex(r),
+        t_error,
+        count_orders(reach),
+        float(energy.real),
+        "rcwa",
+        met,
+        reason,
     )
 
 

@@ -1,5 +1,5 @@
 """Fourier basis of RCWA: orders of any lattice, reduced by the symmetries that shape,
-lattice and light share, and the plane waves made of them.
+lattice and light share, and the plane waves of these orders.
 """
 
 import math
@@ -141,6 +141,12 @@ def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
         for rows, columns in ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
     )
     return ReducedOrders(ex, ey, ez, hz, reach, links)
+
+
+def count_orders(harmonics: int) -> int:
+    """Number of orders of a square lattice within a circle of this radius."""
+    m = np.arange(-harmonics, harmonics + 1)
+    return int(np.count_nonzero(np.hypot(m[:, None], m) <= harmonics))
 
 
 def _reduced(

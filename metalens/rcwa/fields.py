@@ -14,6 +14,7 @@ from metalens.rcwa.basis import (
     Operation,
     OrderSet,
     ReducedOrders,
+    count_orders,
     half_space,
     lattice_frame,
     plane_waves,
@@ -122,7 +123,7 @@ class _Stack:
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
         """Permittivity and normal field on the grid, for every slab.
 
-        For each, eps (ny, nx), and N n n^T of (2) as (xx, yy, xy); None for a
+        For each, eps (ny, nx), and the normal field N n n^T as (xx, yy, xy); None for a
         homogeneous slab.
         """
         cell = self.problem.cell
@@ -209,8 +210,7 @@ def near_fields(
         if len(history) >= sequence.compared and error.max() <= tolerance:
             break
         history = [*history, fields][-sequence.compared :]
-    m = np.arange(-reach, reach + 1)
-    orders = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
+    orders = count_orders(reach)
     results = []
     for grid, (e, h), grid_error in zip(grids, fields, error.tolist(), strict=True):
         points = stack.points(grid)

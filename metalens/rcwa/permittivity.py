@@ -377,7 +377,7 @@ def section_operators(
     products N, for x and y and their coupling. For Ez, [[eps]]^-1 is used.
 
     Args:
-        space, waves: reduced orders, and the waves made of them.
+        space, waves: reduced orders, and their plane waves.
         section: outlines and permittivities. cell: its lattice.
         normals: outlines of the normal field; None: those of the section.
     """

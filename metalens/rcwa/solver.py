@@ -28,6 +28,7 @@ from metalens.rcwa.basis import (
     IDENTITY,
     Operation,
     TangentialWave,
+    count_orders,
     lattice_frame,
     plane_waves,
     reduced_orders,
@@ -683,9 +684,7 @@ def _response(
 ) -> JonesResponse:
     """Jones response of a truncation, with its basis and number of orders."""
     basis = ("x", "y") if problem.light.normal else ("s", "p")
-    m = np.arange(-reach, reach + 1)
-    count = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
     t, r = truncation.both
     return JonesResponse(
-        basis, t, r, error, truncation.energy, count, converged, reason
+        basis, t, r, error, truncation.energy, count_orders(reach), converged, reason
     )

@@ -37,7 +37,7 @@ def test_what_is_drawn_gives_what_was_designed(slopes, start, isolated, alone):
         table_nm=tuple(zip(knots.tolist(), values.tolist(), strict=True)),
         isolated_nm=isolated,
     )
-    made = bias.made_nm(bias.drawn_nm(DESIGN, alone), alone)
+    made = bias.fabricated_nm(bias.drawn_nm(DESIGN, alone), alone)
     assert np.abs(made - DESIGN).max() < 1e-9  # contraction by 0.49 a round, 60 rounds
 
 
