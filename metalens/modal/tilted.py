@@ -15,8 +15,7 @@ import numpy as np
 
 from metalens.cell import Cell, Incidence, Response
 from metalens.core.arrays import Array
-from metalens.rcwa import CellProblem, problem_of_light, solve_problem
-from metalens.rcwa.basis import count_orders
+from metalens.rcwa import CellProblem, count_orders, problem_of_light, solve_problem
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4

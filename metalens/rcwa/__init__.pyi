@@ -1,3 +1,4 @@
+from .basis import count_orders as count_orders
 from .fields import FieldGrid as FieldGrid
 from .fields import NearField as NearField
 from .fields import near_field as near_field
