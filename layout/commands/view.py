@@ -12,7 +12,6 @@ from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, PolygonStack, equal_shapes
 from layout.formats.reading import read_mask
 from layout.process.process import LayerNumber
-from layout.shapes import polygon
 from metalens.commands import MASKS
 from metalens.core.errors import MaskFileError
 from metalens.view import DrawingPanel, OutlinePanel, Panel, TablePanel
@@ -57,7 +56,7 @@ def mask_panels(path: Path) -> list[Panel]:
         + (f"Boxes: {len(marks)} places where a rule is broken." if marks else "")
     )
     drawn = DrawingPanel(mask.name, outlines, 1e-3 * content.unit_nm, caption, marks)
-    return [drawn, _layers(content, outlines, dose)]
+    return [drawn, _layers(content, dose)]
 
 
 def _outline(
@@ -87,38 +86,21 @@ def _name(content: MaskLibrary, layer: LayerNumber) -> str:
     return f"{layer[0]} {name.replace('_', ' ')}".strip()
 
 
-def _layers(
-    content: MaskLibrary, outlines: list[OutlinePanel], dose: dict[LayerNumber, float]
-) -> TablePanel:
+def _layers(content: MaskLibrary, dose: dict[LayerNumber, float]) -> TablePanel:
     """Shapes, area and dose of each (layer, datatype)."""
-    rows = []
-    for layer in sorted(
-        {layer for cell in content.cells.values() for layer in cell.layers}
-    ):
-        number = "/".join(map(str, layer))
-        in_layer = [outline for outline in outlines if outline.notes["layer"] == number]
-        area = (
-            sum(
-                len(outline.places) * abs(polygon.twice_area(outline.corners)) / 2
-                for outline in in_layer
-            )
-            * (1e-3 * content.unit_nm) ** 2
+    counts, areas = content.count_shapes(), content.areas_um2()
+    rows = [
+        (
+            "/".join(map(str, layer)),
+            content.layer_names.get(layer, ""),
+            counts[layer],
+            areas[layer],
+            dose.get(layer, "none stated"),
         )
-        name = content.layer_names.get(layer, "")
-        rows.append(
-            (
-                number,
-                name,
-                sum(len(outline.places) for outline in in_layer),
-                area,
-                dose.get(layer, "none stated"),
-            )
-        )
-    return TablePanel(
-        "Layers",
-        ("layer/datatype", "name", "shapes", "area / µm²", "relative dose"),
-        rows,
-    )
+        for layer in sorted(content.layers)
+    ]
+    head = ("layer/datatype", "name", "shapes", "area / µm²", "relative dose")
+    return TablePanel("Layers", head, rows)
 
 
 def _marks(path: Path) -> list[tuple[float, float, str]]:

@@ -24,14 +24,12 @@ class DrawnClasses:
     """Quantised drawn pillars.
 
     sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
-    whole nm, thinnest first. counts: (k,) pillars of each class. rounding_nm: largest
-    difference between the exact and the drawn diameter.
+    whole nm, thinnest first. counts: (k,) pillars of each class.
     """
 
     sites: ScratchArray
     diameters_nm: Array
     counts: Array
-    rounding_nm: float
 
     @property
     def classes(self) -> Array:
@@ -73,10 +71,7 @@ def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses
     blocks = ((first, lookup.take(block)) for first, block in drawn.blocks())
     step = process.rules.diameter_step_nm
     return DrawnClasses(
-        hold_on_disk(drawn.shape, lookup.dtype, blocks),
-        used * step,
-        counts[used],
-        step / 2,
+        hold_on_disk(drawn.shape, lookup.dtype, blocks), used * step, counts[used]
     )
 
 

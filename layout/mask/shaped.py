@@ -65,9 +65,7 @@ def shape_classes(
         [2 * float(np.hypot(*pillar.outline.T).max()) * unit_nm for pillar in classes]
     )
     class_counts = np.array([counts[int(key)] for key in used])
-    return DrawnClasses(
-        sites, widths_nm, class_counts, process.rules.diameter_step_nm / 2
-    ), classes
+    return DrawnClasses(sites, widths_nm, class_counts), classes
 
 
 def _turns(cell: Cell, diameters: DiameterMap, process: Process) -> int:
