@@ -57,7 +57,7 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "scene": (
         "codesign.commands.options.scene",
-        "SCENE.toml -> rendered eyes: contact sheet, layers, labels",
+        "SCENE.toml -> rendered eyes: contact sheet, labels",
     ),
     "evaluate": (
         "codesign.commands.evaluate",
@@ -127,7 +127,6 @@ VIEWS = {
     "pupil": "characterize.commands.view:pupil_panels",
     "run": "codesign.commands.view:run_panels",
     "scene": "codesign.commands.view:scene_panels",
-    "layers": "codesign.commands.view:layer_panels",
     "image": "codesign.commands.view:image_panels",
     "answers": "codesign.commands.view:prediction_panels",
     "budget": "codesign.commands.view:budget_panels",

@@ -1,4 +1,4 @@
-"""SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
+"""SCENE.toml to rendered eyes: a contact sheet, masks and labels."""
 
 import functools
 import math
@@ -24,7 +24,6 @@ from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
 from metalens.core.store import Provenance
-from metalens.image import scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,6 @@ class SceneSettings:
     variety: of the looks, as of training's frames: 1 the population as published, bare;
     2 with spectacles, make-up,
         uneven light, shadows and movement as well.
-    layer_mm: thickness of the depth layers that are written; at most 0.5.
     """
 
     frames: int = 24
@@ -55,7 +53,6 @@ class SceneSettings:
     slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
     scale: float = 0.0
     variety: float = 1.0
-    layer_mm: float = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -69,7 +66,6 @@ class SceneSettings:
             slip_mm=(0, 1e4),
             scale=(0, 0.49),
             variety=(0, 4),
-            layer_mm=(LEAST, 0.5),
         )
 
     @property
@@ -116,15 +112,9 @@ def run(options: Options) -> int:
     with options.claim_folder(
         folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
     ) as draft:
-        count = _render_and_write(settings, draft.path)
-        values: dict[str, object] = {
-            "frames": settings.frames,
-            "layers": count,
-            "folder": str(folder),
-        }
-        summary = (
-            f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png"
-        )
+        _render_and_write(settings, draft.path)
+        values: dict[str, object] = {"frames": settings.frames, "folder": str(folder)}
+        summary = f"{settings.frames} frames: {folder}/sheet.png"
         if lens is not None and options.lens is not None:
             options.console.say(
                 "the lens over its field; half a minute for one of 1 mm"
@@ -160,39 +150,16 @@ def _rendered(
     return augmented_frames(states, rig, camera, settings.variety, (settings.seed, 3))
 
 
-def _render_and_write(settings: SceneSettings, folder: Path) -> int:
-    """Render frames, write scene, layers, labels and sheet; number of layers."""
+def _render_and_write(settings: SceneSettings, folder: Path) -> None:
+    """Render frames, write scene, labels and sheet."""
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     rendered = _rendered(settings, settings.frames, camera, settings.rig)
     provenance = Provenance(config=config.dumps(settings), seed=settings.seed)
     dataset.write_shard(
         folder / "scene.h5", rendered, seed=settings.seed, provenance=provenance
     )
-    layer_count = _write_layers(
-        folder / "layers.h5", rendered, settings.layer_mm * 1e3, provenance
-    )
     store.write_text(folder / "labels.csv", _labels_csv(rendered))
     contact_sheet(rendered, folder / "sheet.png")
-    return layer_count
-
-
-def _write_layers(
-    path: Path, rendered: RenderedFrames, step_um: float, about: Provenance
-) -> int:
-    """Write the occupied depth layers of the first frame; their number."""
-    first = rendered.rows(torch.tensor([0])).frames
-    depths_um = first.depth_um[first.coverage > 0]
-    low, high = float(depths_um.min()), float(depths_um.max())
-    depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
-    layers = scene.cut_layers(first, depths)
-    arrays = {
-        "radiance": layers.radiance[0].numpy(),
-        "coverage": layers.coverage[0].numpy(),
-        "depth_um": layers.depth_um.numpy(),
-        "near": layers.near.numpy(),
-    }
-    store.save(path, "layers", arrays, provenance=about)
-    return len(layers.depth_um)
 
 
 def _labels_csv(rendered: RenderedFrames) -> str:

@@ -252,22 +252,6 @@ def scene_panels(path: Path) -> list[Panel]:
     ]
 
 
-def layer_panels(path: Path) -> list[Panel]:
-    """Light and coverage of the depth layers of one frame, as images are formed of
-    them.
-
-    Args:
-        path: of the file.
-    """
-    arrays = store.load(path, "layers").arrays
-    axis = [SliderAxis("layer at", (1e-3 * arrays["depth_um"]).tolist(), "mm")]
-    covered = arrays["coverage"]
-    return [
-        _pixels("Light of a layer", arrays["radiance"], axis, "of full light"),
-        _pixels("What a layer covers", covered, axis, "share of the pixel"),
-    ]
-
-
 def image_panels(path: Path) -> list[Panel]:
     """Scene and image with its error, their difference, PSFs over field and depth.
 

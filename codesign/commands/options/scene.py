@@ -1,4 +1,4 @@
-"""SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
+"""SCENE.toml to rendered eyes: a contact sheet, masks and labels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ class Options(CommonOptions):
 
     Attributes:
         config: SCENE.toml; without it the defaults.
-        output: folder for scene.h5, layers.h5, sheet.png and labels.csv; with --lens
+        output: folder for scene.h5, sheet.png and labels.csv; with --lens
             also image.h5 and image.png.
         lens: a lens that images the first frames onto its sensor, over the whole field
             and in its light: scene, image,
