@@ -67,48 +67,51 @@ def run(options: Options) -> int:
         settings = dataclasses.replace(
             settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes)
         )
-    made = [lenses.load_plain(path) for path in options.lenses]
-    names = list(distinct_names([path.stem for path in options.lenses]))
+    compared = {
+        name: lenses.load_plain(path)
+        for name, path in zip(
+            distinct_names([path.stem for path in options.lenses]),
+            options.lenses,
+            strict=True,
+        )
+    }
     folder = options.output
     with options.claim_folder(folder) as draft:
-        values, text = _measure(options, settings, made, names, draft.path)
+        values, text = _measure(options, settings, compared, draft.path)
     words = f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html"
     return options.console.judged(values, words, values["failures"])
 
 
 def _measure(
-    options: Options,
-    settings: OpticsSettings,
-    compared: list[Lens],
-    names: list[str],
-    folder: Path,
+    options: Options, settings: OpticsSettings, compared: dict[str, Lens], folder: Path
 ) -> tuple[dict[str, Any], str]:
     """Axial information, field and scene energies of all lenses; the numbers, and
     tables.
 
     Writes tables, numbers, pictures and page into the folder.
     """
+    console, first = options.console, next(iter(compared.values()))
     if options.baselines:
-        for name, lens in tuned_like(compared[0], settings.axial):
-            names.append(name)
-            compared.append(lens)
-    setting = settings.axial.about(compared[0])
+        compared |= tuned_like(first, settings.axial)
+    setting = settings.axial.about(first)
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
-    axial, over_field, spread = {}, {}, []
-    pairs = zip(names, compared, strict=True)
-    for name, lens in options.console.track(pairs, total=len(compared), label="PSFs"):
+    axial, over_field, remarks = {}, {}, {}
+    for name, lens in console.track(
+        compared.items(), total=len(compared), label="PSFs"
+    ):
         axial[name] = evaluate_optics.measure_axial_information(lens, setting)
-        over_field[name] = settings.over_field.of(lens, compared[0], setting.angles_deg)
+        over_field[name] = settings.over_field.of(lens, first, setting.angles_deg)
         if not design.lens_has_focus(lens):
-            spread.append(name)
-    remarks = [f"{name} {SPREAD}" for name in spread]
+            remarks[name] = f"{name} {SPREAD}"
     try:
-        energies = evaluate_optics.scene_energies(compared, states, settings.scenes)
+        energies = evaluate_optics.scene_energies(
+            list(compared.values()), states, settings.scenes
+        )
     except PropagationError as error:
-        raise ConfigError("; ".join([str(error), *remarks])) from error
-    scenes = dict(zip(names, energies, strict=True))
+        raise ConfigError("; ".join([str(error), *remarks.values()])) from error
+    scenes = dict(zip(compared, energies, strict=True))
     tables = [
-        evaluate_optics.axial_table(axial, setting, remarks),
+        evaluate_optics.axial_table(axial, setting, list(remarks.values())),
         evaluate_optics.scene_table(scenes),
         *field_page.field_tables(over_field),
     ]
@@ -116,14 +119,12 @@ def _measure(
     values["failures"] = evaluate_optics.table_failures(axial, scenes, setting)
     for name, result in over_field.items():
         values["lenses"][name] |= {
-            "focuses": name not in spread,
+            "focuses": name not in remarks,
             "field": field_page.field_values(result),
         }
     if options.reader:
-        judged = judge_lenses(dict(zip(names, compared, strict=True)), settings.reader)
-        results = dict(
-            options.console.track(judged, total=len(compared), label="reader")
-        )
+        judged = judge_lenses(compared, settings.reader)
+        results = dict(console.track(judged, total=len(compared), label="reader"))
         values["reader"] = {
             "settings": dataclasses.asdict(settings.reader),
             "lenses": {name: result.values() for name, result in results.items()},
@@ -132,28 +133,23 @@ def _measure(
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
-    sections = [Section("Tables", items=tables)]
-    for name, picture, caption in (
-        ("field", field_page.plot_over_field(over_field), field_page.CAPTION),
-        ("scenes", plots.plot_scenes(scenes), plots.CAPTIONS["scenes"]),
-        (
-            "axial",
-            plots.plot_axial_information(axial, setting),
-            plots.CAPTIONS["axial"],
-        ),
-    ):
+    pictures = {
+        "axial": plots.plot_axial_information(axial, setting),
+        "scenes": plots.plot_scenes(scenes),
+        "field": field_page.plot_over_field(over_field),
+    }
+    captions = plots.CAPTIONS | {"field": field_page.CAPTION}
+    for name, picture in pictures.items():
         store.write_bytes(folder / f"{name}.png", picture)
-        sections.insert(
-            0, Section(items=[Figure(picture, caption, wide=True)], title=name)
-        )
+    figures = [Figure(png, captions[name], wide=True) for name, png in pictures.items()]
+    sections = [Section("Pictures", items=figures), Section("Tables", items=tables)]
     write_report(folder / "report.html", "What the lenses tell", sections)
     return values, text
 
 
-def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:
-    """Tuned hyperbolic lens and double helix with the pillars and aperture of a lens.
-
-    Returns (name, lens) each.
+def tuned_like(lens: Lens, setting: MeasurementSettings) -> dict[str, Lens]:
+    """{name: lens} of the tuned hyperbolic lens and double helix with the pillars and
+    aperture of a lens.
 
     Args:
         lens: whose cell, aperture and focus are used. setting: how lenses are measured.
@@ -167,7 +163,7 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
         radius_um=measured.radius_um,
         normalisation="sum" if setting.normalisation == "sum" else "l2",
     ).about(focus, radius)
-    tuned = []
+    tuned = {}
     for baseline in tune_baselines(design_pupil(focus, radius, fisher), fisher):
         refocused = dataclasses.replace(focus, source_distance_um=baseline.focus_um)
         helix = DoubleHelix(zones=baseline.zones) if baseline.zones else None
@@ -176,5 +172,5 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
             phase, refocused, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy,
             profile="double-helix" if helix else "hyperbolic",
         )  # fmt: skip
-        tuned.append((baseline.name, made[0]))
+        tuned[baseline.name] = made[0]
     return tuned
