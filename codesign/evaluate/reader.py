@@ -3,7 +3,7 @@ slippage errors rate the lens.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -88,11 +88,6 @@ class ReaderConfig:
         return margin_of(self.pitch_um)
 
     @property
-    def camera(self) -> PinholeCamera:
-        """Samples of the frames."""
-        return PinholeCamera(self.pixels, self.pitch_um)
-
-    @property
     def sensor(self) -> Sensor:
         """Pixels of this pitch: 5 electrons of read noise, full well at twice the white
         object's light, 10 bits.
@@ -168,18 +163,9 @@ class LensFrames:
     slip_mm: Tensor
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class JudgingScenes:
-    """Scenes that are the same for every lens: to train on, to calibrate intervals on
-    and to test on.
-    """
-
-    learn: SceneSource
-    calibrate: SceneSource
-    judge: SceneSource
-
-
-def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> JudgingScenes:
+def render_scenes(
+    config: ReaderConfig, *, sensor_distance_um: float
+) -> list[SceneSource]:
     """Render the training, calibration and test scenes for lenses of one sensor
     distance.
 
@@ -199,7 +185,7 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
         raise ConfigError(
             f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
         )
-    sources = []
+    sources: list[SceneSource] = []
     for stream in (EXPERIMENT, VALIDATION, TEST):
         eyes = EyeScenes(
             scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream
@@ -209,11 +195,11 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
         sources.append(
             PoolScenes(pool, config.margin, scenes.scale, config.seed + stream)
         )
-    return JudgingScenes(*sources)
+    return sources
 
 
 def train_reader(
-    optics: Imager, scenes: JudgingScenes, config: ReaderConfig
+    optics: Imager, scenes: Sequence[SceneSource], config: ReaderConfig
 ) -> ReaderResult:
     """Train the reference reader on images of a lens and test it.
 
@@ -221,18 +207,21 @@ def train_reader(
 
     Args:
         optics: imager of the lens.
-        scenes: scenes to train, calibrate and test on.
+        scenes: of :func:`render_scenes`, the same for every lens.
         config: frames, sensor and light of the reader.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         reader = ReferenceReader()
-        training = lens_frames(optics, scenes.learn, config, config.frames)
+        training, calibration, test = (
+            lens_frames(optics, source, config, count)
+            for source, count in zip(
+                scenes, (config.frames, config.test, config.test), strict=True
+            )
+        )
         _train_depth(reader, training)
         _train_slip(reader, training)
         reader.eval()
-        calibration = lens_frames(optics, scenes.calibrate, config, config.test)
-        test = lens_frames(optics, scenes.judge, config, config.test)
         return _evaluate(reader, calibration, test, optics.error)
 
 
@@ -409,7 +398,7 @@ def judge_lenses(
     for name, lens in lenses.items():
         optics = lens_imager(
             lens,
-            config.camera,
+            PinholeCamera(config.pixels, config.pitch_um),
             (nearest * 1e3, farthest * 1e3),
             fwhm_nm=config.fwhm_nm,
             tolerance=config.tolerance,
