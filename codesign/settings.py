@@ -64,12 +64,12 @@ class ExperimentConfig:
 
     subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that
     they span.
-    axial_mm, lateral_mm: slippage states beside the origin, along z and x.
+    axial_mm, lateral_mm: slippage states besides the origin, along z and x.
     share: of the stimuli that a subject is calibrated on, drawn at random; the rest is
     judged.
-    people: who calibrated before, and tell what readings mean for all of them: the
+    people: who calibrated before; their readings give the
     prior of every subject.
-    hidden: neurons of the regressor, of networks that tell no axis.
+    hidden: neurons of the regressor, of networks that predict no axis.
     fixation_deg: standard deviation of where a subject really looks.
     image: "true", what the device shows, whatever the run was trained on; "trained",
     the image that the run knows.

@@ -264,7 +264,7 @@ def _write_results(
 COLUMNS = {  # of the table, by name in result.json
     "budget_mmacs": "budget",
     "mmacs": "MMACs",
-    "effective_pitch_um": "pixels seen / um",
+    "effective_pitch_um": "pixels read / um",
     "gaze_deg": "gaze / deg",
     "axial_slip_mm": "axial / mm",
     "finer_axial_slip_mm": "finer image / mm",

@@ -22,7 +22,7 @@ PARTS: dict[str, tuple[str, str]] = {
     ),
     "paper": (
         "codesign.commands.options.paper",
-        "RUN_DIR... -> every table and figure of the paper beside ours",
+        "RUN_DIR... -> every table and figure of the paper with our measurement",
     ),
 }
 

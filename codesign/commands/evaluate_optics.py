@@ -1,4 +1,4 @@
-"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: information about
 depth, and about whole scenes.
 """
 
@@ -143,7 +143,7 @@ def _measure(
         store.write_bytes(folder / f"{name}.png", picture)
     figures = [Figure(png, captions[name], wide=True) for name, png in pictures.items()]
     sections = [Section("Pictures", items=figures), Section("Tables", items=tables)]
-    write_report(folder / "report.html", "What the lenses tell", sections)
+    write_report(folder / "report.html", "Comparison of lenses", sections)
     return values, text
 
 

@@ -1,4 +1,4 @@
-"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours,
+"""RUN_DIR... to one page: every table and figure of the paper with our measurement: paper, ours,
 ratio, conditions.
 """
 
@@ -37,7 +37,7 @@ def run(options: Options) -> int:
     runs = dict(zip(ROLES, options.runs, strict=False))
     if (folder / JSON).is_file() and not options.force:
         raise ConfigError(
-            f"{folder / JSON} exists; give --force to write it again from the measurements beside it"
+            f"{folder / JSON} exists; give --force to write it again from the measurements in the folder"
         )
     for path in options.runs:
         finished.rows_of(path)  # refused now, not after an hour of measuring
@@ -157,5 +157,5 @@ def _write_page(folder: Path, claims: list[ClaimLine]) -> None:
         if rows:
             items.insert(0, report.Table(head, rows))
         sections.append(report.Section(place, items=items))
-    lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
+    lead = "Every table and figure of the paper with our measurement. What was not measured says which command would."
     report.write_report(folder / PAGE, "The paper, and ours", sections, lead=lead)

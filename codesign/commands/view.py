@@ -1,4 +1,4 @@
-"""Panels of a co-design run (training, searches, networks, answers, lens), of rendered
+"""Panels of a co-design run (training, searches, networks, predictions, lens), of rendered
 eyes, of a budget.
 """
 

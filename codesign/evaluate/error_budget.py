@@ -464,7 +464,7 @@ class ErrorBudget:
             rows_of = supercell.estimate_neighbour_coupling(self.lens)
         except CellError:
             return  # films or tilted walls: rows of those are not solved
-        method = "rows of unlike pillars solved as one cell"
+        method = "rows of unequal pillars solved as one cell"
         yield self._changed("neighbours", method, factor=self._coupling(rows_of))
 
     def _mask(self) -> Iterator[BudgetEntry]:

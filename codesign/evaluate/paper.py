@@ -1,4 +1,4 @@
-"""Claims of the paper beside what was measured here, with the conditions of both."""
+"""Claims of the paper and what was measured here, with the conditions of both."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Options of the verbs of co-design, apart from their work: what ``--help`` shows needs
+"""Options of the verbs of co-design, without their work: what ``--help`` shows needs
 neither torch nor time.
 """
 

@@ -19,7 +19,7 @@ class Options(CommonOptions):
 
     Attributes:
         lens: lens.h5.
-        output: budget.h5 to write; a report lies beside it as .html.
+        output: budget.h5 to write; with a report as .html.
         library: library.h5 that the lens was made from: parts solver and proxy.
         process: PROCESS.toml: adds mask grid and process spread.
         asbuilt: asbuilt.h5 of the same lens: adds the calibration uncertainty.

@@ -21,7 +21,7 @@ class Options(CommonOptions):
         config: RUN.toml.
         output: folder of the run.
         resume: go on from the folder's checkpoint, bit for bit.
-        freeze: parts that stay as they start, beside those of the config: the
+        freeze: parts that stay as they start, besides those of the config: the
             ablations.
         device: of images and network; auto takes a GPU where there is one. Frames are
             rendered on the processor.

@@ -23,7 +23,7 @@ class Options(CommonOptions):
             metalens retrain shows its network before the lens as made;
             nominal.safetensors in it, the unwarned one.
         output: folder for experiment.json, ambiguity.png, errors.png, report.html and,
-            of every run that tells the optic axis, people_1.h5 ...: what calibrates a wearer of that
+            of every run that predicts the optic axis, people_1.h5 ...: what calibrates a wearer of that
             device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.
         frames: folder of own eye frames on the run's sensor, and frames.csv with a row for each: file; as far as

@@ -1,4 +1,4 @@
-"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: information about
 depth, and about whole scenes.
 """
 

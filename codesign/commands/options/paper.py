@@ -1,4 +1,4 @@
-"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours,
+"""RUN_DIR... to one page: every table and figure of the paper with our measurement: paper, ours,
 ratio, conditions.
 """
 
@@ -22,7 +22,7 @@ class Options(CommonOptions):
             far as there are; without any, the claims are listed with the commands that
             measure them.
         output: folder for paper.json, report.html, and the measurements in optics,
-            experiment and dim beside them.
+            experiment and dim in it.
         subjects: of the experiment.
         scenes: of Table 1; imaged at the largest ``optics.image_tolerance`` of the
             runs.
