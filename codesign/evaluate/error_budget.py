@@ -135,7 +135,7 @@ class NetworkReading:
         self.subjects: list[RenderedFrames] = []
         trials = []
         for subject in range(config.subjects):
-            states, trial = experiment.states_of(config, subject, self.scenes)
+            states, trial = experiment.draw_trials(config, subject, self.scenes)
             self.subjects.append(
                 experiment.render_subject(states, config, subject, self.scenes)
             )
@@ -254,7 +254,7 @@ class NetworkReading:
             )
             for subject, rendered in enumerate(subjects)
         ]
-        return experiment.read_from(predictions, self.source)
+        return experiment.collect_readings(predictions, self.source)
 
 
 class ErrorBudget:

@@ -128,7 +128,7 @@ class RunResult:
         }
 
 
-def states_of(
+def draw_trials(
     config: ExperimentConfig, subject: int, scenes: EyeScenes
 ) -> tuple[EyeStates, ExperimentTrials]:
     """Eye states and true values of all frames of one subject, slippage state by state,
@@ -176,7 +176,7 @@ def states_of(
     trial = ExperimentTrials(
         np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state]
     )
-    return turned_to(states, gaze_deg, scenes.rig), trial
+    return turn_eyes(states, gaze_deg, scenes.rig), trial
 
 
 def render_subject(
@@ -198,7 +198,7 @@ def render_subject(
     return render_dressed(states, worn, rig=scenes.rig, camera=scenes.camera)
 
 
-def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
+def turn_eyes(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
     """Eye states turned until their visual axes point in given directions, to 1e-5
     degrees.
 
@@ -247,7 +247,7 @@ def predict_rendered(
         quiet: no noise.
     """
     batch = as_batch(rendered, source.settings.scenes.margin)
-    return predict_of_run(
+    return predict_with_run(
         source,
         assess.read_batch(
             source.run.trainer, batch, imager, seed=seed, sensor=sensor, quiet=quiet
@@ -255,7 +255,7 @@ def predict_rendered(
     )
 
 
-def predict_of_run(source: FinishedRun, frames: SensorFrames) -> FramePredictions:
+def predict_with_run(source: FinishedRun, frames: SensorFrames) -> FramePredictions:
     """Pupil, slippage and axis that a run's network predicts from sensor frames.
 
     Args:
@@ -284,7 +284,7 @@ def experiment_sensors(
     if config.snr_db is None:
         return sensors
     scenes = sources[0].run.scenes(EXPERIMENT)
-    states, _ = states_of(config, 0, scenes)
+    states, _ = draw_trials(config, 0, scenes)
     at_origin = states[slice(len(config.stimuli_deg))]
     frames = render_subject(at_origin, config, 0, scenes)
     pitch_um = float(sources[0].run.trainer.model.pitch_um.detach())
@@ -348,7 +348,7 @@ def run_experiment(
         [[] for _ in images] for *_, images in devices
     ]
     for subject in range(config.subjects):
-        states, trial = states_of(config, subject, scenes)
+        states, trial = draw_trials(config, subject, scenes)
         rendered = render_subject(states, config, subject, scenes)
         trials.append(trial)
         for (source, sensor, _, images), outputs in zip(
@@ -512,7 +512,7 @@ def run_calibrator(
         person_config = replace(
             config, axial_mm=tuple(axial), lateral_mm=tuple(lateral)
         )
-        states, trial = states_of(person_config, BEFORE + person, scenes)
+        states, trial = draw_trials(person_config, BEFORE + person, scenes)
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
         chosen_states = states[torch.from_numpy(rows)]
         rendered = render_subject(chosen_states, person_config, BEFORE + person, scenes)
@@ -526,11 +526,13 @@ def run_calibrator(
             return sphere_calibrator(source, config)
     person_of_frame = np.repeat(np.arange(config.people), list(map(len, stimuli_deg)))
     return shared.learn_population(
-        read_from(predictions, source), np.concatenate(stimuli_deg), person_of_frame
+        collect_readings(predictions, source),
+        np.concatenate(stimuli_deg),
+        person_of_frame,
     )
 
 
-def read_from(
+def collect_readings(
     predictions: Sequence[FramePredictions], source: FinishedRun
 ) -> NetworkReadings:
     """Readings of all frames in the units of the gaze calibration: pupil and slippage
@@ -566,7 +568,7 @@ def _result(
 
     Gaze errors are nan for calibration frames.
     """
-    readings = read_from(predictions, source)
+    readings = collect_readings(predictions, source)
     predicted, judged = calibrated_gaze(readings, trial, config, calibrator)
     error = np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
     return RunResult(

@@ -118,10 +118,10 @@ def predict_own_frames(
     deviation, mean = torch.std_mean(counts, (1, 2), keepdim=True)
     frames = ((counts - mean) / deviation.clamp_min(1e-6))[:, None].float()
     wide = frame_wide(samples, sample_um, pitch_um)
-    predicted = experiment.predict_of_run(
+    predicted = experiment.predict_with_run(
         source, SensorFrames(frames, mask, blank, settings.inner.batch, blank, wide)
     )
-    read = experiment.read_from([predicted], source)
+    read = experiment.collect_readings([predicted], source)
     pupil_px = read.pupil_mm * 1e3 / pitch_um + (size - 1) / 2
     values = {"pupil": pupil_px, "slip": read.slip_mm}
     table: dict[str, Any] = {"file": [row["file"] for row in rows]}

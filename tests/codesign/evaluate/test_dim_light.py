@@ -32,7 +32,7 @@ def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):
     here, there, half = experiment.experiment_sensors([source, source, other], CONFIG)
     assert here == there
     scenes = source.run.scenes(experiment.EXPERIMENT)
-    states, _ = experiment.states_of(CONFIG, 0, scenes)
+    states, _ = experiment.draw_trials(CONFIG, 0, scenes)
     made = experiment.render_subject(states[slice(12)], CONFIG, 0, scenes)
     level = float(made.pinhole().mean())
     share = (source.settings.run.pitch_um / here.base_pitch_um) ** 2

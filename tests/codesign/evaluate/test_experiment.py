@@ -57,7 +57,7 @@ def _trial(config, subjects):
 
 def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
     scenes = finished.load_finished_run(folder / "run").run.scenes(9)
-    states, trial = experiment.states_of(SMALL, 1, scenes)
+    states, trial = experiment.draw_trials(SMALL, 1, scenes)
     assert np.allclose(states.slip_um.numpy() * 1e-3, trial.slip_mm)
     assert np.ptp(states.trait("size").numpy()) == 0  # one subject
     assert np.ptp(states.trait("pupil_radius_um").numpy()) > 0  # whose pupil moves
@@ -71,7 +71,7 @@ def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
         assert (
             np.abs(found - want).max() < 1e-6
         )  # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
-    other, _ = experiment.states_of(SMALL, 2, scenes)
+    other, _ = experiment.draw_trials(SMALL, 2, scenes)
     assert float(other.trait("size")[0]) != float(states.trait("size")[0])
 
 
@@ -126,7 +126,7 @@ def test_an_eye_that_would_slip_into_the_lens_is_refused():
     with pytest.raises(
         ConfigError, match=r"axial_mm \(-21.0,\): the eye stands 21 mm before the lens"
     ):
-        experiment.states_of(replace(SMALL, axial_mm=(-21.0,)), 0, scenes)
+        experiment.draw_trials(replace(SMALL, axial_mm=(-21.0,)), 0, scenes)
 
 
 @pytest.mark.parametrize(

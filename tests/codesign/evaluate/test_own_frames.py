@@ -32,12 +32,12 @@ def device(tmp_path_factory):
     m.finished_run(folder / "run")
     source = finished.load_finished_run(folder / "run")
     scenes, trainer = source.run.scenes(EXPERIMENT), source.run.trainer
-    states, trial = experiment.states_of(CONFIG, 3, scenes)
+    states, trial = experiment.draw_trials(CONFIG, 3, scenes)
     rendered = experiment.render_subject(states, CONFIG, 3, scenes)
     imager = experiment.prepare_run(source)
     batch = as_batch(rendered, source.settings.scenes.margin)
     frames = assess.read_batch(trainer, batch, imager, seed=8)
-    predicted = experiment.predict_of_run(source, frames)
+    predicted = experiment.predict_with_run(source, frames)
     (folder / "frames").mkdir()
     rows = []
     for k, frame in enumerate(frames.frames[:, 0].double().numpy()):
