@@ -577,7 +577,7 @@ def _is_square(problem: CellProblem) -> bool:
 
 
 def solve_problem(
-    problem: CellProblem, reach: int, tolerance: float = 0.0
+    problem: CellProblem, reach: int, tolerance: float = 1e-5
 ) -> TruncatedSolution:
     """t and r of the problem's polarisations at one truncation.
 
@@ -587,7 +587,7 @@ def solve_problem(
 
     Args:
         problem: cell and light. reach: harmonics.
-        tolerance: of t and r, of which the wall has a tenth; 0: all of ``STEPS``.
+        tolerance: of t and r, of which the wall has a tenth.
     """
     row: list[Array] = []  # extrapolated amplitudes, of rising order
     for i, steps in enumerate(STEPS if problem.cell.sidewall_rad else (1,)):
