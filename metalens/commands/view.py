@@ -13,7 +13,7 @@ from metalens.cli import VIEWS
 from metalens.commands.common import MASKS, CommonOptions, MaybeOutput
 from metalens.core import store, transaction
 from metalens.core.errors import ConfigError
-from metalens.view import Panel, write_page
+from metalens.view import Panel, page_html
 
 # kind of a folder by patterns of file names, any of which it holds
 FOLDERS = {
@@ -58,7 +58,8 @@ def run(options: Options) -> int:
     with options.claim(target) as draft:
         kind = kind_of(options.file)
         title, panels = f"{options.file.name} ({kind})", panels_of(kind)(options.file)
-        write_page(draft.path, title, panels, about=_about(options.file))
+        page = page_html(title, panels, about=_about(options.file))
+        store.write_text(draft.path, page)
     size = target.stat().st_size
     options.console.result(
         {"page": target.name, "panels": len(panels), "bytes": size},

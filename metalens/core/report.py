@@ -462,27 +462,19 @@ class CommandConsole:
         return 1 if failed else 0
 
     def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
-        """Yield ``items`` while showing progress, rate and remaining time.
+        """Yield ``items`` while printing progress, rate and remaining time every 5 s.
 
         Args:
             items: that are passed through.
             total: how many there are.
             label: of the progress.
         """
-        if self.quiet or self.json:
-            yield from items
-            return
-        live = sys.stdout.isatty()
         start = last_shown = time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            ended = done == total and (live or now - start > 2)
-            if now - last_shown > (0.2 if live else 10) or ended:
+            if now - last_shown > 5 or (done == total and now - start > 2):
                 rate = done / (now - start)
                 left = (total - done) / rate
-                text = f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left"
-                # on a terminal the line is written over: return, and erase to its end
-                end = "\n" if ended or not live else ""
-                flush_output(f"\r{text}\033[K{end}" if live else f"{text}\n")
+                self.say(f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left")
                 last_shown = now

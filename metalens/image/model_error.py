@@ -170,32 +170,18 @@ def gathering_error(
     share = _triangles(count, finer)
     edge = (window.samples - count) // 2
     middle = slice(edge, edge + count)
-    errors, lights = [], []
+    sampled = window.step_um, count + 1, finer
     with torch.no_grad():
-        for place in at[0]:
-            light = _of_pillars(
-                optics,
-                wave,
-                wavelength_um,
-                (place, at[1]),
-                (window.step_um, count + 1, finer),
-            )
-            reference = share @ light @ share.T
-            psf = psfs(
-                optics,
-                place[None],
-                depths_um=at[1],
-                wavelength_um=wavelength_um,
-                window=window,
-            )[0, :, middle, middle]
-            errors.append(
-                texture_error(
-                    psf / psf.sum((-1, -2), keepdim=True),
-                    reference / reference.sum((-1, -2), keepdim=True),
-                )
-            )
-            lights.append(psf.sum((-1, -2)))
-    return weigh_by_light(torch.stack(errors), torch.stack(lights))
+        light = [
+            _of_pillars(optics, wave, wavelength_um, (place, at[1]), sampled)
+            for place in at[0]
+        ]
+        psf = psfs(
+            optics, at[0], depths_um=at[1], wavelength_um=wavelength_um, window=window
+        )[..., middle, middle]
+    reference = share @ torch.stack(light) @ share.T
+    units = [part / part.sum((-1, -2), keepdim=True) for part in (psf, reference)]
+    return weigh_by_light(texture_error(*units), psf.sum((-1, -2)))
 
 
 def _triangles(count: int, finer: int) -> Tensor:

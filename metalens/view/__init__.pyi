@@ -1,6 +1,5 @@
 from .artefacts import lens_panels as lens_panels
 from .page import page_html as page_html
-from .page import write_page as write_page
 from .panels import ClassMapPanel as ClassMapPanel
 from .panels import CurvePanel as CurvePanel
 from .panels import DrawingPanel as DrawingPanel

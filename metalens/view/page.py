@@ -9,13 +9,11 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from metalens import __version__
-from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.view.panels import CurvePanel, ImagePanel, OutlinePanel, Panel
 
@@ -25,27 +23,6 @@ DTYPES = {
     "uint8": "Uint8Array",
     "uint16": "Uint16Array",
 }
-
-
-def write_page(
-    path: str | Path,
-    title: str,
-    panels: Sequence[Panel],
-    *,
-    about: Mapping[str, Any] | None = None,
-) -> None:
-    """Write the page.
-
-    Args:
-        path: of the page.
-        title: file and kind.
-        panels: in order.
-        about: header and provenance, shown at the end.
-
-    Raises:
-        OSError: the target cannot be written.
-    """
-    store.write_text(path, page_html(title, panels, about=about))
 
 
 def page_html(

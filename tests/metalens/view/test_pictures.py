@@ -36,7 +36,7 @@ def _colour(share):
 
 
 def _told(folder, panels, script, *, width=1440):
-    page.write_page(folder / "page.html", "page", panels)
+    (folder / "page.html").write_text(page.page_html("page", panels))
     return told(folder / "page.html", script, width=width)
 
 
@@ -191,11 +191,8 @@ def test_a_map_reaches_the_paper(tmp_path):
     index = np.where(np.hypot(*(np.mgrid[:300, :300] - 150)) < 140, 1, 0).astype(
         np.uint8
     )
-    page.write_page(
-        tmp_path / "page.html",
-        "page",
-        [ClassMapPanel("mask", index, np.array([120.0]), 0.3, "nm")],
-    )
+    panels = [ClassMapPanel("mask", index, np.array([120.0]), 0.3, "nm")]
+    (tmp_path / "page.html").write_text(page.page_html("page", panels))
     printed(tmp_path / "page.html", tmp_path / "page.pdf")
     sheets = (tmp_path / "page.pdf").read_bytes()
     wide = [

@@ -178,7 +178,7 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
     else:
         panels = getattr(artefacts, f"{what}_panels")(folder / f"{what}.h5")
     path = tmp_path / "page.html"
-    page.write_page(path, what, panels, about={"settings": "x = 1"})
+    path.write_text(page.page_html(what, panels, about={"settings": "x = 1"}))
     shown = told(path, "return document.documentElement.outerHTML")
     assert 'data-ready="true"' in shown
     assert 'class="failed"' not in shown
