@@ -38,7 +38,7 @@ class Options(CommonOptions):
     """Options of ``metalens demo``.
 
     Attributes:
-        output: folder for everything that is made; report.html is the page to open.
+        output: folder of all results; report.html is the page to open.
         config: CHAIN.toml of your own (cell, design, process; psf, bench_design,
             bench_truth, bench_metrology, run):
             the same chain unattended, at any size.
@@ -190,7 +190,7 @@ def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
         for o in outcomes
     ]
     timing = report.Table(
-        head, rows, "Time beside error. Run any of these yourself in this folder."
+        head, rows, "Time and error. Run any of these yourself in this folder."
     )
     sections = [
         report.Section(

@@ -35,7 +35,7 @@ class Options(CommonOptions):
         config: CELL.toml, of which [cell] and the first wavelength of [sweep] are
             taken.
         diameter_um: of the pillar (of other shapes their size).
-        output: the file to write; NAME.png beside it.
+        output: the file to write; NAME.png next to it.
         wavelength_nm: in vacuum; left out, the first of [sweep].
         angle_deg: of the light outside, in air.
         azimuth_deg: of the plane of incidence, from +x to +y.

@@ -39,7 +39,7 @@ class Options(CommonOptions):
         file: library.h5, lens.h5, psf.h5, asbuilt.h5 and most other HDF5 files of the
             toolchain; a mask (GDSII or OASIS);
             or the folder of a mask, of captures or of a co-design run.
-        output: the page to write; by default the file's name with .html, beside it, or
+        output: the page to write; by default the file's name with .html, next to it, or
             with _view.html where a report
             of that name stands there.
     """

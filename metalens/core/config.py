@@ -430,7 +430,7 @@ def _dump(record: Any, prefix: str, lines: list[str]) -> None:
     }
     for key, value in values.items():
         if key not in tables and key not in lists and value is not None:
-            lines.append(f"{key} = {_text(value)}")
+            lines.append(f"{key} = {_toml_value(value)}")
     for key, value in tables.items():
         lines += ["", f"[{prefix}{key}]"]
         _dump(value, f"{prefix}{key}.", lines)
@@ -440,14 +440,14 @@ def _dump(record: Any, prefix: str, lines: list[str]) -> None:
             _dump(entry, f"{prefix}{key}.", lines)
 
 
-def _text(value: Any) -> str:
+def _toml_value(value: Any) -> str:
     """A plain value in TOML."""
     if hasattr(value, "item"):  # a scalar of NumPy
         value = value.item()
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return "[" + ", ".join(_text(v) for v in value) + "]"
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     if isinstance(value, str | Path):
         # strings of JSON are strings of TOML, but for the control character 7f
         return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

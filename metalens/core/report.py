@@ -338,12 +338,12 @@ def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _finite(value: Any) -> Any:
+def _finite_or_none(value: Any) -> Any:
     """A value for JSON: None in place of numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {name: _finite(part) for name, part in value.items()}
+        return {name: _finite_or_none(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
+        return [_finite_or_none(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -441,7 +441,9 @@ class CommandConsole:
         In JSON None stands for numbers that are not finite.
         """
         if self.json:
-            flush_output(json.dumps(_finite(values), indent=1, default=float) + "\n")
+            flush_output(
+                json.dumps(_finite_or_none(values), indent=1, default=float) + "\n"
+            )
         else:
             self.say(text)
 

@@ -69,7 +69,7 @@ def run_split(count: int, work: Callable[[int, int], object]) -> None:
     stop = getattr(_CONCURRENT, "stop", None)
     if stop is not None and stop.is_set():
         raise WorkStopped
-    _shared(count, min(thread_count(), count), work)
+    _run_parts(count, min(thread_count(), count), work)
 
 
 def run_concurrently(*works: Callable[[], Any]) -> list[Any]:
@@ -104,12 +104,12 @@ def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:
         work(start, stop)
 
     try:
-        _shared(count, min(torch_threads, count), work_single_threaded)
+        _run_parts(count, min(torch_threads, count), work_single_threaded)
     finally:
         torch.set_num_threads(torch_threads)
 
 
-def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
+def _run_parts(count: int, parts: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in ``parts``, the first in this
     thread.
     """

@@ -269,7 +269,7 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
             yield scratch
         except OSError as error:
             if error.filename is None:  # a full disk
-                error.add_note(f"{target} could not be made")
+                error.add_note(f"{target} could not be written")
             raise
 
 
@@ -418,7 +418,7 @@ def write_manifest(folder: Path, command: str, *, finished: bool = True) -> None
 
     Args:
         folder: that is listed.
-        command: that made it.
+        command: that wrote it.
         finished: False while the folder is being filled; no files are listed then.
     """
     listed = {

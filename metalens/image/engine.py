@@ -81,7 +81,7 @@ def imager(
 
     Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may
     leave it above the
-        tolerance (``edge``: light that a small aperture's rim bends beyond the window).
+        tolerance (``edge``: light that the rim of a small aperture diffracts beyond the window).
     """
     _check(field, polarisation)
     if layers is None:

@@ -90,7 +90,7 @@ class PupilSampling:
     the padded transform, harmonics
     that are kept.
 
-    beyond: share of the light that a sharp round rim at p bends beyond the period (half
+    beyond: share of the light that a sharp round rim at p diffracts beyond the period (half
     of it, less the spare, is h),
         4√2 / (π² k p h); the transform folds it back.
     dimmed: share that a window lacks and is given back: nodes are the mean of their

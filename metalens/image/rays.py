@@ -1,4 +1,4 @@
-"""Rays of one field point: where they leave the lens, how the window bends them, and
+"""Rays of one field point: where they leave the lens, how they turn over the window, and
 their paths from the sources.
 """
 

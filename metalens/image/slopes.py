@@ -49,10 +49,10 @@ class _ByNodes(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, psf: Tensor, shares: Tensor, content: Tensor, about: Any
+        ctx: Any, psf: Tensor, shares: Tensor, content: Tensor, options: Any
     ) -> Tensor:
         ctx.save_for_backward(psf, shares, content)
-        ctx.about = about
+        ctx.options = options
         return torch.zeros_like(content)
 
     @staticmethod
@@ -64,7 +64,7 @@ class _ByNodes(torch.autograd.Function):
         correlation of the image's gradient with the other factors, by FFT.
         """
         psf, shares, content = tuple[Tensor, ...](ctx.saved_tensors)
-        illumination, illuminated, asked = ctx.about
+        illumination, illuminated, asked = ctx.options
         rows, columns, depths, h, w = psf.shape
         to_coefficients = spline_coefficients(depths).to(content)
         height, width = content.shape[-2:]

@@ -88,7 +88,7 @@ class PillarWave:
     differentiable in. cell_um: width of
     the cells, a whole number of pitches, one at least.
 
-    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.neighbour_coupling`,
+    Different neighbours count where the lens holds their rows (:mod:`metalens.psf.neighbour_coupling`,
     the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image;
     what of it lands in the window is
@@ -96,8 +96,8 @@ class PillarWave:
 
     Raises:
         SceneError: another lattice than a square one, turned pillars, those of two
-            sizes, or such that answer x and y
-            apart.
+            sizes, or such that transmit x and y
+            differently.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class PillarWave:
     ) -> None:
         if lens.pairs is not None:
             raise SceneError(
-                "pillars of two sizes answer x and y apart: the image of the whole field is of unpolarised light and "
+                "pillars of two sizes differ along x and y: the image of the whole field is of unpolarised light and "
                 "of pillars of one size; metalens psf LENS --light x (or y, or both) gives PSFs of single directions"
             )
         if not lens.diameters.plain:
@@ -116,7 +116,7 @@ class PillarWave:
             )
         if lens.one_light:
             raise SceneError(
-                f"pillars ({lens.cell.described}) that answer x and y apart, of which the lens knows {lens.one_light} "
+                f"pillars ({lens.cell.described}) that differ along x and y, of which the lens knows {lens.one_light} "
                 "alone: the image is of unpolarised light (metalens psf says of which light it is)"
             )
         self.lens = lens

@@ -260,16 +260,16 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
     wave = complex(np.cos(angle), np.sin(angle)) * np.sqrt(0.5)
     if a < LONGEST:
         i = int(a * STEPS)
-        bent = table[i] + (a * STEPS - i) * (table[i + 1] - table[i])
+        amplitude = table[i] + (a * STEPS - i) * (table[i + 1] - table[i])
     else:
         part = complex(0.0, -1 / (np.pi * a * a))  # 1 / (iπw²)
-        bent = a * part * (1 + part * (1 + 3 * part * (1 + 5 * part)))
-    field = 1 + wave * bent if w >= 0 else -wave * bent
+        amplitude = a * part * (1 + part * (1 + 3 * part * (1 + 5 * part)))
+    field = 1 + wave * amplitude if w >= 0 else -wave * amplitude
     return field, w * field + complex(0.0, 1 / np.pi) * wave
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyped-def]
+def _fill_edge_factor(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyped-def]
     """Write S of :func:`edge_diffraction_factor` at places (x, y) into ``out``.
 
     The edge at the nearest point of the rim is straight, with its curvature to first
@@ -294,10 +294,10 @@ def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyp
         half = width[i] * scale / 2
         upper = _wave(middle + half, table)
         lower = _wave(middle - half, table)
-        bent = complex(
+        curvature = complex(
             0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i])
         )
-        out[i] = (upper[1] - lower[1]) / (2 * half) - bent * (upper[0] - lower[0])
+        out[i] = (upper[1] - lower[1]) / (2 * half) - curvature * (upper[0] - lower[0])
 
 
 def edge_diffraction_factor(
@@ -329,7 +329,7 @@ def edge_diffraction_factor(
     out = np.empty(len(x), complex)
 
     def work(a: int, b: int) -> None:
-        _fill(
+        _fill_edge_factor(
             x[a:b],
             y[a:b],
             width[a:b],

@@ -1,6 +1,4 @@
-"""Differences of optical paths, without cancellation: numpy, torch and plain numbers
-alike.
-"""
+"""Differences of optical paths, without cancellation, of numpy, torch and plain numbers."""
 
 import math
 from typing import Any

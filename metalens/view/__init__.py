@@ -1,5 +1,5 @@
 """One self-contained page to explore an artefact: figures that can be turned, their
-numbers beside them.
+numbers next to them.
 """
 
 import lazy_loader
