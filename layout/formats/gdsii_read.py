@@ -11,6 +11,7 @@ from layout.formats.files import CONTEXT_CELL, decode_name, map_bytes, release_b
 from layout.formats.library import MaskCell, MaskLibrary, Orientation
 from layout.formats.open_cell import OpenCell, PlacementSums, has_area
 from layout.formats.read_loops import FARTHEST, sref_run
+from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -223,18 +224,22 @@ class _Reader:
             raise self.fail(f"element with a wrong or missing {gds.NAMES[kind]}")
         return np.frombuffer(data, f">i{size}").astype(np.int64)
 
-    def boundary(self, kind: int) -> tuple[tuple[int, int], Array]:
+    def layer(self, records: dict[int, bytes], kind: int) -> LayerNumber:
+        """Layer and datatype of an element, unsigned 16 bits each."""
+        number, datatype = (
+            int(self.numbers(records, k, 1)[0]) & 0xFFFF for k in (gds.LAYER, kind)
+        )
+        return number, datatype
+
+    def boundary(self, kind: int) -> tuple[LayerNumber, Array]:
         """Layer and corners of an outline, closed where the file leaves it open."""
         records = self.fields()
-        layer = int(self.numbers(records, gds.LAYER, 1)[0])
-        datatype = int(
-            self.numbers(
-                records, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
-            )[0]
+        layer = self.layer(
+            records, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE
         )
         points = self.points(records)
         closed = len(points) > 1 and (points[0] == points[-1]).all()
-        return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1] if closed else points
+        return layer, points[:-1] if closed else points
 
     def points(self, records: dict[int, bytes]) -> Array:
         """(n, 2) points of an element, n >= 1."""
@@ -313,26 +318,22 @@ class _Reader:
         # absolute angle and size (bits 13, 14) are ignored, as other readers do
         return Orientation(angle % 360, bool(flags[0] & 128), scale)
 
-    def line(self) -> tuple[tuple[int, int], Array]:
+    def line(self) -> tuple[LayerNumber, Array]:
         """Layer and outline of a path; a negative width does not scale with references,
-        which is ignored as other readers do.
+        which is ignored.
         """
         records = self.fields()
-        layer, datatype = (
-            int(self.numbers(records, kind, 1)[0]) for kind in (gds.LAYER, gds.DATATYPE)
-        )
+        layer = self.layer(records, gds.DATATYPE)
         points = self.points(records)
         width, begin, end = (
             self.whole(records, kind) for kind in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
         )
-        path_type = (
-            int(self.numbers(records, gds.PATHTYPE, 1)[0])
-            if gds.PATHTYPE in records
-            else 0
-        )
+        path_type = 0
+        if gds.PATHTYPE in records:
+            path_type = int(self.numbers(records, gds.PATHTYPE, 1)[0])
         half = abs(width) / 2
         if not half:
-            return (layer & 0xFFFF, datatype & 0xFFFF), points[:1]
+            return layer, points[:1]
         extensions = {1: (half, half), 2: (half, half), 4: (float(begin), float(end))}
         begin_extension, end_extension = extensions.get(path_type, (0.0, 0.0))
         outline = paths.path_outline(
@@ -342,7 +343,7 @@ class _Reader:
             end=end_extension,
             rounded=path_type == 1,
         )
-        return (layer & 0xFFFF, datatype & 0xFFFF), outline
+        return layer, outline
 
     def whole(self, records: dict[int, bytes], kind: int) -> int:
         """A 32-bit number that an element may have; 0 without."""
