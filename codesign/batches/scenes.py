@@ -3,7 +3,7 @@ depth not readable from size.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -64,6 +64,7 @@ class SceneConfig:
     elevation_deg: of the camera below the gaze straight ahead. azimuth_deg: of the
     camera towards the temple. eye_distance_mm: lens to pupil without slippage.
     right_eye: the mirror image of the left eye before the same camera.
+    blinks: share of the frames whose lids are closed.
     pool: frames that training draws from again and again, at another scale each time; 0
     renders every frame anew.
     """
@@ -80,6 +81,7 @@ class SceneConfig:
     azimuth_deg: float = 0.0
     eye_distance_mm: float = 21.0
     right_eye: bool = False
+    blinks: float = field(default=0.0, metadata={"most": 1.0})
 
     def __post_init__(self) -> None:
         if (
@@ -189,12 +191,9 @@ class EyeScenes:
         )
         depth = self.rig.distance_um + plain.slip_um[:, 2]
         generator = np.random.default_rng((self.seed, self.stream, step, 1))
-        return replace(
-            plain,
-            scale=draw_depth_scales(
-                depth, self.depths_um, self.settings.scale, generator
-            ),
-        )
+        scale = draw_depth_scales(depth, self.depths_um, self.settings.scale, generator)
+        is_open = torch.from_numpy(generator.random(size) >= self.settings.blinks)
+        return replace(plain, scale=scale, aperture=plain.aperture * is_open)
 
     def rendered(self, step: int, size: int) -> RenderedFrames:
         """Frames of a step with all labels and the augmentations of the scenes'

@@ -23,6 +23,7 @@ OUTPUTS = {  # name: what it is
     "slip_sd_mm": "(batch, 3) standard deviation that the network gives it, not calibrated, mm",
     "points_mm": "(batch, 10, 2) nine landmarks (codesign.eye.NAMES) and the pupil's middle, as pupil_mm",
     "axis_deg": "(batch, 2) angles of the optic axis across (right +) and down in the frame of the face, deg",
+    "pupil_area_mm2": "(batch,) area of the pupil on the sensor, near 0 behind closed lids, mm²",
 }
 
 
@@ -74,6 +75,8 @@ class ExportedNetwork(nn.Module):
             "slip_sd_mm": prediction.slip_log_sd.exp() * unit,
             "points_mm": prediction.points * self.scale.frame_mm,
             "axis_deg": self._angles(prediction.axis),
+            "pupil_area_mm2": torch.sigmoid(prediction.mask_logits).mean((1, 2))
+            * self.scale.frame_mm**2,
         }
         return tuple(outputs[name] for name in self.scale.outputs)
 

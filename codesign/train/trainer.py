@@ -580,6 +580,7 @@ class Trainer:
             inputs.light.shape[-1], self.optics.sample_um, float(pitch.detach())
         )
         mask = losses.mask_in_frame(batch.mask, frame_width)
+        is_open = (batch.mask.amax((1, 2)) > 0)[:, None]
         shift_mm = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
             prediction = self.model.net(frames[resized[a]], a)
@@ -594,10 +595,14 @@ class Trainer:
                 depth_weight=self.inner.depth_weight,
             )
             if pose is not None:
+                # behind closed lids the pose is not known: no error, no gradient
+                found = prediction.axis.detach(), prediction.points.detach()
+                axis = torch.where(is_open, pose.axis, found[0])
+                points = pose.points / frame_width
                 loss = loss + losses.pose_loss(
                     prediction,
-                    pose.axis,
-                    pose.points / frame_width,
+                    axis,
+                    torch.where(is_open[:, None], points, found[1]),
                     axis_weight=self.inner.axis_weight,
                     point_weight=self.inner.point_weight,
                 )

@@ -180,3 +180,18 @@ def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
     )  # single precision, and a pixel between two codes of 4096
     near = SingleSurfaceFrames(light, np.full_like(depth, 16_000), frames.scale)
     assert float((sensor_irradiance(near, imager) - want).norm() / contrast) > 0.05
+
+
+def test_closed_lids_come_in_their_share_and_change_nothing_else():
+    plain, blinking = (
+        EyeScenes(SceneConfig(pixels=32, margin=0, blinks=share), 36.0, 2000.0, seed=4)
+        for share in (0.0, 0.4)
+    )
+    before, after = plain.states(2, 400), blinking.states(2, 400)
+    shut = after.aperture == 0
+    # four sigma of 400 draws
+    assert float(shut.double().mean()) == pytest.approx(0.4, abs=0.1)
+    assert torch.equal(before.aperture[~shut], after.aperture[~shut])
+    assert torch.equal(before.slip_um, after.slip_um)
+    masks = blinking.batch(2, 40).mask.amax((1, 2))
+    assert float(masks[blinking.states(2, 40).aperture == 0].max()) == 0

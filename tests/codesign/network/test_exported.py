@@ -88,6 +88,9 @@ def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(graphs, case)
             "slip_sd_mm": np.exp(want.slip_log_sd.numpy()) * unit,
             "points_mm": 1.87 * want.points.numpy(),
             "axis_deg": _angles_deg(want.axis.double().numpy(), 0.6),
+            "pupil_area_mm2": (1.87**2 / (1 + np.exp(-want.mask_logits.numpy()))).mean(
+                (1, 2)
+            ),
         }
         assert [value.name for value in session.get_outputs()] == list(told)
         for value, (name, expected) in zip(found, told.items(), strict=True):
@@ -116,6 +119,7 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
         "pupil_mm",
         "slip_mm",
         "slip_sd_mm",
+        "pupil_area_mm2",
     ]
     assert {
         v.name: v.doc_string[-2:] for v in whole.graph.output if v.name.endswith("_mm")
