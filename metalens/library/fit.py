@@ -460,8 +460,10 @@ def _choose_domain(
     _, best = min(attempts, key=itemgetter(0))
     if best is None or _cost(best, [max(MOST_ERROR, t) for t in tolerances]) > 1:
         raise DomainError(
-            f"no polynomial of {terms} coefficients follows the library, with |T| between 0 and 1 and "
-            f"a phase that does not turn back, even up to {shortest.diameter_um[-1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+            f"no polynomial of {terms} coefficients follows the library, with |T| "
+            "between 0 and 1 and a phase that does not turn back, even up to "
+            f"{shortest.diameter_um[-1]:.4g} um: sweep with more samples, or fewer "
+            "wavelengths and angles"
         )
     return shortest, best
 
