@@ -229,6 +229,7 @@ def bench(p: Pillars, shift: np.ndarray) -> np.ndarray:
     return plain.on_pixels(np.abs(field) ** 2, weight) / apparent[:, None, None] ** 2
 
 
+@cache
 def _true_frames(lens_path: Path) -> np.ndarray:
     """Electrons of the hidden lens, without noise."""
     hidden = small.HIDDEN
@@ -272,11 +273,15 @@ def of_fit(lens_path: Path, path: Path) -> Iterator[Output]:
     wider = pillars(lens_path, step)
     electrons = _true_frames(lens_path)
 
-    def predict(q: np.ndarray) -> np.ndarray:
-        t = base.t * (wider.t / base.t) ** (q[0] * 1e-3 / step)
-        return np.exp(q[6]) * bench(base._replace(t=t), q[1:6]) + q[7]
+    @cache
+    def lit(bias_nm: float, *shift: float) -> np.ndarray:
+        t = base.t * (wider.t / base.t) ** (bias_nm * 1e-3 / step)
+        return bench(base._replace(t=t), np.array(shift))
 
-    light = bench(base, np.zeros(5))
+    def predict(q: np.ndarray) -> np.ndarray:
+        return np.exp(q[6]) * lit(*q[:6].tolist()) + q[7]
+
+    light = lit(*[0.0] * 6)
     place = np.array([0.0, 0, 0, 0, 0, 0, np.log(small.PEAK_E / light.max()), 0.0])
     steps = np.array([0.5, 0.3, 0.02, 0.05, 0.05, 3.0, 0.01, 1.0])
     sigma = plain.fisher_sigma(predict, place, steps, electrons + small.READ_E**2)
