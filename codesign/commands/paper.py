@@ -112,7 +112,12 @@ def _run_measurements(options: Options, folder: Path) -> None:
         if not (folder / name / "experiment.json").is_file():
             options.console.say(f"measuring: {name}")
             experiment = experiment_options.Options(
-                options.runs, folder / name, names, settings, quiet=True, force=True
+                options.runs,
+                folder / name,
+                names,
+                settings=settings,
+                quiet=True,
+                force=True,
             )
             command_experiment.run(experiment)
     if not (folder / "optics" / "optics.json").is_file():

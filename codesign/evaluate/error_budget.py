@@ -67,8 +67,8 @@ def quadrature_total(rows: list[BudgetEntry]) -> BudgetEntry:
     without_gaze = [row.link for row in counted if math.isnan(row.gaze_rad)]
     if without_gaze:
         method += f"; gaze without {', '.join(without_gaze)}"
-    columns = (root_sum_square(name) for name in ("phase_rad", "psf", "gaze_rad"))
-    return BudgetEntry(TOTAL, *columns, method)
+    phase_rad, psf, gaze_rad = map(root_sum_square, ("phase_rad", "psf", "gaze_rad"))
+    return BudgetEntry(TOTAL, phase_rad, psf, gaze_rad, method)
 
 
 @dataclass(frozen=True, slots=True)
@@ -518,8 +518,10 @@ class ErrorBudget:
             for state, shift in lenses
         ]
         total, root = quadrature_total(rows), math.sqrt(len(rows))
-        columns = total.phase_rad, total.psf, total.gaze_rad
-        return BudgetEntry(link, *(value / root for value in columns), method)
+        phase_rad, psf, gaze_rad = (
+            value / root for value in (total.phase_rad, total.psf, total.gaze_rad)
+        )
+        return BudgetEntry(link, phase_rad, psf, gaze_rad, method)
 
 
 def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:

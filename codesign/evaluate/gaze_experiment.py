@@ -451,7 +451,7 @@ def finer_imager(source: FinishedRun) -> Imager | None:
     """
     settings = assess.finer_image(source.run.trainer.optics)
     try:
-        return settings and _imager_of(source, settings)
+        return None if settings is None else _imager_of(source, settings)
     except (SceneError, PropagationError):
         return None
 

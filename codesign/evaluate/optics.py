@@ -310,9 +310,12 @@ def scene_energies(
             image / images[0].mean((1, 2), keepdim=True) for image in images
         )
         changes = [(gaze - anchor) ** 2, (slip - anchor) ** 2, (gaze - slip) ** 2]
+        of_gaze, of_slip, separability = (change.sum((1, 2)) for change in changes)
         results.append(
             SceneEnergy(
-                *(change.sum((1, 2)) for change in changes),
+                of_gaze,
+                of_slip,
+                separability,
                 optics.error,
                 torch.stack([anchor[0], changes[0][0], changes[2][0]]),
                 optics.above(settings.image_tolerance),
