@@ -31,33 +31,6 @@ _ANGLES = 8  # along a circle of points where the corrected map is judged
 DRAWS = 24
 # largest standard deviation of usable table entries: the step of drawn diameters
 WIDE_NM = 2.0
-_REMEDIES = (  # word in the name of a cause, and the measurement that removes it
-    ("side wall", "the side wall by a cross-section ([[known]] sidewall_deg)"),
-    ("refractive index", "the index by ellipsometry ([[known]] index)"),
-    (
-        "pixel pitch",
-        "the pixel pitch in the light by a target of known period (pixel_sigma_um of capture.toml)",
-    ),
-    (
-        "illumination",
-        "the light on the lens by a frame of the lamp alone ([[known]] light_x, light_y, light_r)",
-    ),
-    (
-        "glass",
-        "the glass in the beam (glass_um, glass_tilt_x_deg, glass_tilt_y_deg of capture.toml)",
-    ),
-    ("write fields", "the overlay of the write fields ([[known]] stitching_nm)"),
-    ("source", "the size of the source (pinhole_um of capture.toml)"),
-    ("spectrum", "the spectrum ([[known]] bandwidth_nm)"),
-    (
-        "tilt of the lens",
-        "the tilt of the lens, by frames at opposite field angles ([[known]] tilt_x_deg, tilt_y_deg)",
-    ),
-    (
-        "saddle",
-        "diameters round the rim by micrographs ([[known]] bias_a_nm, bias_o_nm)",
-    ),
-)
 _FRAMES = (
     "frames at source depths on both sides of focus where the spot is several pixels wide (metalens capture lens.h5 "
     "--plan lists the best), frames at a field angle, diameters from micrographs (metalens measure) or the height "
@@ -130,16 +103,6 @@ class NextMask:
         return f"{words}; bias table alone: {self.uneven}" if self.uneven else words
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class CorrectionTable:
-    """A bias table, (knots,) each: see :class:`MaskCorrection`."""
-
-    drawn_nm: Array
-    bias_nm: Array
-    designed_um: Array
-    wanted_um: Array
-
-
 def plan_next_mask(
     result: AsBuilt, *, old: Bias, truths: Sequence[Array] | None = None
 ) -> NextMask:
@@ -172,70 +135,24 @@ def plan_next_mask(
         )
         for each in zip(*lenses_of_truths, strict=True)
     ]
-    printed = printed_um(design)
 
     def bias_table_nm(x: Array) -> Array:
-        table = correction_table(
-            design, x, response=response, old=old, range_um=printed
-        )
-        return table.bias_nm
+        return propose_correction(design, x, response=response, old=old).bias_nm
 
-    table_spread = judge_correction(result, bias_table_nm)
-    map_spread = judge_correction(result, uneven_nm, part=MAP)
+    table_open = reason_left_open(result, bias_table_nm)
+    map_open = reason_left_open(result, uneven_nm, part=MAP)
     return NextMask(
         plan,
         steps,
-        refused=table_spread.words or loss_reason(steps[0], steps[1]),
-        uneven=map_spread.words or loss_reason(steps[1], steps[2]),
+        refused=table_open or loss_reason(steps[0], steps[1]),
+        uneven=map_open or loss_reason(steps[1], steps[2]),
     )
 
 
 def propose_correction(
-    design: Lens, x: Array, *, response: Sensitivity, old: Bias
+    design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: int = 13
 ) -> MaskCorrection:
     """Bias table and corrected diameter map for fitted process parameters.
-
-    Args:
-        design: as designed. x: all parameters of the fit.
-        response: of the pillars to height, index and side wall.
-        old: bias that the present mask was drawn with.
-
-    Raises:
-        ConfigError: pillars of two sizes, or the table would be steeper than the layout
-            can invert.
-    """
-    if design.pairs is not None:
-        raise ConfigError("pillars of two sizes have no bias table of one size")
-    table = correction_table(
-        design, x, response=response, old=old, range_um=printed_um(design)
-    )
-    return MaskCorrection(
-        table.drawn_nm,
-        table.bias_nm,
-        old.at(table.drawn_nm),
-        table.designed_um,
-        table.wanted_um,
-        _with_even_bias(design, x),
-    )
-
-
-def printed_um(design: Lens) -> tuple[float, float]:
-    """(least, largest) diameter of the design's pillars, um."""
-    diameter = design.diameters.diameter_um
-    least = float(diameter.min(where=diameter > 0, initial=np.inf))
-    return least, float(diameter.max())
-
-
-def correction_table(
-    design: Lens,
-    x: Array,
-    *,
-    response: Sensitivity,
-    old: Bias,
-    range_um: tuple[float, float],
-    knots: int = 13,
-) -> CorrectionTable:
-    """Bias table over drawn diameter that gives the designed phases in a process.
 
     Drawn diameter = mask rule at (corrected diameter - bias of the process); the table
     is designed minus drawn, at ``knots`` evenly spaced designed diameters.
@@ -243,23 +160,35 @@ def correction_table(
     Args:
         design: as designed. x: all parameters of a lens, in the fit's order.
         response: of the pillars to height, index and side wall.
-        old: of the present mask. range_um: least and largest diameter of the design.
+        old: bias that the present mask was drawn with.
         knots: of the table.
 
     Raises:
-        ConfigError: the table would be steeper than the layout can invert.
+        ConfigError: pillars of two sizes, or the table would be steeper than the layout
+            can invert.
     """
-    designed_um = np.linspace(*range_um, knots)
+    if design.pairs is not None:
+        raise ConfigError("pillars of two sizes have no bias table of one size")
+    diameter = design.diameters.diameter_um
+    least = float(diameter.min(where=diameter > 0, initial=np.inf))
+    designed_um = np.linspace(least, float(diameter.max()), knots)
     corrected_um = _corrected_diameters_um(design, designed_um, x, response)
     drawn_nm = old.drawn_nm(corrected_um * 1e3 - process_state_of(x)["bias_nm"])
     bias_nm = designed_um * 1e3 - drawn_nm
-    slope = np.diff(bias_nm) / np.diff(drawn_nm)
-    if np.abs(slope).max() > STEEPEST:
+    slope = float(np.abs(np.diff(bias_nm) / np.diff(drawn_nm)).max())
+    if slope > STEEPEST:
         raise ConfigError(
-            f"the table would change by {np.abs(slope).max():.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
+            f"the table would change by {slope:.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
             "lens is too far from its design for a table; correct height or index in the process instead"
         )
-    return CorrectionTable(drawn_nm, bias_nm, designed_um, corrected_um)
+    return MaskCorrection(
+        drawn_nm,
+        bias_nm,
+        old.at(drawn_nm),
+        designed_um,
+        corrected_um,
+        _with_even_bias(design, x),
+    )
 
 
 def predict_lenses(
@@ -525,36 +454,17 @@ MAP = CorrectionPart(
 )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class CorrectionSpread:
-    """Spread of a correction over the posterior.
-
-    table_nm: (draws, knots) table of every draw. sigma_nm: (knots,) its standard
-    deviation.
-    words: why it is refused, and what to capture or measure; empty where it is usable.
-    """
-
-    table_nm: Array
-    sigma_nm: Array
-    words: str
-
-    @property
-    def usable(self) -> bool:
-        """Whether the posterior is narrow enough."""
-        return not self.words
-
-
-def judge_correction(
+def reason_left_open(
     result: AsBuilt,
     table: Callable[[Array], Array],
     *,
     part: CorrectionPart = TABLE,
     wide_nm: float = WIDE_NM,
     seed: int = 5,
-) -> CorrectionSpread:
-    """Spread of a correction over draws of the posterior, and whether it is usable.
+) -> str:
+    """Why the posterior leaves a correction too open to be used, and what to measure.
 
-    Usable where the standard deviation over DRAWS draws is at most ``wide_nm``
+    Empty where its standard deviation over DRAWS draws is at most ``wide_nm``
     everywhere.
 
     Args:
@@ -564,74 +474,23 @@ def judge_correction(
         part: which of them. wide_nm: largest standard deviation of a usable correction.
         seed: of the random generator.
     """
+    draws = result.samples(DRAWS, seed=seed)
     try:
-        tables = np.array(
-            [table(result.parameters(row)) for row in result.samples(DRAWS, seed=seed)]
-        )
+        tables = [table(result.parameters(row)) for row in draws]
     except ConfigError as refusal:
-        return CorrectionSpread(
-            np.empty((0, 0)),
-            np.empty(0),
-            f"no correction: for lenses of the posterior {refusal}",
-        )
-    sigma = tables.std(axis=0, ddof=1)
-    if sigma.max() <= wide_nm:
-        return CorrectionSpread(tables, sigma, "")
-    ranges = [
-        (name, *result.interval(name)) for name in part.names if name in result.names
-    ]
+        return f"no correction: for lenses of the posterior {refusal}"
+    sigma = float(np.std(tables, axis=0, ddof=1).max())
+    if sigma <= wide_nm:
+        return ""
+    names = [name for name in part.names if name in result.names]
     intervals = ", ".join(
-        f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges
+        "{} {:.3g} to {:.3g}".format(name, *result.interval(name)) for name in names
     )
-    return CorrectionSpread(
-        tables,
-        sigma,
-        f"no correction: the posterior leaves {part.words} open by {sigma.max():.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {intervals}). Settle it by {_remedies(result, table, sigma, (part, wide_nm))}",
+    causes = dict.fromkeys(cause for name in names for cause in result.most(name))
+    state = f"a statement on {', '.join(causes)} (capture.toml, [[known]]), " * any(
+        causes
     )
-
-
-def _remedies(
-    result: AsBuilt,
-    table: Callable[[Array], Array],
-    sigma: Array,
-    limits: tuple[CorrectionPart, float],
-) -> str:
-    """Measurements that would narrow the table, in words, the most effective first.
-
-    Finite-difference slopes of the widest knot propagate the covariance of the fit. A
-    cause moves all parameters together, so its part is at most the sum of the absolute
-    parts.
-
-    Args:
-        sigma: (knots,) standard deviation of the table, nm.
-        limits: part of the correction, and its largest standard deviation in nm.
-    """
-    part, wide_nm = limits
-    best = table(result.parameters())
-    knot = int(np.argmax(sigma))
-    slopes = np.zeros(len(result.names))
-    for i, name in enumerate(result.names):
-        if name in part.names:
-            moved = result.value.copy()
-            moved[i] += 0.1 * result.sigma[i]
-            change = table(result.parameters(moved)) - best
-            slopes[i] = change[knot] / (0.1 * result.sigma[i])
-    own_sigma = float(np.sqrt(slopes @ result.within_covariance @ slopes))
-    cause_sigma = (
-        result.by_cause @ np.abs(slopes) if len(result.causes) else np.empty(0)
+    return (
+        f"no correction: the posterior leaves {part.words} open by {sigma:.1f} nm (1 sigma, at most "
+        f"{wide_nm:g} allowed; {intervals}). Settle it by {state}{_FRAMES}"
     )
-    large = [
-        k
-        for k in np.argsort(-cause_sigma)
-        if cause_sigma[k] > max(cause_sigma.max() / 4, 0.2 * wide_nm)
-    ]
-    measurements = [
-        remedy for k in large for word, remedy in _REMEDIES if word in result.causes[k]
-    ]
-    captures = (
-        [_FRAMES]
-        if own_sigma > 0.7 * wide_nm or not measurements
-        else ["the diameters themselves by micrographs (metalens measure)"]
-    )
-    return "; ".join([*dict.fromkeys(measurements), *captures])

@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from characterize.inference import leastsquares
-from characterize.inference.leastsquares import FitImages, GaussianPrior, SolverSettings
+from characterize.inference.leastsquares import (
+    FitImages,
+    FitProblem,
+    FitSolution,
+    GaussianPrior,
+    SolverSettings,
+)
 from characterize.pupil import zernike
 from characterize.pupil.model import PupilModel, PupilSpec
 
@@ -145,7 +150,7 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
 
 def _fit(
     model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: SolverSettings
-) -> leastsquares.FitSolution:
+) -> FitSolution:
     everywhere = np.ones(images.shape, bool)
     data = FitImages(
         images,
@@ -160,9 +165,7 @@ def _fit(
             model.unpack(v)[name] for v in (prior.low, prior.high, begin)
         )
         low[:] = high[:] = held
-    return leastsquares.fit_levenberg_marquardt(
-        model.images, data, begin, prior=prior, settings=settings
-    )
+    return FitProblem(model.images, data, prior).fit(begin, settings)
 
 
 def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, float]:

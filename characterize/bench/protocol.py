@@ -241,7 +241,7 @@ def _unstated_shifts(
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
-    return unmodelled_effects.expected_score_tests(
+    return unmodelled_effects.expected_shifts(
         SearchTask(model, data, x, known, None, free, sizes)
     )
 

@@ -12,4 +12,3 @@ from .frames import normalized_cross_correlation as normalized_cross_correlation
 from .frames import orient_frames as orient_frames
 from .frames import relative_orientation as relative_orientation
 from .frames import shift_frames as shift_frames
-from .rounding import quantization_score as quantization_score

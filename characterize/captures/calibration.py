@@ -69,8 +69,6 @@ class ElectronFrames:
     dark level.
     common_light: relative error of a pixel's light that is common to all frames: that
     of the flat (not in the variance).
-    count_e: electrons of a count where pixels are rounded counts, in steps of
-    ``count_e / scale``; 0 where they are means.
     """
 
     electrons: Array
@@ -82,7 +80,6 @@ class ElectronFrames:
     corrections: tuple[str, ...]
     common_floor: float | Array = 0.0
     common_light: float = 0.0
-    count_e: float = 0.0
 
 
 def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
@@ -194,7 +191,6 @@ def to_electrons(capture: Capture) -> ElectronFrames:
         tuple(notes),
         common_floor=dark_e2 / (frame_e2 + dark_e2),
         common_light=flat_error,
-        count_e=gain.gain_e,
     )
 
 

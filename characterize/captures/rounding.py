@@ -1,6 +1,4 @@
-"""Likelihood of rounded counts whose noise is below a count: score, information and
-dark level, in closed form.
-"""
+"""Dark level of rounded counts whose noise is below a count, by their likelihood."""
 
 import math
 from dataclasses import dataclass
@@ -10,42 +8,9 @@ from scipy import optimize, special
 
 from metalens.core.arrays import Array
 
-_SMOOTH = 1.0  # counts of noise from which on rounding is a variance of 1/12 to 1e-8
-_REACH = 9.0  # sigma to the farthest count that is summed
-_LEAST_INFORMATION = 1e-6  # least information of a count on its light, counts⁻²
 # counts from the median of pixels that are not hot; levels of a pixel that are summed
 _NORMAL_RANGE, _LEVELS = 3, 61
 _TYPICAL = (0.15, 0.1)  # prior medians of noise and of the scatter of levels, counts
-
-
-def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
-    """(score, expected information) of a rounded count on its expected light m,
-    counts⁻¹ and counts⁻².
-
-    Score: d ln P / dm at the count. Information: sum of (dP/dm)² / P over all counts.
-    From ``_SMOOTH`` counts of noise on, rounding adds a variance of 1/12.
-
-    Args:
-        off: count less expected light, in counts.
-        noise: standard deviation before rounding, in counts, above 0.
-    """
-    off, noise = np.broadcast_arrays(np.asarray(off, float), np.asarray(noise, float))
-    score = np.asarray(off / (noise**2 + 1 / 12))
-    information = np.asarray(1 / (noise**2 + 1 / 12))
-    coarse = noise < _SMOOTH
-    if coarse.any():
-        offset = off[coarse]
-        sigma = noise[coarse]
-        score[coarse] = _score(offset, sigma)[0]
-        fisher = np.zeros_like(offset)
-        nearest = offset - np.rint(offset)
-        for shift in range(
-            -math.ceil(_REACH * sigma.max()) - 1, math.ceil(_REACH * sigma.max()) + 2
-        ):
-            slope, log_chance = _score(nearest + shift, sigma)
-            fisher += slope**2 * np.exp(log_chance)
-        information[coarse] = np.maximum(fisher, _LEAST_INFORMATION)
-    return score, information
 
 
 def _score(off: Array, noise: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from characterize.commands.fit_options import Options
 from characterize.inference import AsBuilt, asbuilt, fit
 from characterize.inference import FitOptions as FitOptions
 from characterize.model import KnownValue
-from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
+from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save_pupil
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
@@ -131,7 +131,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
         target, companions=report.BESIDE, room=transaction.ROOM + capture.frames.nbytes
     ) as draft:
         pupil_fit = fit_pupil(capture, spec, insist=options.insist)
-        save(draft.path, pupil_fit, provenance)
+        save_pupil(draft.path, pupil_fit, provenance)
         report.pupil_report(draft.path.with_suffix(".html"), pupil_fit)
     return options.console.judged(
         _values(pupil_fit), _text(pupil_fit, target), pupil_fit.problems

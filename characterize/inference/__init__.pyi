@@ -7,6 +7,7 @@ from .asbuilt import AsBuilt as AsBuilt
 from .estimate import FitOptions as FitOptions
 from .estimate import fit as fit
 from .leastsquares import FitImages as FitImages
+from .leastsquares import FitProblem as FitProblem
 from .leastsquares import FitSolution as FitSolution
 from .leastsquares import GaussianPrior as GaussianPrior
 from .leastsquares import SolverSettings as SolverSettings

@@ -29,11 +29,9 @@ from characterize.inference.multistart import SearchTask, with_values
 from characterize.inference.prepare import (
     check_depths,
     check_enough,
-    correct_quantization,
     data_of,
     merge_exposures,
     quick_enough,
-    roughly_known,
     setting_of,
     stated_priors,
 )
@@ -41,7 +39,6 @@ from characterize.inference.uncertainty import FitPosterior
 from characterize.inference.unmodelled_effects import (
     ResidualFinding,
     ScoreTest,
-    ScoreTests,
     UnmodelledShifts,
 )
 from characterize.model import (
@@ -56,22 +53,14 @@ from characterize.model import (
 )
 from metalens.core import threads
 from metalens.core.arrays import Array
-from metalens.core.errors import FitError, FitRefused
+from metalens.core.errors import FitRefused
 from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 LIKENESS = 0.45
-# fitted too where the usual parameters do not explain the frames
-EXTRA = (
-    "bias_a_nm", "bias_o_nm", "bandwidth_nm", "tilt_x_deg", "tilt_y_deg", "pinhole_um",
-    "pixel_percent",
-)  # fmt: skip
-# fits with rounded counts: at most so many, until none moves by more sigma
-_ROUNDS, _STAYS = 5, 0.1
-# a solution, its score tests, and stated values that it contradicts
-Looked = tuple[FitSolution, ScoreTests, list[ResidualFinding]]
-# chi-square a pixel of frames left out, over noise and uncertainty of the prediction
-_HELD_OUT = 1.25
+_ROUGH = 0.1  # relative error of the slopes of pillars above which it is said
+# score tests, shifts by unstated effects, and stated values that the frames contradict
+Looked = tuple[list[ScoreTest], UnmodelledShifts, list[ResidualFinding]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,16 +122,25 @@ def _fit(
     known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
     sizes = unfitted_sizes(known, lens)
     check_enough(data, multistart.names_of(known, options.free))
-    response = response or log_response_slopes(lens, names=_spoken_of(options))
+    stated = {*options.free, *(k.name for k in options.known)}
+    response = response or log_response_slopes(lens, names=stated)
     model = ForwardModel(lens, setting, response)
     start = parameter_vector({name: k.value for name, k in known.items()})
     scan_um = options.scan_um
     if scan_um is None:
         scan_um = 0.12 * float(np.median(setting.depth_um))
+    # two prior sigma, within the bounds
+    prior = multistart.prior_of(("distance_um",), known, lens)
+    reach_um = float(min(2 * prior.sigma[0], prior.high[0]))
     arrangement = find_arrangement(
-        model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens)
+        model, data, scan_um=scan_um, start=start, reach_um=reach_um
     )
-    _check_likeness(arrangement, lens)
+    if arrangement.likeness < LIKENESS:
+        raise FitRefused(
+            "fit refused: the frames look like no image of this lens (best correlation "
+            f"{arrangement.likeness:.2f}); they are of another lens than this {lens.profile} one, far from the "
+            "stated depths, or dark"
+        )
     whole = SearchTask(model, data, start, known, arrangement, options.free, sizes)
     task = multistart.choose_orientation(
         [
@@ -155,34 +153,25 @@ def _fit(
         *arrangement_text(task.arrangement or arrangement),
         *verdict.spectrum_text(lens, known),
     ]
-    cautions += roughly_known(lens, model.response)
+    if model.response.error > _ROUGH:
+        cautions.append(
+            "slopes of the pillars by height and index are known to "
+            f"{model.response.error:.0%} only"
+        )
     unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
     fast = quick_enough(task.model, task.data, unbiased)
     task = dataclasses.replace(task, model=fast)
-    task, ends = _ends(task, frames.gain, cautions)
+    task, ends = multistart.search_modes(task)
     task, ends = multistart.place_windows(task, ends)
-    task, ends = _unrounded(task, ends, frames.gain)
     task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
-    score_tests = looked[1].tests if looked else []
-    _refuse(_problems(task, ends[0], frames.gain), options, score_tests)
+    _refuse(_problems(task, ends[0], frames.gain), options, looked[0])
     posterior = uncertainty.explore_posterior(task, ends, frames.gain)
-    doubts = looked[2] if looked else []
-    if looked is None or posterior.best is not looked[0]:
-        looked = (
-            posterior.best,
-            unmodelled_effects.run_score_tests(task, posterior.best),
-            doubts,
-        )
-    cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
+    if posterior.best is not ends[0]:
+        tests, shifts = unmodelled_effects.run_score_tests(task, posterior.best)
+        looked = tests, shifts, looked[2]
     result = _result(capture, task, posterior, cautions, frames.gain, looked)
-    _refuse(result.problems, options, score_tests)
+    _refuse(result.problems, options, looked[0])
     return result
-
-
-def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
-    """Half the range of distances to scan, um: two prior sigma, within the bounds."""
-    prior = multistart.prior_of(("distance_um",), known, lens)
-    return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
 def _refuse(
@@ -197,73 +186,20 @@ def _refuse(
         raise FitRefused("fit refused: " + "; ".join(reasons))
 
 
-def _ends(
-    task: SearchTask, gain: SensorNoise, cautions: list[str]
-) -> tuple[SearchTask, list[FitSolution]]:
-    """Modes of the usual parameters, or with ``EXTRA`` where these do not fit.
-
-    The extra parameters stay only where chi-square falls by 3 % or more.
-    """
-    task, ends = multistart.search_modes(task)
-    if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
-        return task, ends
-    extended = dataclasses.replace(task, free=(*task.free, *EXTRA))
-    begin = task.all_of(ends[0].value)
-    try:
-        wider = multistart.search_modes(extended, begins=[begin])
-    except FitError:
-        return task, ends
-    if wider[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
-        return task, ends
-    cautions.append(
-        f"the usual parameters did not explain the frames: {', '.join(EXTRA)} fitted too"
-    )
-    return wider
-
-
-def _unrounded(
-    task: SearchTask, ends: list[FitSolution], gain: SensorNoise
-) -> tuple[SearchTask, list[FitSolution]]:
-    """The fit with the likelihood of rounded counts, where rounding matters.
-
-    Repeated with the correction at the last fit, until no parameter moves.
-    """
-    if not (gain.coarse and task.data.count_e):
-        return task, ends
-    counts = task.data
-    for _ in range(_ROUNDS):
-        task = dataclasses.replace(
-            task, data=correct_quantization(counts, ends[0].image)
-        )
-        before = ends[0]
-        ends = multistart.distinct_modes(
-            [multistart.refine_fit(task, end.value) for end in ends]
-        )
-        off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
-        if np.abs(off).max() < _STAYS:
-            break
-    return task, ends
-
-
 def _with_likely_causes(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
-) -> tuple[SearchTask, list[FitSolution], Looked | None]:
+) -> tuple[SearchTask, list[FitSolution], Looked]:
     """The task with the parameters of likely causes (:func:`unmodelled_effects.to_fit`) freed.
 
-    At most four, one after the other, each the largest fall of the misfit.
-
-    Returns:
-        (task, its modes, (solution, score tests, contradicted statements)); the last is
-        None without a known gain.
+    At most four, one after the other, each the largest fall of the misfit; none without
+    a known gain.
     """
-    if not gain.known:
-        return task, ends, None
-    tests = unmodelled_effects.run_score_tests(task, ends[0])
+    tests, shifts = unmodelled_effects.run_score_tests(task, ends[0])
     doubts = list[ResidualFinding]()
-    for _ in range(4):  # causes, one after the other
+    for _ in range(4 if gain.known else 0):  # causes, one after the other
         if not ends[0].converged:
             break
-        falls = _falls(task, ends[0], tests.tests)
+        falls = _falls(task, ends[0], tests)
         cause = next((test for _, test in falls if not test.stated), None)
         if cause is None:
             break
@@ -278,27 +214,23 @@ def _with_likely_causes(
         )
         doubts += _contradicted(cause, falls)
         task, ends = extended, wider
-        tests = unmodelled_effects.run_score_tests(task, ends[0])
-    return task, ends, (ends[0], tests, doubts)
+        tests, shifts = unmodelled_effects.run_score_tests(task, ends[0])
+    return task, ends, (tests, shifts, doubts)
 
 
 def _falls(
-    task: SearchTask,
-    best: FitSolution,
-    score_tests: list[ScoreTest],
-    *,
-    out_of_bounds: float = 10.0,
+    task: SearchTask, best: FitSolution, score_tests: list[ScoreTest]
 ) -> list[tuple[float, ScoreTest]]:
     """(fall of the misfit, cause) of causes whose parameters explain the frames better.
 
     Largest first. A cause must lower -2 ln L by half of its score-test chi-square, or,
-    where a parameter ran to its bound, by ``out_of_bounds``.
+    where a parameter ran to its bound, by 10.
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
     for cause in unmodelled_effects.to_fit(score_tests, stuck=stuck):
         fall = best.merit - multistart.merit_with(task, best, cause.frees)
-        if fall > (out_of_bounds if stuck else cause.chi2 / 2):
+        if fall > (10.0 if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
     return sorted(falls, key=lambda pair: -pair[0])
 
@@ -325,24 +257,9 @@ def _contradicted(
     ]
 
 
-def _spoken_of(options: FitOptions) -> set[str]:
-    """Parameters that the options free or know."""
-    return {*options.free, *(k.name for k in options.known)}
-
-
-def _check_likeness(arrangement: FrameArrangement, lens: Lens) -> None:
-    if arrangement.likeness < LIKENESS:
-        raise FitRefused(
-            f"fit refused: the frames look like no image of this lens (best correlation {arrangement.likeness:.2f}); "
-            f"they are of another lens than this {lens.profile} one, far from the stated depths, or dark"
-        )
-
-
 def _arranged(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
     """The task with its frames in an arrangement, and its window fixed at the light."""
-    sideways = arrangement.clearly and arrangement.orientation % 2 == 1
-    model = task.model.exchanged() if sideways else task.model
-    model = model.about(multistart.window_um(arrangement, model))
+    model = task.model.about(multistart.window_um(arrangement, task.model))
     return dataclasses.replace(
         task,
         model=model,
@@ -364,33 +281,28 @@ def _result(
     Errors of causes that nobody stated widen covariance and intervals.
 
     Args:
-        looked: (solution, its score tests, contradicted statements).
+        looked: score tests, shifts by unstated effects, contradicted statements.
     """
-    _, tests, doubts = looked
+    tests, unstated, doubts = looked
     model, data, names = task.model, task.data, task.names
     solution, value = posterior.best, posterior.best.value
     fitted = dict(zip(names, value.tolist(), strict=True))
-    held_out = verdict.hold_out_chi_square(task, solution)
-    unstated = tests.shifts()
     findings = [*_findings(task, solution, tests), *doubts]
-    # intervals about the value less the expected shift, widened by its spread
+    # about the joint optimum, never within the statistical interval
     centre = value - unstated.mean
-    more = uncertainty.REACH * unstated.spread
+    more = uncertainty.REACH * unstated.sigma
     low = np.minimum(centre - np.hypot(value - posterior.low, more), posterior.low)
     high = np.maximum(centre + np.hypot(posterior.high - value, more), posterior.high)
+    # second moment about the value
+    spread = unstated.covariance + np.outer(unstated.mean, unstated.mean)
     prior_share = (posterior.high - posterior.low) / (2 * uncertainty.REACH)
     cautions = [*cautions, *(finding.words for finding in findings)]
-    if gain.known and held_out > _HELD_OUT:
-        cautions.append(
-            f"frames left out are predicted with chi-square {held_out:.2f} a pixel, not "
-            "1: do not extrapolate"
-        )
     return AsBuilt(
         design=model.lens,
         response=model.response,
         names=names,
         value=value,
-        covariance=posterior.covariance + unstated.covariance,
+        covariance=posterior.covariance + spread,
         information=solution.information,
         held={
             name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted
@@ -424,7 +336,7 @@ def _result(
         ),
         low=low,
         high=high,
-        draws=_drawn(task, posterior.draws, unstated),
+        draws=_drawn(task, posterior.draws, spread),
         within=WithinModel(
             posterior.covariance, posterior.low, posterior.high, posterior.draws
         ),
@@ -433,7 +345,7 @@ def _result(
             for name, profile in posterior.profiles.items()
         },
         verdicts=(
-            verdict.psf_verdict(task, posterior, held_out),
+            verdict.psf_verdict(task, posterior),
             verdict.process_verdict(
                 usual_parameters(names, model.lens),
                 low,
@@ -447,13 +359,11 @@ def _result(
     )
 
 
-def _drawn(task: SearchTask, draws: Array, unstated: UnmodelledShifts) -> Array:
+def _drawn(task: SearchTask, draws: Array, spread: Array) -> Array:
     """Draws with the shifts by unstated effects; none where there are none."""
     if not len(draws):
         return draws
-    shifted = draws + gaussian_draws(
-        np.random.default_rng(2), len(draws), unstated.covariance
-    )
+    shifted = draws + gaussian_draws(np.random.default_rng(2), len(draws), spread)
     return np.asarray(np.clip(shifted, task.prior.low, task.prior.high))
 
 
@@ -470,7 +380,7 @@ def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
 
 
 def _findings(
-    task: SearchTask, solution: FitSolution, looked: ScoreTests
+    task: SearchTask, solution: FitSolution, tests: list[ScoreTest]
 ) -> list[ResidualFinding]:
     """Findings in the residuals: correlated structure, and causes that they lean to.
 
@@ -479,11 +389,10 @@ def _findings(
     data = task.data
     residual = solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
     noise = np.sqrt(data.variance(solution.image))
-    shared = data.shared(solution.image) / noise
     structure = verdict.correlated_residuals_text(
-        np.where(data.saturated, 0.0, residual), shared
+        np.where(data.saturated, 0.0, residual), data.shared(solution.image)[1] / noise
     )
-    return [*structure, *unmodelled_effects.score_test_text(looked.tests)]
+    return [*structure, *unmodelled_effects.score_test_text(tests)]
 
 
 def _problems(task: SearchTask, solution: FitSolution, gain: SensorNoise) -> list[str]:

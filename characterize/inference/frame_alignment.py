@@ -2,8 +2,8 @@
 the nominal lens.
 """
 
-import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,10 +25,6 @@ from metalens.core import threads
 from metalens.core.arrays import Array
 
 _EVERY = range(8)  # orientation
-Way = tuple[bool, int]  # reordered, orientation
-Shift = tuple[float, float]
-Both = tuple[Array, Array]
-"""Images as they are, and those of a camera on its side: the same where frames are square."""
 # likeness by which reversed frames must be better: defocus is similar on both sides
 _TWIN = 0.05
 # likeness within which orientations remain candidates: ten times what errors of an
@@ -54,8 +50,7 @@ class FrameArrangement:
     order: (n,) frame that fits the i-th stated depth best; reordered: whether it
     clearly differs from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
-    orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the
-    stated one beyond doubt.
+    orientation: (0 to 7) turn that suits the frames beyond doubt; 0: as stated.
     equivalent: turns (1 to 7) under which the nominal images do not change: these cannot be
     distinguished from the chosen one.
     others: other arrangements of nearly equal likeness; fits choose among them.
@@ -69,14 +64,8 @@ class FrameArrangement:
     reordered: bool
     order_seen: bool
     orientation: int
-    clearly: bool
     equivalent: tuple[int, ...]
     others: tuple["FrameArrangement", ...] = ()
-
-    @property
-    def words(self) -> str:
-        """The orientation in words."""
-        return (TURNS + MIRRORED)[self.orientation]
 
 
 def few_frames(setting: FrameSetting) -> Array:
@@ -130,7 +119,7 @@ def find_arrangement(
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     plain, score = frames.scanned(start, zeros)
     arrangement = _arrange(frames, plain, score)
-    doubtful = arrangement.reordered or arrangement.clearly or score < _SURE
+    doubtful = arrangement.reordered or arrangement.orientation or score < _SURE
     if reach_um > 0 and doubtful:
         distances = start[PLACE["distance_um"]] + reach_um * np.linspace(
             -1, 1, _DISTANCES
@@ -140,9 +129,9 @@ def find_arrangement(
         )
         place, better = frames.scanned(place, zeros)
         refocused = _arrange(frames, place, better)
-        simpler = (refocused.reordered, refocused.clearly) < (
+        simpler = (refocused.reordered, refocused.orientation > 0) < (
             arrangement.reordered,
-            arrangement.clearly,
+            arrangement.orientation > 0,
         )
         if better >= score and (
             simpler or (better > score + _TWIN and not refocused.reordered)
@@ -208,37 +197,36 @@ class _Frames:
         grid = np.meshgrid(distances, zeros, indexing="ij")
         places[:, PLACE["distance_um"]] = grid[0].ravel()
         places[:, PLACE["stage_zero_um"]] = grid[1].ravel()
-        turned = [
-            FrameSpectra.of(orient_frames(self.light, k), self.noise) for k in _EVERY
-        ]
-        scores = np.nan_to_num(
-            threads.run_each(lambda x: self._scores(x, turned), places), nan=-math.inf
-        )
+        turned = self.spectra()
+        orders = [np.arange(len(self.light)), self.back]
+
+        def score(x: Array) -> Array:
+            return _scores(turned, _expected(self.rough, x, self.clipped), orders)
+
+        scores = np.nan_to_num(threads.run_each(score, places), nan=-math.inf)
         stated, reverse = scores.max(0)
         orientation, is_reversed = _way(stated, reverse)
         of_way = scores[:, int(is_reversed), orientation]
         best = int(np.argmax(of_way))
         return places[best], float(of_way[best]) - _TWIN * is_reversed
 
-    def _scores(self, x: Array, turned: list[FrameSpectra]) -> Array:
-        """(2, orientations) likeness at parameters ``x``: stated order, then reversed.
+    def spectra(self) -> list[FrameSpectra]:
+        """Of the frames in every orientation."""
+        return [
+            FrameSpectra.of(orient_frames(self.light, k), self.noise) for k in _EVERY
+        ]
 
-        Args:
-            turned: spectra of the frames in every orientation.
-        """
-        upright, sideways = _expected(self.rough, x, self.clipped)
-        first = FrameSpectra.of(upright, 0 * self.noise)
-        second = first
-        if sideways is not upright:
-            second = FrameSpectra.of(sideways, 0 * self.noise)
-        expected = first, second
-        orders = np.arange(len(self.light)), self.back
-        return np.array(
-            [
-                [turned[k].alike(expected[k % 2], index) for k in _EVERY]
-                for index in orders
-            ]
-        )
+
+def _scores(
+    turned: list[FrameSpectra], expected: Array, orders: Sequence[Array]
+) -> Array:
+    """(orders, orientations) mean likeness of the frames to the ``expected`` ones.
+
+    Args:
+        turned: spectra of the frames in every orientation.
+    """
+    goal = FrameSpectra.of(expected, np.zeros(len(expected)))
+    return np.array([[one.alike(goal, index) for one in turned] for index in orders])
 
 
 def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
@@ -248,8 +236,7 @@ def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
         stated: (8,) likeness of the stated order.
         reverse: (8,) likeness of the reversed one.
     """
-    orientation, clearly = _plainest_turn(stated)
-    orientation = orientation if clearly else 0
+    orientation = _plainest_turn(stated)
     if reverse[0] <= stated[0] + _TWIN or reverse.max() < stated[orientation]:
         return orientation, False
     if reverse.max() > reverse[0] + _TWIN:
@@ -268,84 +255,60 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     """
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
-    order, reordered, order_seen = _order(light, expected[0], noise, frames.model)
-    orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
-    likeness_of, shifts = _ways(frames, expected, orders)
-    stated = np.array([likeness_of[False, k] for k in _EVERY])
-    orientation, clearly = _plainest_turn(stated)
-    if reordered and clearly:
+    order, reordered, order_seen = _order(light, expected, noise, frames.model)
+    orders = [np.arange(len(light)), *([order] if reordered else [])]
+    score = _scores(frames.spectra(), expected, orders)
+    chosen = reordered, _plainest_turn(score[0])
+    if reordered and chosen[1]:
         # a twin: images that twist with depth look mirrored when reversed
-        twins = (True, 0), (False, orientation), (True, orientation)
-        best = max(likeness_of[way] for way in twins)
-        way = next(way for way in twins if likeness_of[way] > best - _TWINS)
-        reordered, clearly = way[0], way[1] > 0
-    chosen = reordered, orientation if clearly else 0
+        twins = (True, 0), (False, chosen[1]), chosen
+        best = max(score[int(way[0]), way[1]] for way in twins)
+        chosen = next(
+            way for way in twins if score[int(way[0]), way[1]] > best - _TWINS
+        )
     chi2 = {k: _chi_square_of_turn(k, expected, light, noise) for k in _EVERY}
-    arrangement = FrameArrangement(
-        stage_zero_um=float(x[PLACE["stage_zero_um"]]),
-        distance_um=float(x[PLACE["distance_um"]]),
-        shift_px=shifts[chosen],
-        likeness=likeness,
-        order=order,
-        reordered=reordered,
-        order_seen=order_seen,
-        orientation=chosen[1],
-        clearly=clearly,
-        equivalent=tuple(k for k in chi2 if k and chi2[k] < _DISTINCT),
-    )
-    distinct = [
-        way
-        for way in likeness_of
-        if way[0] == reordered
-        and chi2[relative_orientation(chosen[1], way[1])] >= _DISTINCT
-    ]
-    # the likeliest of the other order
-    twin = sorted(
-        (way for way in likeness_of if way[0] != reordered),
-        key=lambda way: -likeness_of[way],
-    )[:1]
-    others = [
-        replace(
-            arrangement,
+
+    def arranged(way: tuple[bool, int]) -> FrameArrangement:
+        found = orient_frames(light[orders[int(way[0])]], way[1])
+        noises = noise[orders[int(way[0])]].tolist()
+        pairs = zip(found, expected, noises, strict=True)
+        shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
+        y, x_px = np.median(shifts, axis=0).tolist()
+        return FrameArrangement(
+            stage_zero_um=float(x[PLACE["stage_zero_um"]]),
+            distance_um=float(x[PLACE["distance_um"]]),
+            shift_px=(y, x_px),
+            likeness=likeness,
+            order=order,
             reordered=way[0],
+            order_seen=order_seen,
             orientation=way[1],
-            clearly=way[1] > 0,
-            shift_px=shifts[way],
+            equivalent=tuple(k for k in _EVERY if k and chi2[k] < _DISTINCT),
         )
-        for way in [*distinct, *twin]
-        if likeness_of[way] > likeness_of[chosen] - _NEAR
+
+    distinct = [
+        (chosen[0], k)
+        for k in _EVERY
+        if chi2[relative_orientation(chosen[1], k)] >= _DISTINCT
     ]
-    return replace(arrangement, others=tuple(others))
+    if reordered:  # the likeliest of the other order
+        other = not chosen[0]
+        distinct.append((other, int(score[int(other)].argmax())))
+    others = [
+        arranged(way)
+        for way in distinct
+        if score[int(way[0]), way[1]] > score[int(chosen[0]), chosen[1]] - _NEAR
+    ]
+    return replace(arranged(chosen), others=tuple(others))
 
 
-def _ways(
-    frames: _Frames, expected: Both, orders: dict[bool, Array]
-) -> tuple[dict[Way, float], dict[Way, Shift]]:
-    """Mean likeness and median shift (y, x) of the frames in every arrangement.
-
-    By (reordered, orientation).
-    """
-    likeness, shifts = {}, {}
-    for way in itertools.product(orders, _EVERY):
-        index = orders[way[0]]
-        peaks = _compare(
-            orient_frames(frames.light[index], way[1]),
-            expected[way[1] % 2],
-            frames.noise[index],
-        )
-        likeness[way] = float(np.mean([score for score, _ in peaks]))
-        y, x = np.median([shift for _, shift in peaks], axis=0).tolist()
-        shifts[way] = y, x
-    return likeness, shifts
-
-
-def _chi_square_of_turn(k: int, expected: Both, light: Array, noise: Array) -> float:
+def _chi_square_of_turn(k: int, expected: Array, light: Array, noise: Array) -> float:
     """Chi-square between the nominal images and the same in orientation ``k``.
 
     At the brightness of the measured frames: how well fits can distinguish the two.
     """
-    change = ((orient_frames(expected[0], k) - expected[k % 2]) ** 2).sum((1, 2))
-    power = change * _brightness(light, expected[0], noise) ** 2
+    change = ((orient_frames(expected, k) - expected) ** 2).sum((1, 2))
+    power = change * _brightness(light, expected, noise) ** 2
     return float((power * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
@@ -360,32 +323,17 @@ def _reversed(model: ForwardModel) -> Array:
     return order
 
 
-def _expected(model: ForwardModel, x: Array, clipped: Array) -> Both:
-    """Nominal frames (upright, sideways) without background, clipped as the measured.
+def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
+    """Nominal frames without background, clipped as the measured ones.
 
-    The same share of pixels is clipped in each. For square windows both are one array.
+    The same share of pixels is clipped in each.
     """
-    upright = _clipped(model, x, clipped)
-    square = model.setting.rows == model.setting.columns
-    return upright, upright if square else _clipped(model.exchanged(), x, clipped)
-
-
-def _clipped(model: ForwardModel, x: Array, clipped: Array) -> Array:
     images = model.images(_bare(x))[0]
     tops = [
         np.quantile(image, 1 - share)
         for image, share in zip(images, clipped, strict=True)
     ]
     return above_rim(np.minimum(images, np.array(tops)[:, None, None]))
-
-
-def _compare(
-    light: Array, expected: Array, noise: Array
-) -> list[tuple[float, tuple[float, float]]]:
-    return [
-        normalized_cross_correlation(a, b, float(s))
-        for a, b, s in zip(light, expected, noise, strict=True)
-    ]
 
 
 def _order(
@@ -434,15 +382,15 @@ def _distance(a: Array, b: Array) -> float:
     return float(((a - shift_frames(b, (int(dy), int(dx)))) ** 2).sum())
 
 
-def _plainest_turn(scores: Array) -> tuple[int, bool]:
-    """(simplest orientation of best likeness, whether it clearly beats the first).
+def _plainest_turn(scores: Array) -> int:
+    """The simplest orientation of best likeness; 0 unless it clearly beats that.
 
     Within 2e-3 the first of equals is taken. Clearly: half of the missing likeness and
     0.02 better than the frames as stated.
     """
     best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
     halved = (1 - scores[best]) < 0.5 * (1 - scores[0])
-    return best, bool(best != 0 and halved and scores[best] - scores[0] > 0.02)
+    return best if halved and scores[best] - scores[0] > 0.02 else 0
 
 
 def _bare(x: Array) -> Array:
@@ -459,11 +407,7 @@ def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
     Args:
         values: (n, y, x) values of the frames.
     """
-    out = (
-        orient_frames(values, arrangement.orientation)
-        if arrangement.clearly
-        else values
-    )
+    out = orient_frames(values, arrangement.orientation)
     return np.asarray(out[arrangement.order] if arrangement.reordered else out)
 
 
@@ -475,14 +419,17 @@ def arrangement_text(arrangement: FrameArrangement) -> list[str]:
         arrangement: how the frames lie.
     """
     words = []
-    if arrangement.clearly:
-        words.append(f"frames fit the design only {arrangement.words}: used so")
+    turns = TURNS + MIRRORED
+    if arrangement.orientation:
+        words.append(
+            f"frames fit the design only {turns[arrangement.orientation]}: used so"
+        )
     if arrangement.reordered:
         words.append(
             f"frames fit the stated depths only in the order {arrangement.order.tolist()}: used so"
         )
     if arrangement.equivalent:
-        which = ", ".join((TURNS + MIRRORED)[k] for k in arrangement.equivalent)
+        which = ", ".join(turns[k] for k in arrangement.equivalent)
         words.append(
             f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
             "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"

@@ -22,18 +22,15 @@ def correlated_pairs(
     sigma = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigma, sigma)
     words = []
-    pairs = [
-        (abs(correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)
-    ]
-    for size, i, j in sorted(pairs, reverse=True):
-        if size > 0.9:
-            either = dict.fromkeys(
-                PARAMETERS[PLACE[names[k]]].measured_by for k in (j, i)
-            )
-            methods = " or ".join(method for method in either if method)
-            why = f"measure {methods or 'either'}, which settles both"
+    rows, columns = np.tril_indices(len(names), -1)
+    for k in np.argsort(-np.abs(correlation[rows, columns])):
+        i, j = int(rows[k]), int(columns[k])
+        if abs(correlation[i, j]) > 0.9:
+            methods = (PARAMETERS[PLACE[names[k]]].measured_by for k in (j, i))
+            either = " or ".join(dict.fromkeys(filter(None, methods))) or "either"
             words.append(
-                f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): {why}"
+                f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): "
+                f"measure {either}, which settles both"
             )
     for name, s, prior in zip(names, sigma, sigma_prior, strict=True):
         if np.isfinite(prior) and s > 0.8 * prior:
@@ -56,23 +53,14 @@ def identifiable_combinations(
     """
     values, vectors = information_eigenvectors(names, information)
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
-    prior = np.where(np.isfinite(sigma_prior), sigma_prior / unit, np.inf)
+    prior = np.minimum(sigma_prior / unit, 1e9)
     lines = []
-    for value, vector in sorted(
-        zip(values, vectors.T, strict=True), key=lambda t: -t[0]
-    ):
-        sigma = 1 / np.sqrt(max(value, 1e-30))
-        before = np.sqrt(
-            (np.where(np.isfinite(prior), prior, 1e9) ** 2 * vector**2).sum()
-        )
-        if sigma < 0.5 * before:
-            main = np.argsort(-np.abs(vector))[:3]
-            parts = [
-                f"{vector[i]:+.2f} {names[i]}/{unit[i]:g}"
-                for i in main
-                if abs(vector[i]) > 0.15
-            ]
-            lines.append(f"{' '.join(parts)} to {sigma:.2g}")
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        sigma = max(value, 1e-30) ** -0.5
+        if sigma < 0.5 * np.linalg.norm(prior * vector):
+            main = [i for i in np.argsort(-np.abs(vector))[:3] if abs(vector[i]) > 0.15]
+            parts = " ".join(f"{vector[i]:+.2f} {names[i]}/{unit[i]:g}" for i in main)
+            lines.append(f"{parts} to {sigma:.2g}")
     return lines
 
 

@@ -36,8 +36,6 @@ class FitImages:
     common_floor: share of ``variance_e2`` that is one error in all frames.
     common_light: relative error of a pixel's light that is one in all frames, not in
     the variance. Both widen intervals and do not change the weights.
-    count_e: electrons of a count, ``count_e / scale`` in a pixel, where pixels are
-    rounded counts; 0 where they are means.
     """
 
     electrons: Array
@@ -48,7 +46,6 @@ class FitImages:
     model_error: float = 0.0
     common_floor: float | Array = 0.0
     common_light: float = 0.0
-    count_e: float = 0.0
 
     def variance(self, image: Array) -> Array:
         """(n, y, x) variance of a pixel whose expected light is ``image``."""
@@ -168,113 +165,6 @@ class FitSolution:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FitProblem:
-    """Images by parameters, the frames they are fitted to, and prior knowledge."""
-
-    model: Model
-    data: FitImages
-    prior: GaussianPrior
-
-    def merit(self, x: Array) -> float:
-        """-2 ln posterior at (p,) parameters ``x``, but for a constant."""
-        return _merit(self.data, self.model(x, False)[0], x, self.prior)
-
-    def fit(
-        self,
-        start: Array,
-        settings: SolverSettings | None = None,
-        slopes: Array | None = None,
-    ) -> FitSolution:
-        """:func:`fit_levenberg_marquardt` from (p,) ``start`` with ``settings`` and
-        ``slopes`` (p, n, y, x) of a place close by.
-        """
-        return fit_levenberg_marquardt(
-            self.model,
-            self.data,
-            start,
-            prior=self.prior,
-            settings=settings,
-            slopes=slopes,
-        )
-
-    def with_fixed(self, i: int, value: float) -> "FitProblem":
-        """The same with parameter number ``i`` fixed at ``value``."""
-        low, high = self.prior.low.copy(), self.prior.high.copy()
-        low[i] = high[i] = value
-        prior = dataclasses.replace(self.prior, low=low, high=high)
-        return dataclasses.replace(self, prior=prior)
-
-
-def fit_levenberg_marquardt(
-    model: Model,
-    data: FitImages,
-    start: Array,
-    *,
-    prior: GaussianPrior | None = None,
-    settings: SolverSettings | None = None,
-    slopes: Array | None = None,
-) -> FitSolution:
-    """Maximum posterior of the parameters by Levenberg-Marquardt from one start.
-
-    Steps solve (C + damping diag C) s = -g with curvature C and gradient g of the
-    weighted residuals and the prior. The fit stops when a full step moves every
-    combination of parameters by less than ``step_tolerance`` sigma.
-
-    Args:
-        model: (parameters, with Jacobian) -> (images, Jacobian or None).
-        data: frames, masks and noise.
-        start: (p,) parameters.
-        prior: prior knowledge of the fitted parameters.
-        settings: when to stop.
-        slopes: (p, n, y, x) Jacobian of a place close by, to begin with; computed
-            without it.
-
-    Raises:
-        FitError: the model is not finite at the start, or no pixel is usable.
-    """
-    settings = settings or SolverSettings()
-    prior = prior or GaussianPrior.none(start)
-    x = np.clip(np.asarray(start, float), prior.low, prior.high)
-    if not data.usable.any():
-        raise FitError("no usable pixel in the fit window; check masks and crop")
-    damping = 1e-3
-    converged = False
-    reason = f"stopped after {settings.iterations} iterations"
-    state = _linearise(model, data, x, prior, settings, slopes)
-    iteration = 0
-    while iteration < settings.iterations:
-        iteration += 1
-        step, image, damping, accepted = _step(
-            model, data, state, prior, settings, damping
-        )
-        moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
-        done = not accepted or moved < settings.step_tolerance * (1 + damping)
-        # the Jacobian is exact, or was computed close enough
-        fresh = state.travel <= settings.near if accepted else state.travel == 0
-        if not fresh and (done or moved < settings.near):
-            # what looks final is checked with an exact Jacobian
-            x = state.x + step if accepted else state.x
-            state = _linearise(model, data, x, prior, settings)
-            damping = 1e-3
-            continue
-        if accepted and not done and _missed(state, step, image) > _MISSED:
-            state = _linearise(model, data, state.x + step, prior, settings)
-        elif accepted:
-            state = _secant(data, state, step, image, prior, settings, moved=moved)
-        if done:
-            converged = moved < 10 * settings.step_tolerance
-            reason = (
-                f"last step moved {moved:.2g} sigma"
-                if converged
-                else "no step lowers the misfit"
-            )
-            break
-    if settings.finish and state.travel > settings.near:
-        state = _linearise(model, data, state.x, prior, settings)
-    return _solution(data, state, prior, settings, (converged, reason, iteration))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class _State:
     """The problem about a point; travel: sigma from where the Jacobian was computed,
     not only brought up to date.
@@ -292,158 +182,216 @@ class _State:
     noise: Array
 
 
-def _linearise(
-    model: Model,
-    data: FitImages,
-    x: Array,
-    prior: GaussianPrior,
-    settings: SolverSettings,
-    slopes: Array | None = None,
-) -> _State:
-    """The problem at (p,) ``x``, with an exact Jacobian or with ``slopes``.
+@dataclass(frozen=True, eq=False, slots=True)
+class FitProblem:
+    """Images by parameters, the frames they are fitted to, and prior knowledge."""
 
-    Raises:
-        FitError: the images are not finite.
-    """
-    image, jacobian = model(x, slopes is None)
-    jacobian = jacobian if slopes is None else slopes
-    if jacobian is None or not np.isfinite(image).all():
-        raise FitError(
-            "the model is not finite at these parameters; bound them or correct the start"
-        )
-    return _state(
-        data,
-        (x, image, jacobian),
-        prior,
-        settings,
-        travel=0.0 if slopes is None else math.inf,
-    )
+    model: Model
+    data: FitImages
+    prior: GaussianPrior
 
+    def merit(self, x: Array) -> float:
+        """-2 ln posterior at (p,) parameters ``x``, but for a constant."""
+        return self._merit(self.model(x, False)[0], x, HUBER)
 
-def _missed(state: _State, step: Array, image: Array) -> float:
-    """Relative error of the Jacobian's prediction of a step, in sigma of the pixels.
+    def with_fixed(self, i: int, value: float) -> "FitProblem":
+        """The same with parameter number ``i`` fixed at ``value``."""
+        low, high = self.prior.low.copy(), self.prior.high.copy()
+        low[i] = high[i] = value
+        prior = dataclasses.replace(self.prior, low=low, high=high)
+        return dataclasses.replace(self, prior=prior)
 
-    |dI - J s| / |dI| for the change dI of the images by the step s.
-    """
-    root = np.sqrt(state.weight) / state.noise
-    change = (image - state.image) * root
-    left = change - np.tensordot(step, state.jacobian, 1) * root
-    return float(np.linalg.norm(left) / max(float(np.linalg.norm(change)), 1e-300))
+    def fit(
+        self,
+        start: Array,
+        settings: SolverSettings | None = None,
+        slopes: Array | None = None,
+    ) -> FitSolution:
+        """Maximum posterior of the parameters by Levenberg-Marquardt from one start.
 
+        Steps solve (C + damping diag C) s = -g with curvature C and gradient g of the
+        weighted residuals and the prior. The fit stops when a full step moves every
+        combination of parameters by less than ``step_tolerance`` sigma.
 
-def _secant(
-    data: FitImages,
-    state: _State,
-    step: Array,
-    image: Array,
-    prior: GaussianPrior,
-    settings: SolverSettings,
-    *,
-    moved: float,
-) -> _State:
-    """The problem after a step, with the Jacobian updated by the images (Broyden).
+        Args:
+            start: (p,) parameters.
+            settings: when to stop.
+            slopes: (p, n, y, x) Jacobian of a place close by, to begin with; computed
+                without it.
 
-    J + (dI - J s) sᵀC / (sᵀC s), with the curvature C as the metric: the least change
-    that explains dI. After a step of less than ``_TELLING`` sigma the Jacobian stays:
-    rounding of the images (float32) over so short a step would be mistaken for slopes.
-    Covariance and corrected fast models depend on these.
-    """
-    jacobian = state.jacobian
-    if moved >= _TELLING:
+        Raises:
+            FitError: the model is not finite at the start, or no pixel is usable.
+        """
+        settings = settings or SolverSettings()
+        huber, near = settings.huber, settings.near
+        if not self.data.usable.any():
+            raise FitError("no usable pixel in the fit window; check masks and crop")
+        x = np.clip(np.asarray(start, float), self.prior.low, self.prior.high)
+        state = self._linearise(x, huber, slopes)
+        damping = 1e-3
+        converged = False
+        reason = f"stopped after {settings.iterations} iterations"
+        iteration = 0
+        while iteration < settings.iterations:
+            iteration += 1
+            step, image, damping, accepted = self._step(state, damping, huber)
+            x = state.x + step if accepted else state.x
+            moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
+            done = not accepted or moved < settings.step_tolerance * (1 + damping)
+            # the Jacobian is exact, or was computed close enough
+            fresh = state.travel <= near if accepted else state.travel == 0
+            if not fresh and (done or moved < near):
+                # what looks final is checked with an exact Jacobian
+                state = self._linearise(x, huber)
+                damping = 1e-3
+                continue
+            if accepted:
+                state = self._advance(state, step, image, huber, final=done)
+            if done:
+                converged = moved < 10 * settings.step_tolerance
+                reason = (
+                    f"last step moved {moved:.2g} sigma"
+                    if converged
+                    else "no step lowers the misfit"
+                )
+                break
+        if settings.finish and state.travel > near:
+            state = self._linearise(state.x, huber)
+        return self._solution(state, huber, (converged, reason, iteration))
+
+    def _linearise(self, x: Array, huber: float, slopes: Array | None = None) -> _State:
+        """The problem at (p,) ``x``, with an exact Jacobian or with ``slopes``.
+
+        Raises:
+            FitError: the images are not finite.
+        """
+        image, jacobian = self.model(x, slopes is None)
+        jacobian = jacobian if slopes is None else slopes
+        if jacobian is None or not np.isfinite(image).all():
+            raise FitError(
+                "the model is not finite at these parameters; bound them or correct the start"
+            )
+        travel = 0.0 if slopes is None else math.inf
+        return self._state(x, image, jacobian, huber, travel)
+
+    def _advance(
+        self, state: _State, step: Array, image: Array, huber: float, *, final: bool
+    ) -> _State:
+        """The problem after a step, with the Jacobian updated by the images (Broyden),
+        or computed anew where it missed ``_MISSED`` of their change.
+
+        J + (dI - J s) sᵀC / (sᵀC s), with the curvature C as the metric: the least
+        change that explains dI. After a step of less than ``_TELLING`` sigma the
+        Jacobian stays: rounding of the images (float32) over so short a step would be
+        mistaken for slopes. Covariance and corrected fast models depend on these.
+        """
+        x = state.x + step
+        jacobian = state.jacobian
+        change = image - state.image
+        missed = change - np.tensordot(step, jacobian, 1)
+        root = np.sqrt(state.weight) / state.noise
+        size = max(float(np.linalg.norm(change * root)), 1e-300)
+        if not final and float(np.linalg.norm(missed * root)) > _MISSED * size:
+            return self._linearise(x, huber)
         measure = state.curvature @ step
-        missed = (image - state.image) - np.tensordot(step, jacobian, 1)
-        share = measure / max(float(step @ measure), 1e-300)
-        jacobian = jacobian + np.multiply.outer(share, missed)
-    return _state(
-        data,
-        (state.x + step, image, jacobian),
-        prior,
-        settings,
-        travel=state.travel + moved,
-    )
+        square = max(float(step @ measure), 1e-300)
+        moved = math.sqrt(square)
+        if moved >= _TELLING:
+            jacobian = jacobian + np.multiply.outer(measure / square, missed)
+        return self._state(x, image, jacobian, huber, state.travel + moved)
 
+    def _state(
+        self, x: Array, image: Array, jacobian: Array, huber: float, travel: float
+    ) -> _State:
+        """Gradient, curvature and weights of the problem at a point.
 
-def _state(
-    data: FitImages,
-    at: tuple[Array, Array, Array],
-    prior: GaussianPrior,
-    settings: SolverSettings,
-    *,
-    travel: float = 0.0,
-) -> _State:
-    """Gradient, curvature and weights of the problem at a point.
+        Args:
+            travel: sigma from the point where the Jacobian was computed.
+        """
+        prior = self.prior
+        noise, residual, weight = pixel_weights(self.data, image, huber)
+        root = np.sqrt(weight)
+        scaled = jacobian.reshape(len(x), -1) * (root / noise).ravel()
+        information = scaled @ scaled.T
+        pull = np.where(
+            np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma**2, 0.0
+        )
+        return _State(
+            x,
+            image,
+            jacobian,
+            travel,
+            residual,
+            weight,
+            -scaled @ (root * residual).ravel() + pull,
+            information + np.diag(prior.sigma**-2.0),
+            information,
+            noise,
+        )
 
-    Args:
-        at: (parameters, image, Jacobian).
-        travel: sigma from the point where the Jacobian was computed.
-    """
-    x, image, jacobian = at
-    noise, residual, weight = pixel_weights(data, image, settings.huber)
-    root = np.sqrt(weight)
-    scaled = jacobian.reshape(len(x), -1) * (root / noise).ravel()
-    information = scaled @ scaled.T
-    pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma**2, 0.0)
-    gradient = -scaled @ (root * residual).ravel() + pull
-    curvature = information + np.diag(prior.sigma**-2.0)
-    return _State(
-        x,
-        image,
-        jacobian,
-        travel,
-        residual,
-        weight,
-        gradient,
-        curvature,
-        information,
-        noise,
-    )
+    def _step(
+        self, state: _State, damping: float, huber: float
+    ) -> tuple[Array, Array, float, bool]:
+        """A step that lowers the misfit: (step, image there, next damping, accepted).
 
-
-def _step(
-    model: Model,
-    data: FitImages,
-    state: _State,
-    prior: GaussianPrior,
-    settings: SolverSettings,
-    damping: float,
-) -> tuple[Array, Array, float, bool]:
-    """A step that lowers the misfit: (step, image there, next damping, accepted).
-
-    Damping grows by 6 until -2 ln posterior does not rise; parameters blocked by a
-    bound stay. Two attempts with an approximate Jacobian, ten with an exact one.
-    """
-    before = _merit(data, state.image, state.x, prior, settings.huber)
-    size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
-    scaled = state.curvature / np.outer(size, size)
-    # at a bound, with the gradient beyond it
-    blocked = ((state.x <= prior.low) & (state.gradient > 0)) | (
-        (state.x >= prior.high) & (state.gradient < 0)
-    )
-    free = np.flatnonzero(~blocked)
-    step, image = np.zeros_like(state.x), state.image
-    for _ in range(10 if state.travel == 0 else 2):
-        matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
-        step = np.zeros_like(state.x)
+        Damping grows by 6 until -2 ln posterior does not rise; parameters blocked by a
+        bound stay. Two attempts with an approximate Jacobian, ten with an exact one.
+        """
+        x, low, high = state.x, self.prior.low, self.prior.high
+        limit = self._merit(state.image, x, huber) * (1 + 1e-12)
+        size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
+        scaled = state.curvature / np.outer(size, size)
+        # at a bound, with the gradient beyond it
+        blocked = ((x <= low) & (state.gradient > 0)) | (
+            (x >= high) & (state.gradient < 0)
+        )
+        free = np.flatnonzero(~blocked)
         gradient = state.gradient[free] / size[free]
-        step[free] = -np.linalg.lstsq(matrix, gradient, rcond=1e-14)[0] / size[free]
-        step = np.clip(state.x + step, prior.low, prior.high) - state.x
-        image, _ = model(state.x + step, False)
-        if np.isfinite(image).all():
-            after = _merit(data, image, state.x + step, prior, settings.huber)
-            if after <= before * (1 + 1e-12):
+        step, image = np.zeros_like(x), state.image
+        for _ in range(10 if state.travel == 0 else 2):
+            matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
+            step = np.zeros_like(x)
+            step[free] = -np.linalg.lstsq(matrix, gradient, rcond=1e-14)[0] / size[free]
+            step = np.clip(x + step, low, high) - x
+            image, _ = self.model(x + step, False)
+            finite = bool(np.isfinite(image).all())
+            if finite and self._merit(image, x + step, huber) <= limit:
                 return step, image, max(damping / 5, 1e-10), True
-        damping *= 6
-    return step, image, damping, False
+            damping *= 6
+        return step, image, damping, False
 
+    def _merit(self, image: Array, x: Array, huber: float) -> float:
+        """Deviance, linear beyond ``huber`` sigma, and the squared pull of the prior."""
+        prior = self.prior
+        size = np.sqrt(self.data.deviance(image))
+        loss = np.where(size <= huber, size**2, huber * (2 * size - huber))
+        pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma, 0.0)
+        return float(loss.sum() + (pull**2).sum())
 
-def _merit(
-    data: FitImages, image: Array, x: Array, prior: GaussianPrior, huber: float = HUBER
-) -> float:
-    """Deviance, linear beyond ``huber`` sigma, and the squared pull of the prior."""
-    size = np.sqrt(data.deviance(image))
-    loss = np.where(size <= huber, size**2, huber * (2 * size - huber))
-    pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma, 0.0)
-    return float(loss.sum() + (pull**2).sum())
+    def _solution(
+        self, state: _State, huber: float, ended: tuple[bool, str, int]
+    ) -> FitSolution:
+        """The solution at the end of a fit: covariance, reduced chi-square.
+
+        Args:
+            ended: (converged, reason, iterations).
+        """
+        counted = self.data.usable & ~self.data.saturated
+        inlier = counted & (np.abs(state.residual) <= huber)
+        dof = max(int(inlier.sum()) * _inlier_variance(huber) - len(state.x), 1.0)
+        covariance = invert_information(state.curvature)
+        return FitSolution(
+            state.x,
+            covariance,
+            state.information,
+            state.image,
+            state.residual * self.data.usable,
+            float((state.residual[inlier] ** 2).sum()) / dof,
+            self._merit(state.image, state.x, huber),
+            *ended,
+            beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
+            slopes=state.jacobian,
+        )
 
 
 def pixel_weights(
@@ -467,39 +415,6 @@ def pixel_weights(
     weight = np.minimum(1.0, huber / np.maximum(size, huber))
     silent = ~data.usable | (data.saturated & (residual == 0))
     return noise, residual, np.where(silent, 0.0, weight)
-
-
-def _solution(
-    data: FitImages,
-    state: _State,
-    prior: GaussianPrior,
-    settings: SolverSettings,
-    ended: tuple[bool, str, int],
-) -> FitSolution:
-    """The solution at the end of a fit: covariance, reduced chi-square.
-
-    Args:
-        ended: (converged, reason, iterations).
-    """
-    counted = data.usable & ~data.saturated
-    shown = state.residual * data.usable
-    inlier = counted & (np.abs(state.residual) <= settings.huber)
-    dof = max(int(inlier.sum()) * _inlier_variance(settings.huber) - len(state.x), 1.0)
-    chi2 = float((state.residual[inlier] ** 2).sum()) / dof
-    merit = _merit(data, state.image, state.x, prior, settings.huber)
-    covariance = invert_information(state.curvature)
-    return FitSolution(
-        state.x,
-        covariance,
-        state.information,
-        state.image,
-        shown,
-        chi2,
-        merit,
-        *ended,
-        beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
-        slopes=state.jacobian,
-    )
 
 
 def _inlier_variance(huber: float) -> float:

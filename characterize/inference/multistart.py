@@ -146,13 +146,11 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     )
 
 
-def search_modes(
-    task: SearchTask, *, begins: Sequence[Array] = ()
-) -> tuple[SearchTask, list[FitSolution]]:
+def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
     1. Short fits on a few frames, from the nominal lens, other global biases and
-       astigmatic wave fronts, or from ``begins``.
+       astigmatic wave fronts.
     2. The best of these to the end.
     3. Other promising ones, and mirrored starts, to the end.
 
@@ -161,7 +159,7 @@ def search_modes(
     """
     few = few_frames(task.model.setting)
     plain = starting_points(task)
-    starts = list(begins) or [*plain, *_leaning(plain[0])]
+    starts = [*plain, *_leaning(plain[0])]
     first = _short(task.rough(), few, starts)
     task = hold_windows(task, first[0].value)
     best = refine_fit(task, first[0].value)
@@ -315,9 +313,8 @@ def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
         task: model, frames, priors and arrangement of the search.
         begin: (parameters,) start of the search.
     """
-    start = with_values(begin, _opened(task, begin))
     try:
-        best = refine_fit(task, start[[PLACE[name] for name in task.names]])
+        best = refine_fit(task, _opened(task, begin))
         return add_mirrored_starts(task, [best])
     except FitError:
         return []
@@ -332,8 +329,7 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
         frees: names of the parameters that are fitted too.
     """
     more = dataclasses.replace(task, free=(*task.free, *frees))
-    x = task.all_of(best.value)
-    begin = with_values(x, _opened(more, x))[[PLACE[name] for name in more.names]]
+    begin = _opened(more, task.all_of(best.value))
     settings = SolverSettings(iterations=12, step_tolerance=0.3, near=1.0, finish=False)
     try:
         return more.posed().fit(begin, settings).merit
@@ -367,7 +363,6 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
 
     The prior keeps wave-front errors near 0.
     """
-    place = [PLACE[name] for name in task.names]
     problem = task.posed(few)
     waves = np.array([name.endswith("_rad") for name in task.names])
     sigma = np.where(
@@ -379,11 +374,8 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
         iterations=4, step_tolerance=1.0, near=math.inf, finish=False
     )
 
-    def fit_from(begin: Array) -> FitSolution:
-        opened = with_values(begin, _opened(task, begin))
-        return problem.fit(opened[place], short)
-
-    return sorted(threads.run_each(fit_from, begins), key=lambda t: t.merit)
+    fits = threads.run_each(lambda x: problem.fit(_opened(task, x), short), begins)
+    return sorted(fits, key=lambda t: t.merit)
 
 
 def refine_fit(
@@ -399,14 +391,10 @@ def refine_fit(
     return task.posed().fit(value, SolverSettings(iterations=80), slopes)
 
 
-def _opened(task: SearchTask, x: Array) -> dict[str, float]:
-    """Sizes that have no slope at 0 start off it."""
+def _opened(task: SearchTask, x: Array) -> Array:
+    """(p,) fitted ones of all parameters; sizes that have no slope at 0 start off it."""
     off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5, "glass_um": 50.0}
-    return {
-        name: size
-        for name, size in off.items()
-        if name in task.names and x[PLACE[name]] == 0
-    }
+    return np.array([x[PLACE[name]] or off.get(name, 0.0) for name in task.names])
 
 
 def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ...]:

@@ -8,22 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from characterize.captures import (
-    Capture,
-    ElectronFrames,
-    merge_brackets,
-    quantization_score,
-)
+from characterize.captures import Capture, ElectronFrames, merge_brackets
 from characterize.inference.leastsquares import FitImages
 from characterize.model import ForwardModel, FrameSetting, KnownValue, usual_parameters
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
-from metalens.fabrication import PillarKinds, Sensitivity
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
-_STILL = 0.05  # counts of noise at least that levels of pixels add, whatever is stated
-_FEW_BEYOND, _ROUGH = 0.01, 0.1  # share of the pillars, of slopes
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
@@ -122,7 +114,7 @@ def _dark_known(capture: Capture) -> bool:
 
 
 def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
-    """(rows, columns) of at most ``largest`` pixels about the centre of the light.
+    """(rows, columns) of a square of at most ``largest`` pixels about the light.
 
     The centroid of the median frame above 0.2 of its peak.
     """
@@ -131,8 +123,8 @@ def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
     light = np.maximum(light - 0.2 * np.percentile(light, 99.9), 0)
     total = max(light.sum(), 1e-9)
     slices = []
+    side = min(*light.shape, largest)
     for axis, size in enumerate(light.shape):
-        side = min(size, largest)
         place = (light.sum(1 - axis) * np.arange(size)).sum() / total
         first = int(np.clip(round(place) - side // 2, 0, size - side))
         slices.append(slice(first, first + side))
@@ -157,38 +149,6 @@ def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
         scale,
         common_floor=dark,
         common_light=frames.common_light,
-        count_e=frames.count_e,
-    )
-
-
-def correct_quantization(data: FitImages, image: Array) -> FitImages:
-    """Rounded counts as means and variances of equal information about ``image``.
-
-    Fisher scoring in each pixel: mean I + score / information, variance 1 over the
-    information. A fit to them ends at the greatest likelihood of the counts
-    (:mod:`characterize.captures.rounding`), once ``image`` is that of the fit.
-
-    Args:
-        data: frames, masks and noise that are fitted.
-        image: (n, y, x) expected electrons.
-    """
-    step = data.count_e / data.scale
-    variance = data.variance(image)
-    noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
-    score, information = quantization_score((data.electrons - image) / step, noise)
-    floor = np.where(
-        data.saturated,
-        data.variance_e2,
-        data.variance_e2 + step**2 / information - variance,
-    )
-    return dataclasses.replace(
-        data,
-        electrons=np.where(
-            data.saturated, data.electrons, image + step * score / information
-        ),
-        variance_e2=floor,
-        common_floor=data.common_floor * data.variance_e2 / floor,
-        count_e=0.0,
     )
 
 
@@ -297,38 +257,3 @@ def _number(capture: Capture, name: str) -> float:
     ):
         raise CaptureError(f"capture.toml: {name} = {value!r}; need a finite number")
     return float(value)
-
-
-def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
-    """What is known of the pillars to a tenth of it at best, or to a bias less than is
-    assumed, in words.
-
-    Args:
-        lens: the design.
-        response: slopes of the pillars by height and index.
-    """
-    rough = f"slopes of the pillars by height and index are known to {response.error:.0%} only"
-    return [*_beyond_table(lens), *([rough] if response.error > _ROUGH else [])]
-
-
-def _beyond_table(lens: Lens) -> list[str]:
-    """Whether the bias to be expected leads pillars of two sizes beyond the table
-    of their lens, in words.
-    """
-    if lens.pairs is None:
-        return []
-    kinds = PillarKinds.of(lens.diameters)
-    reach_um = usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3
-    at_ends = np.zeros(len(kinds.count), bool)
-    for size, axis in (
-        (kinds.width_um, lens.pairs.x_um),
-        (kinds.length_um, lens.pairs.y_um),
-    ):
-        at_ends |= (size < axis[0] + reach_um) | (size > axis[-1] - reach_um)
-    share = float(kinds.count[at_ends].sum() / kinds.count.sum())
-    if share < _FEW_BEYOND:
-        return []
-    return [
-        f"{share:.0%} of the pillars are within {reach_um * 1e3:.0f} nm of the ends of their table, beyond which t is "
-        "followed along its tangents: sweep the library that much wider than the sizes the design may use"
-    ]

@@ -44,8 +44,7 @@ class ImageChange:
     it; one for all or one for each, 0 for none.
     frees: parameters that describe the cause. stated: whether one of these is stated
     without an error.
-    roughly: the pattern of the change is not known well enough for the frames to bound
-    it. of_mask: the cause belongs to the lens itself. positive: its amount cannot be
+    of_mask: the cause belongs to the lens itself. positive: its amount cannot be
     below 0.
     """
 
@@ -54,7 +53,6 @@ class ImageChange:
     sigma: float | Array = 0.0
     frees: tuple[str, ...] = ()
     stated: bool = False
-    roughly: bool = False
     of_mask: bool = False
     positive: bool = False
 
@@ -78,12 +76,10 @@ def systematic_changes(
     yield from _of_model(task, x, image)
     if "sidewall_deg" not in task.names or rough.lens.cell.sidewall_rad == 0:
         leaning = rough.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
-        # roughly: resonances are left out
         yield ImageChange(
             "a side wall that leans about half height",
             leaning[None],
             (_size(task, "sidewall_deg") / _WALL_DEG) ** 2,
-            roughly=True,
             of_mask=True,
             positive=True,
         )
@@ -116,12 +112,10 @@ def systematic_changes(
     fields = write_fields(rough.lens)
     names = [f"residual_{k}" for k in range(fields.shape[1])]
     by_phase = np.asarray(rough.with_residual(smooth_phases).images(x, names)[1])
-    # roughly: what the polynomials leave over scatters light
     yield ImageChange(
         "write fields out of place, or another smooth phase error",
         np.tensordot(fields, by_phase, 1),
         _size(task, "stitching_nm") * 1e-3,
-        roughly=True,
         of_mask=True,
     )
 

@@ -1,7 +1,6 @@
 """Posterior about the modes of a fit: profiles where the parabola fails, weighted draws."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,8 +30,8 @@ from metalens.core.arrays import Array
 REACH = 1.959964  # sigma of a 95 % interval
 DRAWS = 96
 _PARABOLIC = 0.85, 1.18  # end of an interval over that of the parabola
-_SIDE = 4  # most places of a profile on each side of the mode
-_CLOSE = 0.05  # relative error of the goal at which a place is the profile's end
+# places of a profile on each side, in units of the parabola's interval
+_PLACES = (0.5, 1.0, 2.0, 4.0)
 _LOWER = 0.5  # fall of -2 ln posterior below the mode that counts as a better mode
 _RESTARTS = 2
 _OF_THE_BENCH = ("log_gain", "background")
@@ -46,17 +45,13 @@ class ProfileLikelihood:
     """Profile likelihood of one parameter about a mode.
 
     low, high: 95 % interval. value, rise: (k,) the parameter, and the rise of -2 ln
-    posterior there with all others fitted. parabolic: whether the ends are those of the
-    parabola. reached: whether the low and the high end were reached. stops: the fits with
-    the parameter fixed.
+    posterior there with all others fitted. stops: the fits with the parameter fixed.
     """
 
     low: float
     high: float
     value: Array
     rise: Array
-    parabolic: bool
-    reached: tuple[bool, bool] = (True, True)
     stops: tuple[FitSolution, ...] = ()
 
 
@@ -136,8 +131,8 @@ def profile_parameters(
 ) -> dict[int, ProfileLikelihood]:
     """Profile of each parameter in ``index`` about ``mode``, to a rise of ``level``.
 
-    Where -2 ln posterior at both ends of the parabola's interval is that of the
-    parabola, these are the ends, and no fit is made.
+    The parabola, where -2 ln posterior at its interval's ends rises by ``level`` within
+    ``_PARABOLIC``; else nine points, with all other parameters fitted.
 
     Args:
         problem: images, frames and prior.
@@ -152,79 +147,60 @@ def _profile(
 ) -> ProfileLikelihood:
     """Profile likelihood of parameter ``i``: the parabola where it holds, else fits.
 
-    The parabola holds where -2 ln posterior at its interval's ends rises by ``level``
-    within ``_PARABOLIC``.
+    The root of the rise of -2 ln posterior, straight for a parabola, is interpolated
+    between the points of each side. Where none of them rises so far, the interval ends
+    at the bound, at most twice as far as the last.
     """
     sigma = math.sqrt(float(mode.covariance[i, i]))
     goal = math.sqrt(level)
     middle = float(mode.value[i])
     # all parameters on the ridge of the parabola, for one sigma of this one
     along = mode.covariance[:, i] / sigma
-    low, high = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
+    least, most = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
+    prior = problem.prior
     places = [mode.value + sign * goal * along for sign in (-1, 1)]
-    inside = all(
-        ((x >= problem.prior.low) & (x <= problem.prior.high)).all() for x in places
-    )
-    if inside and all(low < problem.merit(x) - mode.merit < high for x in places):
+    inside = all(((x >= prior.low) & (x <= prior.high)).all() for x in places)
+    if inside and all(least < problem.merit(x) - mode.merit < most for x in places):
         steps = np.array([-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5])
-        value = middle + steps * sigma
-        return ProfileLikelihood(
-            middle - goal * sigma, middle + goal * sigma, value, steps**2, True
-        )
-    sides = [_profile_side(problem, mode, i, sign, goal) for sign in (-1, 1)]
-    ends = [middle + sign * side[0] for sign, side in zip((-1, 1), sides, strict=True)]
-    stops = tuple(itertools.chain.from_iterable(side[2] for side in sides))
+        low, high = middle - goal * sigma, middle + goal * sigma
+        return ProfileLikelihood(low, high, middle + steps * sigma, steps**2)
+    ends, stops = [], list[FitSolution]()
+    for bound in (float(prior.low[i]), float(prior.high[i])):
+        side = _profile_side(problem, mode, i, bound, goal)
+        rises = [stop.merit - mode.merit for stop in side]
+        roots = np.sqrt(np.maximum.accumulate([0.0, *rises]))
+        distance = [0.0, *(abs(float(stop.value[i]) - middle) for stop in side)]
+        beyond = min(abs(bound - middle), 2 * distance[-1])
+        end = float(np.interp(goal, roots, distance, right=beyond))
+        ends.append(middle + math.copysign(end, bound - middle))
+        stops += side
     points = ((float(stop.value[i]), stop.merit - mode.merit) for stop in stops)
     value, rise = np.array(sorted([(middle, 0.0), *points])).T
-    ratio = np.abs(np.array(ends) - middle) / (goal * sigma)
-    straight = bool(((ratio > _PARABOLIC[0]) & (ratio < _PARABOLIC[1])).all())
-    reached = sides[0][1], sides[1][1]
-    return ProfileLikelihood(ends[0], ends[1], value, rise, straight, reached, stops)
+    return ProfileLikelihood(ends[0], ends[1], value, rise, tuple(stops))
 
 
 def _profile_side(
-    problem: FitProblem, mode: FitSolution, i: int, sign: int, goal: float
-) -> tuple[float, bool, list[FitSolution]]:
-    """One end of a profile: where the root of the rise of -2 ln posterior is ``goal``.
-
-    That root grows nearly evenly with the distance: each place is interpolated in those
-    before, or extrapolated along the line from the mode, at most to twice the distance.
-    At every place the other parameters are fitted.
+    problem: FitProblem, mode: FitSolution, i: int, bound: float, goal: float
+) -> list[FitSolution]:
+    """Fits with parameter ``i`` fixed at the places of one side, until -2 ln posterior
+    rises by the square of ``goal``.
 
     Args:
-        sign: side, -1 or 1.
-
-    Returns:
-        (distance of the end from the mode, whether it was reached, fits on the way).
+        bound: of the parameter on this side.
     """
-    prior = problem.prior
     middle = float(mode.value[i])
-    bound = abs(float((prior.high if sign > 0 else prior.low)[i]) - middle)
-    distance = min(goal * math.sqrt(float(mode.covariance[i, i])), bound)
-    # distances from the mode, roots of the rise there, and the fits
-    places, roots, stops = [0.0], [0.0], [mode]
-    for _ in range(_SIDE):
-        here = stops[int(np.argmin(np.abs(np.array(places) - distance)))]
-        value = middle + sign * distance
+    reach = goal * math.sqrt(float(mode.covariance[i, i]))
+    stops = [mode]
+    for place in _PLACES:
+        distance = min(place * reach, abs(bound - middle))
+        value = middle + math.copysign(distance, bound - middle)
+        here = stops[-1]
         way = here.covariance[:, i] / here.covariance[i, i] * (value - here.value[i])
-        stop = problem.with_fixed(i, value).fit(
-            here.value + way, _PROFILE_FIT, here.slopes
-        )
-        root = math.sqrt(max(stop.merit - mode.merit, 0.0))
-        at = int(np.searchsorted(places, distance))
-        places.insert(at, distance)
-        roots.insert(at, root)
-        stops.insert(at, stop)
-        if abs(root - goal) < _CLOSE * goal or (distance >= bound and root < goal):
+        fixed = problem.with_fixed(i, value)
+        stops.append(fixed.fit(here.value + way, _PROFILE_FIT, here.slopes))
+        if stops[-1].merit - mode.merit >= goal**2 or value == bound:
             break
-        if max(roots) >= goal:
-            distance = float(np.interp(goal, np.maximum.accumulate(roots), places))
-        else:
-            distance *= min(2.0, goal / max(root, goal / 2))
-        distance = min(distance, bound)
-    end = float(np.interp(goal, np.maximum.accumulate(roots), places))
-    reached = max(roots) > (1 - _CLOSE) * goal or end >= bound
-    return end, reached, [stop for stop in stops if stop is not mode]
+    return stops[1:]
 
 
 def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
@@ -335,72 +311,52 @@ def _joined(
         calibration: (p, p) covariance by errors of dark, flat and gain.
     """
     best = modes[0]
-    names = task.names
     prior = task.prior
     spread = max(1.0, best.chi2_per_dof)
-    level = REACH**2 * spread
-    sigma = np.sqrt(spread * np.diag(best.covariance))
+    reach = REACH * np.sqrt(spread * np.diag(best.covariance))
     # intervals: of the parabola, of the profiles, then over the other modes
-    low = best.value - REACH * sigma
-    high = best.value + REACH * sigma
-    parabolic = np.ones(len(names), bool)
+    low, high = best.value - reach, best.value + reach
     for i, profile in profiles.items():
-        low[i] = profile.low
-        high[i] = profile.high
-        parabolic[i] = profile.parabolic
+        low[i], high[i] = profile.low, profile.high
     for mode in modes[1:]:
-        root = math.sqrt(max(level - (mode.merit - best.merit), 0.0))
-        reach = root * np.sqrt(np.diag(mode.covariance))
-        low = np.minimum(low, np.where(root > 0, mode.value - reach, low))
-        high = np.maximum(high, np.where(root > 0, mode.value + reach, high))
-    ratio = np.maximum(high - best.value, best.value - low) / (REACH * sigma)
-    parabolic &= ratio < _PARABOLIC[1]
+        root = REACH**2 * spread - (mode.merit - best.merit)
+        if root > 0:
+            other = np.sqrt(root * np.diag(mode.covariance))
+            low = np.minimum(low, mode.value - other)
+            high = np.maximum(high, mode.value + other)
+    ratio = np.array([best.value - low, high - best.value]) / reach
+    close = (ratio > _PARABOLIC[0]) & (ratio < _PARABOLIC[1])
+    parabolic = np.asarray(close.all(0))
     # errors of the calibration, added in quadrature
     common = REACH * np.sqrt(np.maximum(np.diag(calibration), 0.0))
     low = np.maximum(best.value - np.hypot(best.value - low, common), prior.low)
     high = np.minimum(best.value + np.hypot(high - best.value, common), prior.high)
     share = mode_probabilities(modes, spread)
     covariance = best.covariance * spread + calibration
-    draws, size = np.empty((0, len(names))), 0.0
+    draws, size = np.empty((0, len(low))), 0.0
     if not parabolic.all() or share[0] < 0.99:
         stops = [stop for profile in profiles.values() for stop in profile.stops]
         draws, size = draw_posterior(problem, [*modes, *stops], spread=spread)
         rng = np.random.default_rng(1)
         shift = gaussian_draws(rng, len(draws), calibration)
         draws = np.clip(draws + shift, prior.low, prior.high)
-        own = np.sqrt(np.diag(covariance))
-        wide = (high - low) / (2 * REACH)
-        covariance = covariance / np.outer(own, own) * np.outer(wide, wide)
-    named = {
-        names[i]: dataclasses.replace(profile, low=float(low[i]), high=float(high[i]))
-        for i, profile in profiles.items()
-    }
+        wider = (high - low) / (2 * REACH) / np.sqrt(np.diag(covariance))
+        covariance = covariance * np.outer(wider, wider)
+    named = {task.names[i]: profile for i, profile in profiles.items()}
     return FitPosterior(
         tuple(modes), share, low, high, parabolic, draws, size, named, covariance
     )
 
 
 def posterior_text(names: Sequence[str], posterior: FitPosterior) -> list[str]:
-    """Sentences on what the posterior leaves open.
-
-    Ends of intervals that were not reached, skewed intervals, second modes, few draws.
+    """Sentences on what the posterior leaves open: skewed intervals, second modes, few
+    draws.
 
     Args:
         names: of the parameters.
         posterior: their posterior.
     """
-    out = [
-        f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, "
-        "perhaps beyond"
-        for name, profile in posterior.profiles.items()
-        for which, place, reached in zip(
-            ("lower", "upper"),
-            (profile.low, profile.high),
-            profile.reached,
-            strict=True,
-        )
-        if not reached
-    ]
+    out = []
     for i, name in enumerate(names):
         if not posterior.parabolic[i]:
             out.append(

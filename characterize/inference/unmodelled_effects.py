@@ -1,10 +1,10 @@
-"""Causes that the fit leaves out: each leans the residuals its own way, and is looked
-for along that (score test).
+"""One joint covariance of fitted parameters and effects that nobody stated, and score
+tests of every effect that the fit leaves out.
 """
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +23,7 @@ CHANCE = 1e-4
 # Bayes factor above which a cause is fitted: by chance in one fit of 100 or fewer
 ODDS = 10.0
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost: number and range
-# sigma of chi-square above which dark spots are tested; their spacing over the radius
-_PATCHY, _SPOT = 3.0, 0.2
+_CLIP = 6.0  # largest residual that counts, sigma
 
 _CURES = {
     systematic_effects.LAMP: "state the light of every frame, by a monitor diode, in proportion as "
@@ -42,15 +41,13 @@ class ResidualFinding:
     sigma: float
 
 
-def decisive_findings(
-    findings: Sequence[ResidualFinding], sigma: float = 5.0
-) -> list[str]:
-    """Findings beyond ``sigma``, in words: no fit with one passes its checks.
+def decisive_findings(findings: Sequence[ResidualFinding]) -> list[str]:
+    """Findings beyond 5 sigma, in words: no fit with one passes its checks.
 
     Args:
         findings: what residuals hold.
     """
-    return [finding.words for finding in findings if finding.sigma > sigma]
+    return [finding.words for finding in findings if finding.sigma > 5]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,61 +70,14 @@ class ScoreTest:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ScoreTests:
-    """Score tests, the least probable by chance first, at a fit, and the causes of
-    assumed size as changes (k, pixels) over the noise, of one standard deviation each.
-    """
-
-    tests: list[ScoreTest]
-    fit: "FitAtMode"
-    unstated: tuple[ImageChange, ...]
-
-    def shifts(self) -> "UnmodelledShifts":
-        """Shifts of the parameters by causes that nobody stated: the marginal less the
-        conditional covariance of one joint Gaussian posterior.
-
-        Causes have factors c of their changes, N(0, 1) or, where the change is well
-        known, their posterior (:meth:`FitAtMode.amounts`). The parameters shift by M c
-        with M = K⁻¹ A Gᵀ; second moments are summed over the causes.
-        """
-        p = len(self.fit.names)
-        sizes = [len(cause.images) for cause in self.unstated]
-        changes = [cause.images for cause in self.unstated]
-        every = np.concatenate([np.empty((0, len(self.fit.residual))), *changes])
-        number = np.repeat(np.arange(len(sizes)), sizes)
-        exact = np.array([not cause.roughly for cause in self.unstated], bool)[number]
-        bench = np.array([not cause.of_mask for cause in self.unstated], bool)[number]
-        # of a change of 0 the posterior is the prior
-        covariance, pull = self.fit.amounts(every * exact[:, None])
-        amount = covariance @ pull
-        second = covariance + np.outer(amount, amount)
-        moved = self.fit.moved_by(every)
-
-        def moment(some: Array) -> Array:
-            part = moved[:, some]
-            return np.asarray(part @ second[np.ix_(some, some)] @ part.T)
-
-        by_cause = [np.diag(moment(number == k)) for k in range(len(sizes))]
-        return UnmodelledShifts(
-            tuple(cause.cause for cause in self.unstated),
-            np.sqrt(np.maximum(by_cause, 0)).reshape(-1, p),
-            moment(np.ones(len(every), bool)),
-            moment(bench),
-            moved @ amount,
-            np.sqrt(np.maximum(np.diag(moved @ covariance @ moved.T), 0)),
-        )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class UnmodelledShifts:
-    """Root mean square shift of each parameter by each effect that nobody stated:
-    causes, (c, p) shifts.
+    """What effects that nobody stated add to the covariance of the parameters.
 
-    covariance: (p, p) second moment of the shifts by all of them. bench: the same by
-    those that the lens leaves behind
-    with the bench; the others act on its light as the parameters do that took them up.
-    mean, spread: (p,) expected shift of each parameter by all of them, given the
-    frames, and its standard deviation.
+    covariance: (p, p) marginal less conditional covariance of the joint posterior of
+    parameters and effects. mean: (p,) shift from its optimum to that of the parameters
+    alone. bench: the part of ``covariance`` by effects that the lens leaves behind with
+    the bench; the others act on its light as the parameters do that took them up.
+    causes, by_cause: (c, p) standard deviation by each.
     """
 
     causes: tuple[str, ...]
@@ -135,16 +85,137 @@ class UnmodelledShifts:
     covariance: Array
     bench: Array
     mean: Array
-    spread: Array
 
     @property
     def sigma(self) -> Array:
-        """(p,) standard deviation of the shifts by all causes."""
+        """(p,) standard deviation that all effects add in quadrature."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
-def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
-    """Score tests of every cause that is not fitted, at the end of a fit.
+@dataclass(frozen=True, eq=False, slots=True)
+class FitAtMode:
+    """Normal equations at the mode: slopes J (p, pixels) over the noise, information K
+    with the priors, and the residuals r.
+
+    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the
+    noise. pull: (p,) of the priors, which the residuals along the slopes balance at the
+    mode.
+    """
+
+    slopes: Array
+    information: Array
+    residual: Array
+    shared: Array
+    pull: Array
+
+    def project_out(self, changes: Array) -> tuple[Array, Array, Array]:
+        """(k, pixels) changes G less what the fit takes up, their (k,) scores, and the
+        (k, p) shifts M of the parameters that take it up.
+
+        G' = G - M J with M = G Jᵀ K⁻¹. The score G'ᵀr + Mᵀ pull equals Gᵀr at the mode
+        and does not change to first order off it.
+        """
+        moved = np.linalg.solve(self.information, self.slopes @ changes.T).T
+        left = changes - moved @ self.slopes
+        return left, left @ self.residual + moved @ self.pull, moved
+
+    def score_test(self, cause: str, changes: Array, *, positive: bool) -> ScoreTest:
+        """Score test (Rao) of a cause by its changes G (k, pixels).
+
+        Chi-square sᵀS⁻¹s of the scores s with their scatter S. Directions taken up to
+        all but a thousandth are left out. Where the amount is ``positive``, a score
+        below 0 speaks for none.
+        """
+        none = ScoreTest(cause, 0.0, 0, 1.0)
+        size = np.sqrt((changes**2).sum(1))
+        changes = changes[size > 0] / size[size > 0, None]
+        left, score, _ = self.project_out(changes)
+        values, vectors = np.linalg.eigh(changes @ left.T)
+        vectors = vectors[:, values > 1e-3]
+        degrees = vectors.shape[1]
+        if not degrees or (positive and score[0] <= 0):
+            return none
+        scatter = vectors.T @ (changes @ left.T + self.shared_scatter(left)) @ vectors
+        chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
+        return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
+
+    def joint_amounts(self, changes: Array) -> tuple[Array, Array, Array]:
+        """Joint posterior of the factors c of (k, pixels) changes G of one standard
+        deviation each: (k, k) covariance C, (k,) H S⁻¹ s of the mean C H S⁻¹ s, and the
+        (k, p) shifts M of the parameters.
+
+        H = G G'ᵀ is the Schur complement of the parameters in the normal matrix of
+        both, S = H + errors that all frames share the scatter of the scores s, and
+        C = (1 + H S⁻¹ H)⁻¹.
+        """
+        left, score, moved = self.project_out(changes)
+        effect = changes @ left.T
+        scatter = effect + self.shared_scatter(left)
+        scatter += max(1e-9 * float(np.trace(scatter)), 1e-300) * np.eye(len(scatter))
+        weight = np.linalg.solve(scatter, effect)
+        covariance = np.linalg.inv(np.eye(len(effect)) + effect @ weight)
+        return covariance, weight.T @ score, moved
+
+    def odds(self, changes: Array) -> float:
+        """Bayes factor of a cause against its absence, at most exp(100).
+
+        With t = H S⁻¹ s and C of :meth:`joint_amounts`, integration over its factors c,
+        N(0, 1), gives exp(tᵀC t / 2) (det C)^½.
+
+        Args:
+            changes: (k, pixels) of one standard deviation each.
+        """
+        covariance, weighted, _ = self.joint_amounts(changes)
+        explained = float(weighted @ covariance @ weighted) / 2
+        log_odds = explained + float(np.linalg.slogdet(covariance)[1]) / 2
+        return math.exp(min(log_odds, 100.0))
+
+    def unmodelled_shifts(self, effects: Sequence[ImageChange]) -> UnmodelledShifts:
+        """Marginal less conditional covariance of the parameters: M C Mᵀ by the
+        posterior C of the ``effects``, whose changes are (k, pixels) of one standard
+        deviation each.
+        """
+        pixels = self.slopes.shape[1]
+        every = np.concatenate([np.empty((0, pixels)), *(e.images for e in effects)])
+        number = np.repeat(np.arange(len(effects)), [len(e.images) for e in effects])
+        of_bench = np.array([not e.of_mask for e in effects], bool)[number]
+        covariance, weighted, moved = self.joint_amounts(every)
+
+        def moment(some: Array) -> Array:
+            part = moved[some]
+            return np.asarray(part.T @ covariance[np.ix_(some, some)] @ part)
+
+        variances = [np.diag(moment(number == k)) for k in range(len(effects))]
+        return UnmodelledShifts(
+            tuple(effect.cause for effect in effects),
+            np.sqrt(np.maximum(variances, 0)).reshape(-1, len(self.slopes)),
+            moment(number >= 0),
+            moment(of_bench),
+            covariance @ weighted @ moved,
+        )
+
+    def shared_scatter(self, left: Array) -> Array:
+        """(k, k) additional scatter of scores by errors that all frames share.
+
+        Errors of dark and of flat; less what of the dark is in the noise already.
+
+        Args:
+            left: (k, pixels) changes that the fit does not take up.
+        """
+        shape = self.shared.shape[1:]
+        dark, flat = (
+            (left.reshape(-1, *shape) * error).sum(1).reshape(len(left), -1)
+            for error in self.shared
+        )
+        counted = left * self.shared[0].ravel()
+        return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
+
+
+def run_score_tests(
+    task: SearchTask, mode: FitSolution
+) -> tuple[list[ScoreTest], UnmodelledShifts]:
+    """Score tests of every cause that is not fitted, the least probable by chance
+    first, and what causes of assumed size add to the covariance.
 
     Each cause changes the images by G; tested is whether the residuals lean along the
     part of G that the fit does not take up. Image and slopes are those of the fit.
@@ -162,54 +233,47 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     weight = task.prior.sigma**-2.0
     over = math.sqrt(max(1.0, mode.chi2_per_dof))
     fit = FitAtMode(
-        task.names,
         fitted,
         fitted @ fitted.T + np.diag(weight),
-        (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel() / over,
+        (np.clip(mode.residual_sigma, -_CLIP, _CLIP) * (root > 0)).ravel() / over,
         task.data.shared(mode.image) * root,
         (mode.value - task.prior.mean) * weight / over,
     )
-    tests, unstated = list[ScoreTest](), list[ImageChange]()
+    tests, assumed = list[ScoreTest](), list[ImageChange]()
     by_name = dict(zip(task.names, mode.slopes, strict=True))
     for effect in systematic_effects.systematic_changes(task, x, by_name):
         change = (effect.images * root).reshape(len(effect.images), -1)
-        test = dataclasses.replace(
-            fit.score_test(effect.cause, change),
-            frees=effect.frees,
-            stated=effect.stated,
-        )
-        if effect.positive and fit.residual_changes(change)[1][0] <= 0:
-            test = ScoreTest(effect.cause, 0.0, 0, 1.0)
+        test = fit.score_test(effect.cause, change, positive=effect.positive)
+        odds = 0.0
         if np.any(effect.sigma):
-            assumed = np.reshape(effect.sigma, (-1, 1)) * change
-            unstated.append(dataclasses.replace(effect, images=assumed))
-            if test.frees and not test.stated:
-                test = dataclasses.replace(test, odds=fit.odds(assumed))
-        tests.append(test)
+            change = np.reshape(effect.sigma, (-1, 1)) * change
+            assumed.append(dataclasses.replace(effect, images=change))
+            if effect.frees and not effect.stated:
+                odds = fit.odds(change)
+        tests.append(
+            dataclasses.replace(
+                test, frees=effect.frees, stated=effect.stated, odds=odds
+            )
+        )
     tests.append(_ghost(task, x, mode.image, root, fit))
-    pixels = max(float((root > 0).sum()), 1.0)
-    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / pixels):
-        tests.append(_patch(task, x, root, fit))
     tests = [test for test in tests if test.degrees]
     tests.sort(key=lambda test: (test.chance, -test.chi2))
-    return ScoreTests(tests, fit, tuple(unstated))
+    return tests, fit.unmodelled_shifts(assumed)
 
 
-def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
-    """Shifts by unfitted causes to be expected of frames not taken yet.
+def expected_shifts(task: SearchTask) -> UnmodelledShifts:
+    """What unstated effects add to the covariance of a fit of frames not taken yet.
 
     At the task's start, with residuals of 0.
     """
     image, slopes = task.model.images(task.start, task.names)
     p = len(task.names)
-    value = task.start[[PLACE[name] for name in task.names]]
-    none = np.zeros_like(image)
     mode = FitSolution(
-        value,
+        task.start[[PLACE[name] for name in task.names]],
         np.eye(p),
         np.eye(p),
         image,
-        none,
+        np.zeros_like(image),
         1.0,
         0.0,
         True,
@@ -218,7 +282,7 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
         np.zeros(p),
         np.asarray(slopes),
     )
-    return run_score_tests(task, mode).shifts()
+    return run_score_tests(task, mode)[1]
 
 
 def to_fit(
@@ -270,132 +334,13 @@ def score_test_text(score_tests: list[ScoreTest]) -> list[ResidualFinding]:
     return [ResidualFinding(said, sigma)]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class FitAtMode:
-    """The fit at its mode: slopes (p, pixels) over the noise, their information with
-    the priors, and the residuals.
-
-    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the
-    noise. pull: (p,) of the
-    priors, which the residuals along the slopes balance at the mode.
-    """
-
-    names: tuple[str, ...]
-    slopes: Array
-    information: Array
-    residual: Array
-    shared: Array
-    pull: Array
-
-    def score_test(self, cause: str, changes: Array) -> ScoreTest:
-        """Score test of a cause by its changes G (k, pixels).
-
-        Score s = G'ᵀr of the part G' that the fit does not take up; chi-square sᵀS⁻¹s
-        with S its scatter. Directions taken up to all but a thousandth are left out.
-        """
-        size = np.sqrt((changes**2).sum(1))
-        changes = changes[size > 0] / size[size > 0, None]
-        if not len(changes):
-            return ScoreTest(cause, 0.0, 0, 1.0)
-        left, score = self.residual_changes(changes)
-        values, vectors = np.linalg.eigh(changes @ left.T)
-        vectors = vectors[:, values > 1e-3]
-        degrees = vectors.shape[1]
-        if not degrees:
-            return ScoreTest(cause, 0.0, 0, 1.0)
-        scatter = vectors.T @ (changes @ left.T + self.shared_scatter(left)) @ vectors
-        chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
-        return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
-
-    def residual_changes(self, changes: Array) -> tuple[Array, Array]:
-        """(k, pixels) changes less what the fit takes up, and their (k,) scores.
-
-        G' = G - M J of changes G, with shifts M and slopes J. The score is G'ᵀr + Mᵀ
-        pull, which equals Gᵀr at the mode and does not change to first order off it.
-        """
-        moved = self.moved_by(changes).T
-        left = changes - moved @ self.slopes
-        return left, left @ self.residual + moved @ self.pull
-
-    def moved_by(self, changes: Array) -> Array:
-        """(p, k) shift M of the parameters by (k, pixels) changes."""
-        return np.asarray(np.linalg.solve(self.information, self.slopes @ changes.T))
-
-    def odds(self, changes: Array) -> float:
-        """Bayes factor of a cause against its absence, at most exp(100).
-
-        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹, integration over its factors c,
-        N(0, 1), gives exp(tᵀC t / 2) (det C)^½.
-
-        Args:
-            changes: (k, pixels) of one standard deviation each.
-        """
-        covariance, weighted = self.amounts(changes)
-        explained = float(weighted @ covariance @ weighted) / 2
-        log_odds = explained + float(np.linalg.slogdet(covariance)[1]) / 2
-        return math.exp(min(log_odds, 100.0))
-
-    def amounts(self, changes: Array) -> tuple[Array, Array]:
-        """Posterior of the factors c of (k, pixels) changes G of one standard deviation
-        each, given the frames: (k, k) covariance C and (k,) H S⁻¹ s, of mean C H S⁻¹ s.
-
-        With H = GᵀG' and S the scatter of their scores s, C = (1 + H S⁻¹ H)⁻¹.
-        """
-        left, score = self.residual_changes(changes)
-        effect = changes @ left.T
-        scatter = effect + self.shared_scatter(left)
-        scatter += max(1e-9 * float(np.trace(scatter)), 1e-300) * np.eye(len(scatter))
-        weight = np.linalg.solve(scatter, effect)
-        return np.linalg.inv(np.eye(len(effect)) + effect @ weight), weight.T @ score
-
-    def shared_scatter(self, left: Array) -> Array:
-        """(k, k) additional scatter of scores by errors that all frames share.
-
-        Errors of dark and of flat; less what of the dark is in the noise already.
-
-        Args:
-            left: (k, pixels) changes that the fit does not take up.
-        """
-        shape = self.shared.shape[1:]
-        dark, flat = (
-            (left.reshape(-1, *shape) * error).sum(1).reshape(len(left), -1)
-            for error in self.shared
-        )
-        counted = left * self.shared[0].ravel()
-        return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
-
-
-def _strongest(
-    changes: Iterable[Array], root: Array, fit: FitAtMode
-) -> tuple[float, int, float]:
-    """The change above 0 that explains most: (chi-square, index, chance).
-
-    The chance is that of the best of all changes (Bonferroni).
-
-    Args:
-        changes: (n, y, x) each.
-        root: (n, y, x) 1 / sigma of the pixels.
-    """
-    best, index, count = 0.0, 0, 0
-    for image in changes:
-        change = (image * root).reshape(1, -1)
-        left, score = fit.residual_changes(change)
-        effect = float((change * left).sum())
-        if effect > 1e-3 * float((change**2).sum()) and score[0] > 0:
-            chi2 = float(score[0]) ** 2 / (
-                effect + float(fit.shared_scatter(left)[0, 0])
-            )
-            best, index = max((best, index), (chi2, count))
-        count += 1
-    return best, index, min(1.0, count * float(stats.chi2.sf(best, 1)) / 2)
-
-
 def _ghost(
     task: SearchTask, x: Array, image: Array, root: Array, fit: FitAtMode
 ) -> ScoreTest:
     """Score test of a ghost: a fainter, shifted copy of the light at any shift.
 
-    Up to about ``_SHIFTS`` shifts of ``_NEAREST_PX`` to ``_FARTHEST_PX`` pixels.
+    The shift that explains most, of about ``_SHIFTS`` by ``_NEAREST_PX`` to
+    ``_FARTHEST_PX`` pixels; its chance is that of the best of all (Bonferroni).
     """
     light = image - background_planes(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
@@ -403,47 +348,12 @@ def _ghost(
     places = [
         (i, j) for i in steps for j in steps if max(abs(i), abs(j)) >= _NEAREST_PX
     ]
-    places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
-    copies = (shift_frames(light, shift) for shift in places)
-    best, _, chance = _strongest(copies, root, fit)
     words = "a ghost: a fainter, shifted copy of the light"
-    return ScoreTest(words, best, int(bool(places)), chance)
-
-
-def _patch(task: SearchTask, x: Array, root: Array, fit: FitAtMode) -> ScoreTest:
-    """Score test of a patch of the lens without light, at any place.
-
-    Light missing from a small spot changes the intensity by -2 Re(E* E_s), linear in
-    its depth.
-    """
-    u, v = _places()
-    names = [f"residual_{k}" for k in range(len(u))]
-    dark = np.asarray(task.model.with_residual(_spots).images(x, names)[1])
-    best, place, chance = _strongest(dark, root, fit)
-    x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
-    words = (
-        f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the "
-        "lens"
-    )
-    return ScoreTest(words, best, 1, chance)
-
-
-def _places() -> tuple[Array, Array]:
-    """(places,) u and v of spots on the lens, a spot's width apart."""
-    t = np.arange(-1, 1 + _SPOT / 2, _SPOT)
-    u, v = (part.ravel() for part in np.meshgrid(t, t))
-    inside = np.hypot(u, v) <= 1
-    return u[inside], v[inside]
-
-
-def _spots(u: Array, v: Array) -> Array:
-    """(spots, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1)
-    of its amplitude there.
-    """
-    places = zip(*_places(), strict=True)
-    return np.stack(
-        [
-            1j * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (_SPOT / 1.5) ** 2)
-            for a, b in places
-        ]
-    )
+    best = ScoreTest(words, 0.0, int(bool(places)), 1.0)
+    for shift in places[:: math.ceil(len(places) / _SHIFTS) or 1]:
+        copy = (shift_frames(light, shift) * root).reshape(1, -1)
+        best = max(
+            best, fit.score_test(words, copy, positive=True), key=lambda test: test.chi2
+        )
+    chance = min(1.0, min(len(places), _SHIFTS) * best.chance / 2)
+    return dataclasses.replace(best, chance=chance)

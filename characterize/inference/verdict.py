@@ -2,24 +2,17 @@
 and two verdicts in words.
 """
 
-import functools
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from characterize.captures import SensorNoise
-from characterize.inference.leastsquares import (
-    FitSolution,
-    GaussianPrior,
-    SolverSettings,
-)
+from characterize.inference.leastsquares import FitSolution, GaussianPrior
 from characterize.inference.multistart import WAVES_RAD, SearchTask
 from characterize.inference.uncertainty import FitPosterior
 from characterize.inference.unmodelled_effects import ResidualFinding
 from characterize.model import FitParameter, KnownValue, background_planes
-from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import wavelength_scale
 from metalens.lens import Lens
@@ -41,24 +34,6 @@ def is_chi_square_consistent(solution: FitSolution, gain: SensorNoise) -> bool:
         gain: noise of the sensor.
     """
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
-
-
-def quantization_text(gain: SensorNoise, *, whole: bool) -> list[str]:
-    """How counts too coarse for their noise were fitted, in words; empty for others.
-
-    Args:
-        gain: noise of the sensor.
-        whole: the frames are counts and no means of them: fitted as rounded.
-    """
-    if gain.coarse:
-        said = (
-            f"counts are {gain.gain_e:.3g} electrons apart and noise in the dark is {gain.read_noise_e:.2g}: rounding "
-            "is no noise there, but one error wherever light is alike, and "
-        )
-        exact = "they are fitted as rounded counts; more bits, or a higher gain of the camera, tell more"
-        rough = "of merged exposures intervals within the model are too narrow; save more bits, or raise the camera's gain"
-        return [said + (exact if whole else rough)]
-    return []
 
 
 def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
@@ -110,6 +85,11 @@ def fit_problems(
         gain: noise of the sensor.
     """
     words = []
+    if gain.coarse:
+        words.append(
+            f"counts are {gain.gain_e:.3g} electrons apart and noise in the dark is {gain.read_noise_e:.2g}: rounding "
+            "is no noise there, but one error wherever light is alike; save more bits, or raise the camera's gain"
+        )
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
     peak = float((solution.image - np.median(solution.image)).max())
@@ -206,25 +186,20 @@ def spectrum_text(lens: Lens, known: Mapping[str, KnownValue]) -> list[str]:
 
 
 def correlated_residuals_text(
-    residual_sigma: Array, shared: Array | None = None
+    residual_sigma: Array, flat_sigma: Array | float = 0.0
 ) -> list[ResidualFinding]:
     """Correlations between residuals that chi-square does not show.
 
     For noise, the mean product of neighbours scatters about 0 by one over the root of
-    their number. Errors of dark and flat are the same in every frame: their part of the
-    products is expected.
+    their number.
 
     Args:
         residual_sigma: (n, y, x) residuals over their noise; 0 where a pixel is masked
             or saturated.
-        shared: (2, n, y, x) standard deviations of such errors over the noise, by dark
-            and by flat, see
-            :meth:`characterize.inference.leastsquares.FitImages.shared`.
+        flat_sigma: (n, y, x) standard deviation of the error by the flat, over the
+            noise.
     """
-    r = np.clip(residual_sigma, -6, 6)
-    shared = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
-    total = np.sqrt(1 + shared[1] ** 2)
-    r = r / total
+    r = np.clip(residual_sigma, -6, 6) / np.sqrt(1 + np.square(flat_sigma))
     found = []
     sides = np.array(
         [_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])]
@@ -237,14 +212,6 @@ def correlated_residuals_text(
             "see the residual map"
         )
         found.append(ResidualFinding(words, float(sides.max())))
-    if len(r) > 1:
-        frames = _from_frame_to_frame(r, shared / total)
-        if frames > _STRUCTURE:
-            words = (
-                f"residuals go together from frame to frame ({frames:.1f} sigma): the "
-                "same is missed in each"
-            )
-            found.append(ResidualFinding(words, frames))
     levels = np.abs(r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1)))
     at = int(np.argmax(levels))
     if levels[at] > _STRUCTURE + 0.5:
@@ -254,26 +221,6 @@ def correlated_residuals_text(
         )
         found.append(ResidualFinding(words, float(levels[at])))
     return found
-
-
-def _from_frame_to_frame(r: Array, shared: Array) -> float:
-    """Correlation of residuals in neighbouring frames, in standard deviations.
-
-    T = rᵀ A r, A = 1/2 next to the diagonal, less its expectation tr AK and over the
-    root of its variance 2 tr AKAK, with K the covariance of the frames in each pixel.
-
-    Args:
-        r: (n, y, x) residuals.
-        shared: (2, n, y, x) errors of dark and of flat over the noise, which all frames
-            share.
-    """
-    n = len(r)
-    k = np.einsum("ciyx,cjyx->yxij", shared, shared)
-    np.einsum("yxii->yxi", k)[:] = np.moveaxis(r != 0, 0, -1)
-    ak = (np.eye(n, k=1) + np.eye(n, k=-1)) / 2 @ k
-    expected = float(np.einsum("yxii->", ak))
-    variance = 2 * float(np.einsum("yxij,yxji->", ak, ak))
-    return (float((r[1:] * r[:-1]).sum()) - expected) / math.sqrt(max(variance, 1.0))
 
 
 def _together(first: Array, second: Array) -> Array:
@@ -314,14 +261,13 @@ def process_verdict(
     return "; ".join(words)
 
 
-def psf_verdict(task: SearchTask, posterior: FitPosterior, held_out: float) -> str:
+def psf_verdict(task: SearchTask, posterior: FitPosterior) -> str:
     """Sentence on the expected relative L2 error of the images at the captured depths
     and angles, √(tr(C JJᵀ) / |I|²), without background and at the brightness of the best.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         posterior: the posterior, with its covariance C.
-        held_out: reduced chi-square of frames left out; nan without such.
     """
     best = posterior.best
     background = background_planes(task.all_of(best.value), task.model.setting)
@@ -331,57 +277,5 @@ def psf_verdict(task: SearchTask, posterior: FitPosterior, held_out: float) -> s
     slopes = best.slopes[lens].reshape(len(lens), -1)
     slopes = slopes - np.outer(slopes @ light / power, light)
     square = posterior.covariance[np.ix_(lens, lens)] * (slopes @ slopes.T)
-    tested = ""
-    if not math.isnan(held_out):
-        tested = f"; frames left out agree within {held_out:.2f} times their noise"
     error = math.sqrt(max(float(square.sum()), 0.0) / power)
-    return f"the PSF is known to {error:.1%} at the captured depths and angles{tested}"
-
-
-def hold_out_chi_square(task: SearchTask, mode: FitSolution) -> float:
-    """Reduced chi-square of frames left out of a fit (cross-validation).
-
-    About 1 where model and intervals hold; nan with fewer than four frames.
-
-    Args:
-        task: model, frames and priors.
-        mode: the fit of all frames.
-    """
-    n = len(task.data.electrons)
-    if n < 4:
-        return float("nan")
-    order = np.argsort(task.model.setting.depth_um, kind="stable")
-    # every second depth is fitted and the others are predicted, then the reverse
-    halves = [
-        (np.sort(fitted), np.sort(hidden))
-        for fitted, hidden in itertools.permutations((order[::2], order[1::2]))
-    ]
-    predict = functools.partial(_held_out, task, mode)
-    total, count = np.sum(threads.run_each(predict, halves), 0)
-    return float(total / max(count, 1))
-
-
-def _held_out(
-    task: SearchTask, mode: FitSolution, halves: tuple[Array, Array]
-) -> tuple[float, int]:
-    """(chi-square, pixels) of frames that are predicted from a fit to the others.
-
-    Residuals are over noise and uncertainty of the prediction, at most 6 sigma.
-
-    Args:
-        halves: indices of the fitted and of the predicted frames.
-    """
-    fitted, hidden = (task.posed(index) for index in halves)
-    settings = SolverSettings(
-        iterations=6, step_tolerance=0.3, near=math.inf, finish=False
-    )
-    part = fitted.fit(mode.value, settings, mode.slopes[:, halves[0]])
-    data = hidden.data
-    image = hidden.model(part.value, False)[0]
-    keep = data.usable & ~data.saturated
-    slopes = mode.slopes[:, halves[1]][:, keep]
-    # variance of the prediction, e²
-    by_fit = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)
-    variance = data.variance(image)[keep] + by_fit
-    square = (data.electrons - image)[keep] ** 2 / variance
-    return float(np.minimum(square, 36.0).sum()), int(keep.sum())
+    return f"the PSF is known to {error:.1%} at the captured depths and angles"

@@ -21,6 +21,8 @@ from metalens.lens import Lens
 from metalens.optics import media
 
 _MOST_NODES = 600
+# tolerance of the nodes of a window: nearer ones to its ends amplify rounding
+_EVEN_ENOUGH = 1e-4
 _TRIAL = 96  # nodes at which the remainder of the kernel is sampled, most it needs
 _CELL = 0.005  # relative width of the cells of distance, each with its coupling terms
 _STEP = 1e-3  # relative step of the distance for derivatives of the terms
@@ -55,7 +57,7 @@ class EvenNodes:
         return cls(count, *span, 1 / math.cosh(reach))
 
     @classmethod
-    def resolving(
+    def of_phase(
         cls, phase_rad: float, span: tuple[float, float], tolerance: float
     ) -> "EvenNodes":
         """The fewest nodes for waves of ``phase_rad`` over half the span.
@@ -65,10 +67,12 @@ class EvenNodes:
         """
         terms = phase_rad + 8 + 2 * (phase_rad + 1) ** (1 / 3)
         terms += 1.5 * max(0.0, math.log(5e-4 / tolerance))
-        for count in itertools.count(12):
-            nodes = cls.of(count, span, tolerance)
-            if count * nodes.density >= terms:
-                return nodes
+        enough = (
+            cls.of(count, span, tolerance)
+            for count in itertools.count(12)
+            if count * cls.of(count, span, tolerance).density >= terms
+        )
+        return next(enough)
 
     @property
     def density(self) -> float:
@@ -229,27 +233,18 @@ class WindowOperators:
 
     def envelope(self, coarse: Array) -> Array:
         """(..., y, x) field on the window's samples from that on the coarse ones."""
-        flat = coarse.reshape(-1, *coarse.shape[-2:])
         fine_y, fine_x = self.terms.fine
-        out = np.empty((len(flat), len(fine_y), len(fine_x)), coarse.dtype)
-
-        def fill(first: int, last: int) -> None:
-            for i in range(first, last):
-                rows = real_complex_product(fine_x, flat[i].T).T
-                out[i] = real_complex_product(fine_y, rows)
-
-        with threads.one_blas_thread():
-            threads.run_split(len(flat), fill)
-        return out.reshape(*coarse.shape[:-2], *out.shape[-2:])
+        rows = real_complex_product(fine_y, coarse)
+        return real_complex_product(fine_x, rows.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 def real_complex_product(weights: Array, values: Array) -> Array:
-    """(m, k) product of real (m, n) and complex (n, k) numbers: half the work of one of
-    complex numbers.
+    """(..., m, k) product of real (m, n) and complex (..., n, k) numbers: half the work
+    of one of complex numbers.
 
     Args:
         weights: (m, n) real.
-        values: (n, k) complex.
+        values: (..., n, k) complex.
     """
     return np.asarray(
         (weights @ np.ascontiguousarray(values).view(weights.dtype)).view(values.dtype)
@@ -270,7 +265,7 @@ def wrapped_phasors(phase: Array) -> Array:
 
 
 def relative_tails(size: Array) -> Array:
-    """(r,) norm of the singular values from each on, over that of all."""
+    """(r,) norm of the singular values ``size`` from each on, over that of all."""
     return np.asarray(np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum()))
 
 
@@ -323,10 +318,6 @@ class CompressedLens:
     def _set_fields(self, gathered: Array) -> None:
         """Set the (r, q, p) fields on the nodes, and the coordinates and phase there."""
         self.gathered = gathered.astype(np.complex64)
-        self._parts = [
-            np.ascontiguousarray(part).reshape(len(gathered), -1)
-            for part in (self.gathered.real, self.gathered.imag)
-        ]
         self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
         self.known = self.k * self.path(self.x_um, self.y_um)
 
@@ -358,7 +349,7 @@ class CompressedLens:
         # phase over half the span of directions: of the window's edge, then in all
         swing = self.k * self.window_um / 2 * max(np.ptp(span) for span in spans) / 2
         self._p, self._q = (
-            EvenNodes.resolving(swing + beyond_rad, span, self.tolerance)
+            EvenNodes.of_phase(swing + beyond_rad, span, self.tolerance)
             for span in spans
         )
         if self._p.count > _MOST_NODES:
@@ -381,14 +372,9 @@ class CompressedLens:
             weight: (b, q, p) real functions.
             series: (b, r) complex.
         """
-        flat, (real, imaginary) = weight.reshape(len(weight), -1), self._parts
-        c, s = (
-            part.T.astype(weight.dtype) @ flat for part in (series.real, series.imag)
-        )
-        out = np.empty(flat.shape[1:], np.complex64)
-        out.real = np.einsum("rn,rn->n", c, real) - np.einsum("rn,rn->n", s, imaginary)
-        out.imag = np.einsum("rn,rn->n", c, imaginary) + np.einsum("rn,rn->n", s, real)
-        return out.reshape(weight.shape[1:])
+        amount = np.tensordot(series.T, weight, 1)
+        light = np.einsum("rqp,rqp->qp", amount, self.gathered)
+        return np.asarray(light.astype(np.complex64))
 
     @property
     def center_um(self) -> tuple[float, float]:
@@ -553,8 +539,10 @@ class CompressedLens:
         # a wave from the rim of the lens turns by k R / d along the window at most
         slopes = self.k * self.half_um / self.films.reduced_um(kernel.distance_um)
         nodes = [
-            EvenNodes.resolving(
-                slope * (last - first) / 2, (first, last), self.tolerance
+            EvenNodes.of_phase(
+                slope * (last - first) / 2,
+                (first, last),
+                max(self.tolerance, _EVEN_ENOUGH),
             )
             for slope, (_, first, last) in zip(slopes, (rows, columns), strict=True)
         ]
@@ -578,14 +566,14 @@ class CompressedLens:
         # the slope, times the largest relative offset in the cell
         slope = (tabulate(1 + _STEP) - tabulate(1 - _STEP)) * (_CELL / 4 / _STEP)
         table = np.concatenate([tabulate(1.0), slope])
-        u, size, rows = np.linalg.svd(table, full_matrices=False)
+        u, size, v = np.linalg.svd(table, full_matrices=False)
         left = relative_tails(size)
         # the symmetry of a square window makes pairs of equal size: none is split
         r = int((size > 0.999 * size[left > self.tolerance][-1]).sum())
-        columns, rows, left = u[:, :r] * size[:r], rows[:r], left[:r]
-        # functions of p in the rows: one more singular value decomposition
+        terms, v, left = u[:, :r] * size[:r], v[:r], left[:r]
+        # functions of p in these: one more singular value decomposition
         mixing, size, across = np.linalg.svd(
-            (rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
+            (v.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
         )
         mixed = relative_tails(size)
         count = int((mixed > _MIXED * self.tolerance).sum())
@@ -599,7 +587,7 @@ class CompressedLens:
         window = np.einsum(
             "Yi,cijr,Xj->cYrX",
             along_y,
-            columns.reshape(2, w_y, w_x, -1),
+            terms.reshape(2, w_y, w_x, -1),
             along_x,
             optimize=True,
         )

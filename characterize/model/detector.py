@@ -5,7 +5,6 @@ pixel area, gain, background.
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import fft, special
@@ -16,24 +15,6 @@ from metalens.lens import Lens
 _ROOM_UM = 20.0  # for decentre
 # pixels: least disc of derivatives, as a point has no slope by its size
 _LEAST_DISC = 0.3
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SeparableBlur:
-    """A blur that acts along each axis by itself, or a sum of such: pairs of (rows, y)
-    and (columns, x) weights.
-    """
-
-    pairs: tuple[tuple[Array, Array], ...]
-
-    def times(self, factor: float) -> "SeparableBlur":
-        """All weights times a factor, in their precision."""
-        return SeparableBlur(
-            tuple((y * y.dtype.type(factor), x) for y, x in self.pairs)
-        )
-
-
-Blur = Array | SeparableBlur
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,15 +79,13 @@ class DetectorGrid:
         fx = fft.rfftfreq(columns, self.fine_um)
         return fy[:, None], fx[None]
 
-    def sample(self, intensity: Array, transfer: Blur) -> Array:
+    def sample(self, intensity: Array, transfer: Array) -> Array:
         """(..., rows, columns) blurred intensity at the pixel centres.
 
         Args:
             intensity: (..., y, x) on the fine grid.
-            transfer: blur, separable or as a transfer function.
+            transfer: of the blur, (..., fy, fx).
         """
-        if isinstance(transfer, SeparableBlur):
-            return np.asarray(sum(y @ (intensity @ x.T) for y, x in transfer.pairs))
         shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
         blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
@@ -115,81 +94,43 @@ class DetectorGrid:
         )
         return np.asarray(blurred[..., y, x])
 
-    def sums(
-        self, sigma_um: float, kind: Any = float
-    ) -> tuple[SeparableBlur, SeparableBlur]:
-        """Separable pixel and Gaussian blur, and its derivative by ``sigma_um``.
-
-        Two small products of matrices in place of two transforms, equal to rounding.
-        """
-        (y, by_y), (x, by_x) = (
-            self._along(count, sigma_um, kind) for count in (self.rows, self.columns)
-        )
-        return SeparableBlur(((y, x),)), SeparableBlur(((by_y, x), (y, by_x)))
-
-    def _along(self, pixels: int, sigma_um: float, kind: Any) -> tuple[Array, Array]:
-        """(pixels, fine samples) weights of pixel and Gaussian blur along one axis, and
-        their derivative by the standard deviation, 1/um.
-
-        Inverse Fourier transform of sinc(f w) exp(-2 pi² f² sigma²).
-        """
-        o, m = self.oversample, self.margin
-        count = (pixels + 2 * m) * o
-        f = fft.fftfreq(count, self.fine_um)
-        # half a fine sample where none lies at a pixel's centre
-        shift = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
-        centres = np.arange(m * o + o // 2, (m + pixels) * o, o)
-        lag = (centres[:, None] - np.arange(count)) % count
-        value, slope = (
-            fft.ifft(np.sinc(f * self.wide_um) * shift * part).real
-            for part in gaussian_transfer(f, np.zeros(1), sigma_um)
-        )
-        return value[lag].astype(kind), slope[lag].astype(kind)
-
 
 def detector_transfers(
-    grid: DetectorGrid,
-    crosstalk_px: float,
-    sizes_um: Array,
-    shrink: Array,
-    *,
-    sized: bool,
-    kind: Any = float,
-) -> tuple[Blur, dict[str, Blur]]:
-    """Transfer functions of pixel, crosstalk and round source, and derivatives by name.
+    grid: DetectorGrid, crosstalk_px: float, sizes_um: Array, shrink: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Transfer functions (frames, fy, fx) of pixel, crosstalk and round source, and
+    their derivatives by name.
 
-    For a point source the blur is separable, as weights along each axis; else it is
-    (frames, fy, fx). ``pinhole_um``: by the source's diameter. ``growth``: by a
-    relative change of the magnification, over the source's diameter.
+    ``pinhole_um``: by the source's diameter. ``growth``: by a relative change of the
+    magnification, over the source's diameter. A point source has the first alone, and
+    one transfer for all frames.
 
     Args:
         grid: fine samples under the pixels.
         crosstalk_px: standard deviation of blur, pixel widths.
         sizes_um: (frames,) diameter of the source's image.
-        shrink: (frames,) magnification of the source.
-        sized: the derivative by the source's diameter is needed.
-        kind: number type of the separable weights.
+        shrink: (frames,) magnification of the source; empty where its size does not
+            matter.
     """
     wide_um = grid.wide_um
-    if not sizes_um.any() and not sized:
-        blur, by_blur = grid.sums(crosstalk_px * wide_um, kind)
-        return blur, {"crosstalk_px": by_blur.times(wide_um)}
     fy, fx = grid.frequencies()
     smooth, by_sigma = gaussian_transfer(fy, fx, crosstalk_px * wide_um)
     square = pixel_transfer(fy, fx, wide_um)
-    shared = square * smooth
+    shared, by_crosstalk = square * smooth, square * by_sigma * wide_um
+    if not len(shrink):
+        return shared, {"crosstalk_px": by_crosstalk}
     discs = [disc_transfer(fy, fx, size) for size in sizes_um]
     disc = np.stack([value for value, _ in discs])
     by_size = np.stack([slope for _, slope in discs])
     # by the source's diameter: of a disc of least size, so that 0 has a slope too
     least = np.maximum(sizes_um, _LEAST_DISC * wide_um)
     by_source = np.stack([disc_transfer(fy, fx, size)[1] for size in least])
-    slopes: dict[str, Blur] = {
-        "crosstalk_px": square * by_sigma * wide_um * disc,
-        "pinhole_um": shared * (by_source * shrink[:, None, None]),
-        "growth": shared * by_size * shrink[:, None, None],
+    ratio = shrink[:, None, None]
+    return shared * disc, {
+        "crosstalk_px": by_crosstalk * disc,
+        "pinhole_um": shared * by_source * ratio,
+        "growth": shared * by_size * ratio,
     }
-    return shared * disc, slopes
 
 
 @functools.lru_cache(maxsize=4)

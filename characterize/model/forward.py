@@ -195,14 +195,6 @@ class ForwardModel:
             part.groups = [part._group(angle_rad) for angle_rad in angles_rad]
         return part
 
-    def exchanged(self) -> "ForwardModel":
-        """The same model with rows and columns exchanged: a camera turned by 90 deg."""
-        part = copy.copy(self)
-        s = self.setting
-        part.setting = dataclasses.replace(s, rows=s.columns, columns=s.rows)
-        part.grid = dataclasses.replace(self.grid, rows=s.columns, columns=s.rows)
-        return part
-
     def rough(self, tolerance: float = 2e-2) -> "ForwardModel":
         """The same model with fields to a relative ``tolerance``, fast enough for scans."""
         part = copy.copy(self)
@@ -594,26 +586,20 @@ class ForwardModel:
         return np.full(len(source_um), self.films.reduced_um(distance_um)), source_um
 
     def _transfer(
-        self,
-        x: Array,
-        group: AngleGroup,
-        names: list[str],
-        grid: detector.DetectorGrid | None = None,
-    ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
+        self, x: Array, group: AngleGroup, names: list[str]
+    ) -> tuple[Array, dict[str, Array]]:
         """Transfer function of pixel, crosstalk and source disc, and its derivatives.
 
         See :func:`detector.detector_transfers`. The disc is the source's diameter times
-        the magnification of its frame. ``grid``: that of the model without it.
+        the magnification of its frame.
         """
         sensor_um, source_um = self._reduced(x, group)
         magnification = sensor_um / source_um
-        crosstalk_px = x[PLACE["crosstalk_px"]]
-        sizes_um = x[PLACE["pinhole_um"]] * magnification
+        if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
+            magnification = np.empty(0)
         return detector.detector_transfers(
-            grid or self.grid,
-            crosstalk_px,
-            sizes_um,
+            self.grid,
+            x[PLACE["crosstalk_px"]],
+            x[PLACE["pinhole_um"]] * magnification,
             magnification,
-            sized="pinhole_um" in names,
-            kind=np.float32,
         )

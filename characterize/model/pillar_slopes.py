@@ -16,7 +16,6 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import solving
 from metalens.cell import Cell, index
-from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
@@ -137,7 +136,7 @@ def _source_digest() -> str:
 
 
 def _about(lens: Lens, extra: Sequence[str]) -> str:
-    """Text of everything that the slopes of a lens depend on: the key of the cache."""
+    """Hash of everything that the slopes of a lens depend on: the key of the cache."""
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     cell = lens.cell
     films = [film.material for film in (*cell.under, *cell.over)]
@@ -149,19 +148,9 @@ def _about(lens: Lens, extra: Sequence[str]) -> str:
     ]
     media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
     indices = [index(medium, lens.wavelength_um) for medium in media]
-    arrays, numbers = store.flatten_record(lens.proxy)
-    proxy = numbers | {name: array.tolist() for name, array in arrays.items()}
-    return repr(
-        (
-            cell,
-            indices,
-            lens.wavelength_um,
-            float(d.min()),
-            float(d.max()),
-            proxy,
-            extra,
-        )
-    )
+    ends = float(d.min()), float(d.max())
+    key = cell, indices, lens.wavelength_um, ends, lens.proxy, tuple(extra)
+    return str(joblib.hash(key))
 
 
 def _solve(lens: Lens, extra: Sequence[str]) -> Sensitivity:

@@ -14,10 +14,10 @@ from characterize.captures import ElectronFrames, to_electrons
 from characterize.captures.capture import Capture
 from characterize.inference import (
     FitImages,
+    FitProblem,
     FitSolution,
     GaussianPrior,
     SolverSettings,
-    leastsquares,
 )
 from characterize.pupil.model import RELATIVE_PRIOR, PupilModel, PupilSpec
 from characterize.pupil.score import (
@@ -154,7 +154,7 @@ def fit_pupil(
     )
 
 
-def save(
+def save_pupil(
     path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None
 ) -> None:
     """Write a pupil file (HDF5, kind ``pupil``).
@@ -493,13 +493,8 @@ def maximize_likelihood(
     lower_of["optics"][:] = -0.3
     upper_of["optics"][:] = 0.3
     settings = SolverSettings(iterations=iterations, step_tolerance=step, near=2.0)
-    return leastsquares.fit_levenberg_marquardt(
-        model.images,
-        data,
-        start,
-        prior=GaussianPrior(mean, sigma, lower, upper),
-        settings=settings,
-    )
+    prior = GaussianPrior(mean, sigma, lower, upper)
+    return FitProblem(model.images, data, prior).fit(start, settings)
 
 
 def describe_limits(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from characterize.captures import to_electrons
-from characterize.inference import leastsquares
 from characterize.inference.leastsquares import SolverSettings
 from characterize.inference.multistart import SearchTask
 from characterize.inference.prepare import data_of
@@ -92,13 +91,7 @@ def test_the_fit_knows_how_much_its_frames_tell():
         model, data_of(frames, (slice(None), slice(None))), start, {}, None
     )
     truth = start[[PLACE[name] for name in task.names]]
-    found = leastsquares.fit_levenberg_marquardt(
-        task.posed().model,
-        task.data,
-        truth,
-        prior=task.prior,
-        settings=SolverSettings(iterations=0),
-    )
+    found = task.posed().fit(truth, SolverSettings(iterations=0))
     want = seen_by_differences(
         session, light.max() / bench.irradiance(lens, session).max()
     )

@@ -119,11 +119,9 @@ def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
         sizes = np.full(2, size)
         every = whole.sample(
             np.roll(light, (2, 2), (1, 2)),
-            detector_transfers(whole, blur, sizes, np.ones(2), sized=False)[0],
+            detector_transfers(whole, blur, sizes, np.ones(2))[0],
         )
-        some = part.sample(
-            light, detector_transfers(part, blur, sizes, np.ones(2), sized=False)[0]
-        )
+        some = part.sample(light, detector_transfers(part, blur, sizes, np.ones(2))[0])
         assert _nearest(some, every) < 1e-9
 
 

@@ -11,7 +11,6 @@ from characterize.inference.leastsquares import (
     FitProblem,
     GaussianPrior,
     SolverSettings,
-    fit_levenberg_marquardt,
     invert_information,
 )
 
@@ -45,8 +44,9 @@ def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
     def model(x, slopes):
         return x[0] * shape, shape[None] if slopes else None
 
-    found = fit_levenberg_marquardt(
-        model, data, np.array([150.0]), settings=SolverSettings(huber=huber)
+    start = np.array([150.0])
+    found = FitProblem(model, data, GaussianPrior.none(start)).fit(
+        start, SolverSettings(huber=huber)
     )
     left = (data.electrons - found.value[0] * shape) / sigma
     left = np.where(saturated, np.maximum(left, 0), left)[usable]
@@ -118,12 +118,8 @@ def test_a_straight_model_has_the_covariance_of_normal_equations():
     def model(x, slopes):
         return np.tensordot(x, shapes, 1), shapes if slopes else None
 
-    found = fit_levenberg_marquardt(
-        model,
-        data,
-        np.array([20.0, 20.0]),
-        prior=prior,
-        settings=SolverSettings(step_tolerance=1e-6),
+    found = FitProblem(model, data, prior).fit(
+        np.array([20.0, 20.0]), SolverSettings(step_tolerance=1e-6)
     )
     columns = (shapes / sigma * usable).reshape(2, -1)
     told, information = np.diag([0.0, 0.21**-2]), columns @ columns.T
@@ -164,13 +160,11 @@ def test_what_bounds_hold_back_is_told_in_sigma():
     )
     wide = np.full(2, np.inf)
     bounds = GaussianPrior(np.zeros(2), wide, -wide, np.array([4.0, np.inf]))
-    found = fit_levenberg_marquardt(
+    found = FitProblem(
         lambda x, slopes: (np.tensordot(x, shapes, 1), shapes if slopes else None),
         data,
-        np.zeros(2),
-        prior=bounds,
-        settings=SolverSettings(step_tolerance=1e-9),
-    )
+        bounds,
+    ).fit(np.zeros(2), SolverSettings(step_tolerance=1e-9))
     flat = shapes.reshape(2, -1)
     covariance = 1.3 * np.linalg.inv(flat @ flat.T)
     held = 2.5 + (flat[0] @ flat[1]) / (flat[1] @ flat[1]) * 3.0
@@ -196,11 +190,12 @@ def test_pixels_beyond_the_outlier_limit_on_either_side_are_no_part_of_chi_squar
         np.full(image.shape, 1e15),
     )
     ones = np.ones((1, *image.shape))
-    found = fit_levenberg_marquardt(
+    start = np.array([6.0])
+    found = FitProblem(
         lambda x, slopes: (x[0] * ones[0], ones if slopes else None),
         data,
-        np.array([6.0]),
-    )
+        GaussianPrior.none(start),
+    ).fit(start)
     left = (image - found.value[0]) / 1.3
     inside = np.abs(left) < 6
     assert inside.sum() == 38
