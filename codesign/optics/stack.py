@@ -290,9 +290,9 @@ def lens_psf_stack(
     if len(rows) < count:
         waves = waves[rows]
     pupil_wave = waves * _node_factor(settings, coefficients_rad, error)
-    light = sampled_light(
-        pupil_wave, settings.pupil, settings.sample_um, settings.window_samples
-    )
+    grid = settings.pupil, settings.sample_um, settings.window_samples
+    # one by one, so that a depth's bits do not depend on who computes the others
+    light = torch.stack([sampled_light(wave, *grid) for wave in pupil_wave])
     if shared:
         light = parallel.gather_rows(light, rows, count)
     if error is not None:
