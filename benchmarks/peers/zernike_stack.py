@@ -152,19 +152,14 @@ def _fit(
     model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: SolverSettings
 ) -> FitSolution:
     everywhere = np.ones(images.shape, bool)
-    data = FitImages(
-        images,
-        everywhere,
-        ~everywhere,
-        np.full(images.shape, 1.0),
-        np.ones(images.shape),
-    )
+    ones = np.ones(images.shape)
+    data = FitImages(images, everywhere, ~everywhere, ones, ones)
     prior = GaussianPrior.none(begin)
     for name in ("blur", "gradient"):
-        low, high, held = (
+        low, high, fixed = (
             model.unpack(v)[name] for v in (prior.low, prior.high, begin)
         )
-        low[:] = high[:] = held
+        low[:] = high[:] = fixed
     return FitProblem(model.images, data, prior).fit(begin, settings)
 
 

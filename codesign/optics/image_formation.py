@@ -246,6 +246,7 @@ def optics_of(
     Args:
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        error: of assembly and process; None for a perfect lens.
     """
     plain = replace(settings, polynomials=0, parameters="polynomials")
     moving = settings if coefficients_rad.numel() else plain

@@ -381,7 +381,7 @@ def state_to_json(search: EvolutionState) -> str:
 
 
 def candidate_to_json(candidate: EvaluatedCandidate) -> dict[str, Any]:
-    """Sizes of the architecture, error and cost, as the state's JSON has them."""
+    """Architecture sizes, error and cost of a ``candidate`` for the state's JSON."""
     sizes = dataclasses.asdict(candidate.architecture)
     return {**sizes, "error": candidate.error, "macs": candidate.macs}
 

@@ -10,6 +10,7 @@ import tyro
 from metalens import lens
 from metalens.commands.common import CommonOptions, Output
 from metalens.core import transaction
+from metalens.core.errors import LensError
 from metalens.lens import export
 
 
@@ -38,6 +39,11 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     export.check_export_format(options.output)
+    is_array = options.output.suffix.lower() in export.ARRAYS
+    if options.samples != Options.samples and is_array:
+        raise LensError(
+            "--samples counts the points of a .dat; arrays hold every pillar"
+        )
     with options.claim(options.output) as draft:
         device = lens.load(options.lens)
         grid = options.output.suffix.lower() == export.GRID

@@ -1,5 +1,5 @@
-"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, and its
-proxy.
+"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy,
+and a figure.
 """
 
 import dataclasses
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
     library.check_sweep(settings.cell, settings.sweep)
     target = options.output
     inputs = _inputs(options.config, settings.cell)
-    with options.claim(target) as draft, options.shared():
+    with options.claim(target, companions=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
         swept = library.sweep(
@@ -120,7 +120,7 @@ def _import_table(options: Options, cell_file: Path) -> int:
     inputs = _inputs(cell_file, settings.cell) | {
         options.config.name: store.sha256(options.config)
     }
-    with options.claim(options.output) as draft:
+    with options.claim(options.output, companions=(".png",)) as draft:
         return _finish(options, draft.path, imported, settings, inputs, 0.0)
 
 
@@ -132,7 +132,7 @@ def _finish(
     inputs: dict[str, str],
     seconds: float,
 ) -> int:
-    """Fit the proxy, write the library and judge it; the exit status.
+    """Fit the proxy, write the library, draw and judge it; the exit status.
 
     Args:
         options: of the command line.
@@ -158,6 +158,7 @@ def _finish(
         provenance=provenance,
     )
     library.save(path, pillars)
+    library.plots.library_figure(path.with_suffix(".png"), pillars)
     failures = _failures(
         pillars,
         fitted,

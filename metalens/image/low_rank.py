@@ -293,7 +293,11 @@ def low_rank_psfs(
 
 
 def depth_table(depths_um: Tensor) -> Tensor:
-    """(:data:`CODES`, depths) matrix of linear interpolation to equal steps of 1/z."""
+    """(:data:`CODES`, depths) matrix of linear interpolation to equal steps of 1/z.
+
+    Args:
+        depths_um: (depths,) of the nodes, ascending.
+    """
     vergence = -1 / depths_um.double().cpu().numpy()
     at = np.linspace(vergence[0], vergence[-1], CODES)
     columns = [np.interp(at, vergence, row) for row in np.eye(len(vergence))]

@@ -199,6 +199,9 @@ def spread_places(count: int) -> list[tuple[float, float]]:
     of the golden section.
 
     Near the rims a blur is widest and most light is aliased.
+
+    Args:
+        count: of the places.
     """
     golden = (math.sqrt(5) - 1) / 2
     return [

@@ -47,8 +47,8 @@ class Frames:
 
 
 def to_device(record: Record, device: torch.device | str) -> Record:
-    """A dataclass with its tensors, and the records that have a method ``to``, on a
-    device; other fields stay.
+    """A dataclass ``record`` with its tensors, and the fields that have a method
+    ``to``, on a ``device``; other fields stay.
     """
     values = {name: getattr(record, name) for name in record.__dataclass_fields__}
     moved = {k: v.to(device) for k, v in values.items() if hasattr(v, "to")}

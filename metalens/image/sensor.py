@@ -56,7 +56,7 @@ def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
     energy-preserving factor.
 
     Args:
-        pitch_um: lattice constant, um.
+        pitch_um: of the pixel. base_pitch_um: of the base pixel.
     """
     return (pitch_um / base_pitch_um) ** 2
 

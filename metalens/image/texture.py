@@ -45,7 +45,7 @@ def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
     """(…) relative L2 error of the image of a texture through PSFs (…, h, w).
 
     Args:
-        psf: (..., h, w) PSFs.
+        psf: (..., h, w) PSFs. reference: their true values.
     """
     psf, reference = psf.double(), reference.double()
     spectra = (scene_spectrum(some) for some in (psf - reference, reference))

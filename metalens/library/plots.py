@@ -1,4 +1,4 @@
-"""Files of the cell study: numbers and figure."""
+"""Figures of pillar libraries and of the cell study, and its numbers."""
 
 import json
 from dataclasses import asdict
@@ -8,6 +8,7 @@ import numpy as np
 
 from metalens.core import report, store
 from metalens.core.store import write_bytes
+from metalens.library.record import PillarLibrary
 from metalens.library.study import CellStudy, CellVerdict
 
 NM = 1e3
@@ -60,4 +61,32 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
         )
         panel.grid(visible=False)
     figure.colorbar(image, ax=panels, label="smooth phase (turns)")
+    write_bytes(path, report.figure_png(figure))
+
+
+def library_figure(path: Path, library: PillarLibrary) -> None:
+    """PNG of phase, and of |t| with its error bars, over the diameter; the domain of
+    the proxy is shaded.
+
+    Args:
+        path: of the PNG.
+        library: the swept cell.
+    """
+    figure, (phase, level) = report.make_figure(2, 1, size=(7.5, 5), sharex=True)
+    size_nm = NM * library.diameter_um
+    for i, j, k in np.ndindex(*library.t.shape[:3]):
+        t = library.t[i, j, k]
+        label = f"{NM * library.wavelength_um[k]:g} nm"
+        if len(library.angle_rad) > 1:
+            angle_deg = np.degrees(library.angle_rad[j])
+            label += f", {angle_deg:.3g}° {library.polarization[i]}"
+        turns = np.unwrap(np.angle(t)) / (2 * np.pi)
+        phase.plot(size_nm, turns - turns[0], label=label)
+        level.errorbar(size_nm, np.abs(t), library.t_error[i, j, k])
+    phase.legend(fontsize=6, ncols=3)
+    phase.set(ylabel="phase (turns)", title=library.cell.described)
+    level.set(xlabel="diameter (nm)", ylabel="|t|", ylim=(0, 1.05))
+    if library.proxy is not None:
+        for panel in (phase, level):
+            panel.axvspan(*np.multiply(NM, library.proxy.domain_um), color="0.92")
     write_bytes(path, report.figure_png(figure))

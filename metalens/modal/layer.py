@@ -141,8 +141,8 @@ class LayerPencil:
 
 
 def is_lossless(case: ModalCase) -> bool:
-    """Whether the layer has positive real permittivities, as the definite blocks
-    need.
+    """Whether the layer of a ``case`` has positive real permittivities, as the definite
+    blocks need.
     """
     return all(e.imag == 0 and e.real > 0 for e in (case.disc, case.around))
 

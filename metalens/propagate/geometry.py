@@ -195,6 +195,7 @@ def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> 
 
     Args:
         phase_rad, transmission: (y, x) numpy arrays of float.
+        case: whose shape they must have.
 
     Raises:
         PropagationError: naming row and column.

@@ -728,7 +728,7 @@ PER_RAD = 1 / (2 * np.pi)
 
 @numba.njit(inline="always")
 def whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
-    """Phase (rad) in turns, reduced to [-1/2, 1/2], in the precision of ``like``.
+    """``phase`` (rad) in turns, reduced to [-1/2, 1/2], in the precision of ``like``.
 
     2π is split in two parts; the first has few bits, so that its multiples are exact.
     """

@@ -157,7 +157,7 @@ def _together(*terms: float) -> float:
 
 
 def worst_of_budgets(budgets: list[Budget]) -> Budget:
-    """The largest of every term."""
+    """The largest of every term of ``budgets``."""
     names = [f.name for f in fields(Budget)]
     return Budget(**{n: _largest([getattr(b, n) for b in budgets]) for n in names})
 

@@ -93,7 +93,7 @@ def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
     own full scale.
 
     Args:
-        stack: PSFs over angle, depth and wavelength.
+        stack: PSFs over angle, depth and wavelength. most: depths that are drawn.
     """
     light = _by_angle(stack)
     picks = np.unique(
@@ -128,7 +128,7 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
     energy, of three depths at the first and last angle.
 
     Args:
-        stack: PSFs over angle, depth and wavelength.
+        stack: PSFs over angle, depth and wavelength. limit: drawn beside them.
     """
     depths = np.unique([0, len(stack.depths_um) // 2, len(stack.depths_um) - 1])
     cut = 0.5 / stack.step_um
@@ -193,7 +193,7 @@ def _encircled(stack: PsfStack, light: Array, radius_um: Array) -> Array:
 
 
 def plot_focus_scan(scan: "FocusScan") -> bytes:
-    """Irradiance along x against the shift of the plane, and its peak and FWHM."""
+    """Irradiance of a ``scan`` along x against the shift of the plane, peak and FWHM."""
     figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     axes[0].pcolormesh(
         scan.shift_um,

@@ -144,7 +144,7 @@ def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
 
 
 def count_orders(harmonics: int) -> int:
-    """Number of orders of a square lattice within a circle of this radius."""
+    """Number of orders of a square lattice within a circle of radius ``harmonics``."""
     m = np.arange(-harmonics, harmonics + 1)
     return int(np.count_nonzero(np.hypot(m[:, None], m) <= harmonics))
 

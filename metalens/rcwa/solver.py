@@ -141,7 +141,7 @@ def cell_problem(
 
 
 def half_space_indices(cell: Cell, light: TangentialWave) -> tuple[complex, complex]:
-    """Refractive indices of substrate and cover.
+    """Refractive indices of substrate and cover of a ``cell``.
 
     Raises:
         CellError: no zero order of the ``light`` in the substrate. MaterialError: a
