@@ -1,5 +1,5 @@
 """What training asks of the lens itself: Eqs. 4 to 6, how separably the sensor shows
-gaze and slippage.
+gaze and slippage, or the depth that blurred texture tells.
 """
 
 import math
@@ -12,8 +12,16 @@ from torch import Tensor
 
 from codesign.batches import EyeScenes
 from codesign.eye import moved_states, render
+from codesign.optics import OpticsConfig, PixelPsfStack
 from metalens.core.errors import ConfigError
-from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
+from metalens.image import (
+    Frames,
+    OpticsLoss,
+    Sensor,
+    encircled_energy,
+    optics_loss,
+    texture_information,
+)
 from metalens.image import sensor as camera
 
 Motions = Literal["axial", "all"]
@@ -145,3 +153,53 @@ def fisher_separability(
         compactness=config.compactness,
     )
     return FisherSeparability(fisher, loss)
+
+
+def depth_information(stack: PixelPsfStack) -> Tensor:
+    """(depths - 1,) Fisher information on depth between neighbouring depths, per mm².
+
+    From the blur of a window of 1/f texture as wide as the PSFs, with noise of a
+    thousandth of the texture's mean power. One over its square root is the Cramér-Rao
+    bound of a reader that knows only the statistics of the texture
+    (:func:`metalens.fisher.texture_information`).
+
+    Args:
+        stack: PSFs over depth.
+    """
+    psfs = stack.intensity
+    spectrum = _texture(psfs.shape[-1]).to(psfs)
+    gaps = (stack.depths_um[1:] - stack.depths_um[:-1]).tolist()
+    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
+    information = [
+        texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
+        for pair, gap in zip(pairs, gaps, strict=True)
+    ]
+    return torch.stack(information)
+
+
+def texture_depth_loss(
+    stack: PixelPsfStack, settings: OpticsConfig, *, energy: float
+) -> Tensor:
+    """Mean of -log(information on depth + 0.05), plus a hinge on the encircled energy.
+
+    Replaces Eq. 6 of the paper: the network reads the blur of texture, and the
+    information of the PSF alone ranks lenses wrongly.
+
+    Args:
+        stack: PSFs over depth. settings: of the lens and its image.
+        energy: least encircled energy within two samples.
+    """
+    information = depth_information(stack)
+    share = encircled_energy(
+        stack.intensity, settings.sample_um, radius_um=2 * settings.sample_um
+    )
+    depth_loss = -torch.log(information + 0.05).mean()
+    return depth_loss + 50 * torch.relu(energy - share).mean()
+
+
+def _texture(size: int) -> Tensor:
+    """Power of a 1/f texture on the grid of rfft2, of mean 1."""
+    fy, fx = torch.fft.fftfreq(size), torch.fft.rfftfreq(size)
+    power = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
+    scaled: Tensor = power / power.mean()
+    return scaled

@@ -43,6 +43,7 @@ from codesign.train.imaging import StepImaging, frame_wide, read_out, seeded_gen
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
+    texture_depth_loss,
     triplet_frames,
 )
 from metalens.core.errors import ConfigError, TrainingError
@@ -188,10 +189,12 @@ class InnerConfig:
         than the run's budgets allow, nor so coarse that least resolution leaves a
         network less than 16 pixels.
     slip_weight, optics_weight, budget_weight: of Eq. 10. separability: Eq. 6, the
-    optics loss. depth_weight: of the depths of windows.
+    optics loss; while it is off, a bound on the depth in blurred texture stands for it.
+    depth_weight: of the depths of windows.
     axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read
     from; 0 where slippage alone
         counts: they cost a tenth of what is read along the axis.
+    energy: encircled share that the loss by texture keeps.
     budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their
     resolution to keep it
         (:func:`sandwich`); the hinge acts on those that cannot.
@@ -221,6 +224,7 @@ class InnerConfig:
     point_weight: float = 0.2
     optics_weight: float = 0.05
     budget_weight: float = 1.0
+    energy: float = field(default=0.4, metadata={"most": 1.0})
     budget_mmacs: float = 0.0
     slip_scale_mm: tuple[float, float, float] = (1.4, 1.2, 2.3)
     refresh: int = 50
@@ -616,20 +620,24 @@ class Trainer:
         """Imager of this step's frames, and the optics loss.
 
         The loss is n times Eq. 6 at every n-th step, n = ``separability.every``, so that
-        its weight is ``optics_weight`` on average; 0 where the lens is fixed.
+        its weight is ``optics_weight`` on average. With n = 0 it is that of blurred
+        texture at every step; 0 where the lens is fixed.
         """
         coefficients = self.model.coefficients_rad
         imager = self.light.at(
             step, coefficients, frame_samples(frames), self.scenes.margin, live=live
         )
         config = self.inner.separability
-        moves = live and not self.light.stacks
-        weighs = moves and self.inner.optics_weight and config.every
-        if not weighs or self.triplets is None or step % config.every:
+        weighs = live and not self.light.stacks and self.inner.optics_weight
+        is_due = not config.every or (self.triplets and step % config.every == 0)
+        if not weighs or not is_due:
             return imager, torch.zeros(())
         stack = lens.lens_psf_stack(
             self.optics, coefficients, error=self._lens_error(step)
         )
+        if not config.every or self.triplets is None:
+            energy = self.inner.energy
+            return imager, texture_depth_loss(stack, self.optics, energy=energy)
         separability = fisher_separability(
             triplet_frames(self.triplets, config, step),
             lambda scenes: sensor_irradiance(scenes, imager),

@@ -264,6 +264,7 @@ def _design_stages(files: ChainFiles) -> Iterator[ChainStage]:
         "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
         ("library", "cell.toml", "-o", "library.h5"),
         ("max_error", "largest error bar of |t|"),
+        (("library.png", "Phase and transmission of the pillars with error bars."),),
     )
     yield ChainStage(
         "Lens",

@@ -243,6 +243,7 @@ def _slopes(
             wavelength_um,
             harmonics=harmonics,
             normals_of=None if tilted else middle,  # normals move with a tilted wall
+            tolerance=1e-3,  # of a wall: 1e-4, which changes rates by some 1e-3
         ).t
         for end in (less, more)
     )

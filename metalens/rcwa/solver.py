@@ -393,6 +393,7 @@ def solve_truncation(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
     normals_of: tuple[Cell, float] | None = None,
+    tolerance: float = 1e-5,
 ) -> JonesResponse:
     """Jones matrices at one truncation, without an error estimate.
 
@@ -402,13 +403,14 @@ def solve_truncation(
         normals_of: upright cell and size with as many sections, whose normal field is
             taken. Between pillars that differ little it cancels the noise of the sampling; the
             limit of many harmonics is the same.
+        tolerance: of t; a tenth of it is left to the staircase of a tilted wall.
     """
     problem = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
     if normals_of:
         other = dataclasses.replace(problem, cell=normals_of[0], size_um=normals_of[1])
         normals = tuple(section.outlines for section, _ in stack_sections(other, 1))
         problem = dataclasses.replace(problem, normals=normals)
-    truncation = solve_problem(problem, harmonics)
+    truncation = solve_problem(problem, harmonics, tolerance)
     return _response(problem, harmonics, truncation, math.inf, False, "one truncation")
 
 

@@ -222,6 +222,23 @@ def test_only_bad_gradients_end_the_run_with_the_cause():
         list(trainer.run())
 
 
+def test_the_optics_loss_falls_along_its_own_gradient():
+    from codesign.optics import stack as lens
+    from codesign.train import separability
+
+    coefficients = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    start = separability.texture_depth_loss(
+        lens.lens_psf_stack(OPTICS, coefficients), OPTICS, energy=0.4
+    )
+    (slope,) = torch.autograd.grad(start, coefficients)
+    assert float(slope.norm()) > 0
+    step = (0.05 / float(slope.norm())) * slope
+    after = separability.texture_depth_loss(
+        lens.lens_psf_stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4
+    )
+    assert float(after) < float(start.detach())
+
+
 def test_impossible_schedules_are_refused():
     with pytest.raises(ConfigError, match="0 <= start < end"):
         LearningRateSchedule(0.1, 0.8, 0.2)

@@ -42,7 +42,7 @@ def files(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_library_with_proxy(cell, tmp_path, capsys):
+def test_library_with_proxy_and_figure(cell, tmp_path, capsys):
     assert cell(QUICK, "--json") == 0
     values = json.loads(capsys.readouterr().out)
     assert values["turns"] >= 1
@@ -50,7 +50,7 @@ def test_library_with_proxy(cell, tmp_path, capsys):
     assert (
         values["max_phase_error_rad"] <= values["entry_error"]
     )  # the polynomials add less than their entries err by
-    assert files(tmp_path) == ["cell.toml", "library.h5"]
+    assert files(tmp_path) == ["cell.toml", "library.h5", "library.png"]
     made = library.load(tmp_path / "library.h5")
     assert made.proxy is not None
     assert made.provenance.inputs.keys() == {"cell.toml"}
