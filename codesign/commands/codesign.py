@@ -86,6 +86,11 @@ def _train_and_search(
     """
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
+    if settings.run.pitch_um < settings.optics.sample_um:
+        console.say(
+            f"run.pitch_um = {settings.run.pitch_um:g} is finer than the samples of the image, optics.sample_um = "
+            f"{settings.optics.sample_um:g}: such pixels cost more and show nothing new"
+        )
     place_on_device(going.trainer, device)
     parallel.wait_for_all()
     event_writer = _event_writer(folder, going.trainer.step) if options.events else None

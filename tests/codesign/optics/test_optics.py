@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
+from codesign.optics.lens_errors import DrawnLensErrors, LensErrors, pillar_proxy
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.image.pupil import coordinates, psf
@@ -221,7 +221,14 @@ def test_a_bias_of_the_diameters_sends_light_straight_on():
     hazy = optics.lens_psf_stack(
         SMALL, torch.zeros(12), error=DrawnLensErrors({"bias_nm": 20.0})
     ).intensity
-    lost = 1 - math.exp(-7.797e-4 * 400)  # rad²/nm², of the default cell: below
+    # pillars with phases evenly over a turn: rad of each for a nanometre of diameter
+    wave_um = SMALL.wavelength_nm * 1e-3
+    proxy = pillar_proxy(SMALL.cell, wave_um)
+    diameter = np.linspace(*proxy.domain_um, 20_001)
+    phase = proxy.phase_rad(diameter, wave_um)
+    even = phase[0] + np.linspace(0, 2 * math.pi, 400, endpoint=False)
+    slope = np.interp(even, phase, np.gradient(phase, diameter * 1e3))
+    lost = 1 - math.exp(-np.var(slope, ddof=1) * 20.0**2)
     window = (SMALL.window_samples * SMALL.sample_um) ** 2 / (math.pi * 100.0**2)
     want = (1 - lost) * plain.sum((1, 2)) + lost * window
     torch.testing.assert_close(hazy.sum((1, 2)), want, rtol=1e-4, atol=0)
