@@ -278,7 +278,7 @@ def draw_posterior(
     whitened = np.concatenate(drawn)
     x = whitened * unit
     log_parts = np.stack([part.logpdf(whitened) for part in mixture], 1)
-    log_q = special.logsumexp(np.log(share) + log_parts, axis=1)
+    log_q = special.logsumexp(log_parts, axis=1, b=share)
     inside = ((x >= problem.prior.low) & (x <= problem.prior.high)).all(1)
     x, log_q = x[inside], log_q[inside]
     # weights posterior / q, truncated

@@ -113,7 +113,8 @@ def pixel_brightness(
         films: media before and behind the lens.
     """
     depth = films.apparent_um(true_depth(x, setting, centre_um))
-    gain = np.exp(x[PLACE["log_gain"]]) * (setting.fill * setting.pixel_um) ** 2
+    # bounded, so that a trial step far off does not overflow
+    gain = np.exp(min(x[PLACE["log_gain"]], 100.0)) * (setting.fill * setting.pixel_um) ** 2
     return np.asarray(
         gain * setting.exposure * (films.apparent_um(reference_um) / depth) ** 2
     )
