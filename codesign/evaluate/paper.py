@@ -226,7 +226,10 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumbe
     Args:
         rows: rows of result.json by role of the run.
     """
-    ours, reference = (rows.get(role, []) for role in ROLES[:2])
+    ours, reference = (
+        [row for row in rows.get(role, []) if "axial_slip_mm" in row]
+        for role in ROLES[:2]
+    )
     pairs = [
         (row, other)
         for row in ours
