@@ -319,7 +319,7 @@ def _joined(
     for i, profile in profiles.items():
         low[i], high[i] = profile.low, profile.high
     for mode in modes[1:]:
-        root = REACH**2 * spread - (mode.merit - best.merit)
+        root = REACH**2 * spread - mode.merit + best.merit
         if root > 0:
             other = np.sqrt(root * np.diag(mode.covariance))
             low = np.minimum(low, mode.value - other)

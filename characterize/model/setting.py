@@ -114,10 +114,9 @@ def pixel_brightness(
     """
     depth = films.apparent_um(true_depth(x, setting, centre_um))
     # bounded, so that a trial step far off does not overflow
-    gain = np.exp(min(x[PLACE["log_gain"]], 100.0)) * (setting.fill * setting.pixel_um) ** 2
-    return np.asarray(
-        gain * setting.exposure * (films.apparent_um(reference_um) / depth) ** 2
-    )
+    gain = np.exp(min(x[PLACE["log_gain"]], 100.0))
+    width = setting.fill * setting.pixel_um * films.apparent_um(reference_um) / depth
+    return np.asarray(gain * setting.exposure * width**2)
 
 
 def brightness_slopes(

@@ -281,11 +281,12 @@ def of_gaze(rows: Sequence[Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
     Args:
         rows: rows of its result.json.
     """
-    if not rows:
+    known = [row for row in rows if "gaze_deg" in row]
+    if not known:
         return {}
     chosen = {
-        "efficient": min(rows, key=lambda row: float(row["mmacs"])),
-        "accurate": min(rows, key=lambda row: float(row["gaze_deg"])),
+        "efficient": min(known, key=lambda row: float(row["mmacs"])),
+        "accurate": min(known, key=lambda row: float(row["gaze_deg"])),
     }
     return {
         f"table2/proposed_{name}": MeasuredNumber(

@@ -168,13 +168,15 @@ def depth_information(stack: PixelPsfStack) -> Tensor:
     """
     psfs = stack.intensity
     spectrum = _texture(psfs.shape[-1]).to(psfs)
-    gaps = (stack.depths_um[1:] - stack.depths_um[:-1]).tolist()
     pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
-    information = [
-        texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
-        for pair, gap in zip(pairs, gaps, strict=True)
-    ]
-    return torch.stack(information)
+    return torch.stack(
+        [
+            texture_information(
+                pair, step_um=float(gap), spectrum=spectrum, noise=1e-3
+            )[0]
+            for pair, gap in zip(pairs, stack.depths_um.diff(), strict=True)
+        ]
+    )
 
 
 def texture_depth_loss(
@@ -193,13 +195,11 @@ def texture_depth_loss(
     share = encircled_energy(
         stack.intensity, settings.sample_um, radius_um=2 * settings.sample_um
     )
-    depth_loss = -torch.log(information + 0.05).mean()
-    return depth_loss + 50 * torch.relu(energy - share).mean()
+    return 50 * torch.relu(energy - share).mean() - torch.log(information + 0.05).mean()
 
 
 def _texture(size: int) -> Tensor:
     """Power of a 1/f texture on the grid of rfft2, of mean 1."""
     fy, fx = torch.fft.fftfreq(size), torch.fft.rfftfreq(size)
     power = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
-    scaled: Tensor = power / power.mean()
-    return scaled
+    return torch.as_tensor(power / power.mean())

@@ -636,8 +636,9 @@ class Trainer:
             self.optics, coefficients, error=self._lens_error(step)
         )
         if not config.every or self.triplets is None:
-            energy = self.inner.energy
-            return imager, texture_depth_loss(stack, self.optics, energy=energy)
+            return imager, texture_depth_loss(
+                stack, self.optics, energy=self.inner.energy
+            )
         separability = fisher_separability(
             triplet_frames(self.triplets, config, step),
             lambda scenes: sensor_irradiance(scenes, imager),

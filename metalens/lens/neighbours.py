@@ -176,24 +176,3 @@ class NeighbourRows:
             if self.diagonal[k] or np.count_nonzero(~self.diagonal) > 1
         ]
         return [self.without(k) for k in removable]
-
-    def doubted(self, sine: Array) -> list["NeighbourRows"]:
-        """Variants of the rows that span their uncertainty.
-
-        They are: the coarser truncation; without the row whose removal changes the mean
-        most at these sines; and the change reduced by a fifth, for zones that shorten
-        towards the rim.
-
-        Args:
-            sine: (m,) by which zones turn light.
-        """
-        present = self.mean(sine)
-        changes = [
-            float(np.abs(other.mean(sine) - present).max()) for other in self.others
-        ]
-        reduced = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))
-        return [
-            self.coarser,
-            *(self.others[k] for k in np.argsort(changes)[-1:]),
-            reduced,
-        ]
