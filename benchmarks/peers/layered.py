@@ -1,16 +1,62 @@
-"""Other ways to one image: layer by layer, and by the formula as published."""
+"""The image of two sheets layer by layer: the plain way to what the imager does."""
+
+from dataclasses import dataclass
 
 import scipy.fft
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from metalens.image import scene
+from metalens.image import Frames
 from metalens.image.forming import occlude
 from metalens.image.low_rank import transfer_functions
 
 
-def image_layers(layers: scene.Layers, psfs: Tensor) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Frames cut into depth layers.
+
+    radiance, coverage: (frames, layers, y, x); radiance multiplied by the coverage.
+    depth_um: (layers,).
+    near: (layers,) True where the layer belongs to the near sheet.
+    """
+
+    radiance: Tensor
+    coverage: Tensor
+    depth_um: Tensor
+    near: Tensor
+
+
+def cut_layers(frames: Frames, depths_um: Tensor) -> Layers:
+    """Layers of frames at fixed depths, those of the near sheet first.
+
+    A source between two depths is split between both, linearly in 1/z.
+
+    Args:
+        frames: sheets with their depths.
+        depths_um: (layers,) ascending, um.
+    """
+    vergence = 1 / depths_um.to(frames.depth_um)
+    position = 1 / frames.depth_um.clamp(float(depths_um[0]), float(depths_um[-1]))
+    count = len(vergence)
+    radiance, coverage = [], []
+    for sheet in (0, 1):
+        for k, node in enumerate(vergence):
+            offset = position[:, sheet] - node
+            below = (vergence[max(k - 1, 0)] - node).clamp_min(1e-12)
+            above = (node - vergence[min(k + 1, count - 1)]).clamp_min(1e-12)
+            share = 1 - torch.where(offset > 0, offset / below, -offset / above)
+            radiance.append(share.clamp(0, 1) * frames.radiance[:, sheet])
+            coverage.append(share.clamp(0, 1) * frames.coverage[:, sheet])
+    return Layers(
+        torch.stack(radiance, 1),
+        torch.stack(coverage, 1),
+        depths_um.repeat(2),
+        torch.arange(2 * count) < count,
+    )
+
+
+def image_layers(layers: Layers, psfs: Tensor) -> Tensor:
     """The image layer by layer, with the PSF of each layer (layers, h, w): slow, no
     approximation of the PSFs.
     """
@@ -31,23 +77,3 @@ def _blurred(content: Tensor, psfs: Tensor) -> Tensor:
     whole = torch.fft.irfft2(torch.fft.rfft2(wide, s=(y, x)) * transfer, s=(y, x))
     rows, columns = (slice(reach, reach + n) for n in content.shape[-2:])
     return whole[..., rows, columns]
-
-
-def published(layers: scene.Layers, psfs: Tensor, *, epsilon: float = 1e-3) -> Tensor:
-    """The occlusion formula as published (Ikoma et al., ICCP 2021), for comparison;
-    layers sorted near to far.
-
-    Every layer hides those behind it; blurred layers are divided by the blurred
-    coverage of all layers at or behind
-    them plus ``epsilon``. Where a near layer is blurred more than the far one reaches,
-    no layer has weight and light
-    is lost: up to 26 % at edges.
-    """
-    behind = _blurred(layers.coverage.flip(1).cumsum(1).flip(1), psfs) + epsilon
-    light = _blurred(layers.radiance, psfs)
-    cover = _blurred(layers.coverage, psfs)
-    light, cover = light / behind, cover / behind
-    passed = torch.cumprod(1 - cover, 1)
-    passed = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], 1)
-    total: Tensor = (passed * light).sum(1)
-    return total

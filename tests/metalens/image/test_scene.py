@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.peers import layered
 from metalens.core.errors import SceneError
-from metalens.image import Grid, scene, uniform_imager
-from metalens.image.scene import Frames, Layers
+from metalens.image import Grid, uniform_imager
+from metalens.image.scene import Frames
 
 N = 96
 DEPTHS = 1 / torch.linspace(1 / 28e3, 1 / 15e3, 21, dtype=torch.float64).flip(0)
@@ -52,7 +52,7 @@ def test_constant_radiance_stays_constant_at_every_edge():
     flat = _eye(radiance=0.37)
     fast = _imager()(flat)
     assert (fast - 0.37).abs().max() < 1e-12
-    layers = scene.cut_layers(flat, DEPTHS)
+    layers = layered.cut_layers(flat, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
     assert (slow - 0.37).abs().max() < 1e-12
 
@@ -90,7 +90,7 @@ def test_a_sharp_near_edge_hides_a_blurred_far_sheet():
     cover = torch.cat([near, 1 - near], 1)
     light = torch.cat([0.2 * near, 0.8 * (1 - near)], 1)
     seen = layered.image_layers(
-        Layers(light, cover, DEPTHS[:2], torch.tensor([True, False])),
+        layered.Layers(light, cover, DEPTHS[:2], torch.tensor([True, False])),
         _stack(torch.tensor([1e-3, 5.0])),
     )
     assert (seen[..., : N // 2] - 0.2).abs().max() < 1e-9
@@ -131,19 +131,11 @@ def test_few_kernels_meet_the_tolerance(tolerance):
     frames = _eye()
     made = _imager(tolerance=tolerance)
     fast = made(frames)
-    layers = scene.cut_layers(frames, DEPTHS)
+    layers = layered.cut_layers(frames, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
     assert made.error <= tolerance
     error = float((fast - slow).norm() / slow.norm())
     assert error < tolerance + 4e-5  # the look-up table's 4096 depths
-
-
-def test_only_occupied_layers_are_cut():
-    layers = scene.cut_layers(_eye(), DEPTHS)
-    assert len(layers.depth_um) < 2 * len(DEPTHS)
-    assert torch.allclose(
-        layers.coverage.sum(1), torch.ones(2, N, N, dtype=torch.float64)
-    )
 
 
 def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
