@@ -131,7 +131,7 @@ class FrameSpectra:
         sides = 2 * frames.shape[1], 2 * frames.shape[2]
         return cls(fft.rfft2(frames, sides), _norm(frames, noise), sides)
 
-    def alike(self, expected: "FrameSpectra", index: Array) -> float:
+    def mean_correlation(self, expected: "FrameSpectra", index: Array) -> float:
         """Mean normalised cross-correlation with expected frames, each at its best
         shift.
 

@@ -226,7 +226,9 @@ def _scores(
         turned: spectra of the frames in every orientation.
     """
     goal = FrameSpectra.of(expected, np.zeros(len(expected)))
-    return np.array([[one.alike(goal, index) for one in turned] for index in orders])
+    return np.array(
+        [[one.mean_correlation(goal, index) for one in turned] for index in orders]
+    )
 
 
 def _way(stated: Array, reverse: Array) -> tuple[int, bool]:
@@ -269,9 +271,9 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     chi2 = {k: _chi_square_of_turn(k, expected, light, noise) for k in _EVERY}
 
     def arranged(way: tuple[bool, int]) -> FrameArrangement:
-        found = orient_frames(light[orders[int(way[0])]], way[1])
+        oriented = orient_frames(light[orders[int(way[0])]], way[1])
         noises = noise[orders[int(way[0])]].tolist()
-        pairs = zip(found, expected, noises, strict=True)
+        pairs = zip(oriented, expected, noises, strict=True)
         shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
         y, x_px = np.median(shifts, axis=0).tolist()
         return FrameArrangement(

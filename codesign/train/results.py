@@ -26,14 +26,14 @@ class BudgetResult:
     """Result of one compute budget.
 
     row: of the result. trainer: with the final model, lens, pitch and weights of its
-    own where that is configured. seen, answers: test frames, and predictions for them.
+    own where that is configured. frames, predictions: of the test scenes.
     interval_mm: (n,) half width of the 90 % intervals of the axial slippage.
     """
 
     row: dict[str, Any]
     trainer: Trainer
-    seen: SensorFrames
-    answers: FramePredictions
+    frames: SensorFrames
+    predictions: FramePredictions
     interval_mm: Tensor
 
 
@@ -133,23 +133,23 @@ def _evaluate_budget(
         trainer, architecture, people, frames.people
     )
 
-    def predict(seen: SensorFrames) -> FramePredictions:
-        return assess.predict_frames(net, architecture, seen, inner)
+    def predict(images: SensorFrames) -> FramePredictions:
+        return assess.predict_frames(net, architecture, images, inner)
 
     quantile = conformal_quantiles(predict(frames.apart), frames.apart)
-    answers = predict(frames.test)
-    half_width = quantile * answers.slip_sd_mm[:, 2]
-    row |= _errors("", answers, frames.test)
-    row |= uncertainty_summary(answers, frames.test, half_width)
+    predictions = predict(frames.test)
+    half_width = quantile * predictions.slip_sd_mm[:, 2]
+    row |= _errors("", predictions, frames.test)
+    row |= uncertainty_summary(predictions, frames.test, half_width)
     if frames.fine is not None:
         row |= _errors("finer_", predict(frames.fine), frames.fine)
         row["finer_ratio"] = row["finer_axial_slip_mm"] / row["axial_slip_mm"]
     shifted_mm = predict(frames.shifted).slip_mm[:, 2]
     row["depth_response_mm_per_mm"], row["depth_response_error"] = (
-        assess.depth_response(answers.slip_mm[: len(shifted_mm), 2], shifted_mm)
+        assess.depth_response(predictions.slip_mm[: len(shifted_mm), 2], shifted_mm)
     )
     row["architecture"] = evolution.candidate_to_json(best)
-    return BudgetResult(row, trainer, frames.test, answers, half_width)
+    return BudgetResult(row, trainer, frames.test, predictions, half_width)
 
 
 def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
@@ -185,7 +185,7 @@ def _errors(
 
 
 def conformal_quantiles(
-    answers: FramePredictions, frames: SensorFrames, *, share: float = 0.9
+    predictions: FramePredictions, frames: SensorFrames, *, share: float = 0.9
 ) -> float:
     """Split-conformal quantile of |axial error| / predicted standard deviation.
 
@@ -193,26 +193,30 @@ def conformal_quantiles(
     slippages, for any distribution of the errors.
 
     Args:
-        answers: predictions for ``frames``. share: coverage of the interval.
+        predictions: predictions for ``frames``. share: coverage of the interval.
         frames: of the sensor with labels, that training, search and test never use.
     """
-    ratio = (answers.slip_mm - frames.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
+    ratio = (predictions.slip_mm - frames.slip_mm)[:, 2].abs() / predictions.slip_sd_mm[
+        :, 2
+    ]
     rank = min(math.ceil(share * (len(ratio) + 1)), len(ratio))
     return float(ratio.sort().values[rank - 1])
 
 
 def uncertainty_summary(
-    answers: FramePredictions, frames: SensorFrames, half_width_mm: Tensor
+    predictions: FramePredictions, frames: SensorFrames, half_width_mm: Tensor
 ) -> dict[str, float]:
     """Coverage and mean half width in mm of the 90 % intervals, and window depth error
     in mm.
 
     Args:
-        answers: of the network. frames: frames of the sensor with their labels.
+        predictions: of the network. frames: frames of the sensor with their labels.
         half_width_mm: (n,) of the intervals of the axial slippage.
     """
-    axial_error = (answers.slip_mm - frames.slip_mm)[:, 2].abs()
-    window_error = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(frames.vergence)
+    axial_error = (predictions.slip_mm - frames.slip_mm)[:, 2].abs()
+    window_error = blur.depth_mm(predictions.depth[:, 0]) - blur.depth_mm(
+        frames.vergence
+    )
     return {
         "axial_coverage_90": float((axial_error <= half_width_mm).float().mean()),
         "axial_interval_mm": float(half_width_mm.mean()),
@@ -231,17 +235,17 @@ def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Arr
         true; told_pupil (networks, n, y, x) probability, told_slip_um (networks, n, 3);
         interval_um (networks, n) half width of the 90 % interval of the distance.
     """
-    frames = ends[0].seen
+    frames = ends[0].frames
     pixels = int(frames.frames.shape[-1])
     pairs = [
-        losses.at_pixels(end.answers.mask[:count], frames.mask[:count], pixels)
+        losses.at_pixels(end.predictions.mask[:count], frames.mask[:count], pixels)
         for end in ends
     ]
     arrays = {
         "frames": frames.frames[:count, 0],
         "slip_um": 1e3 * frames.slip_mm[:count],
         "told_slip_um": torch.stack(
-            [1e3 * end.answers.slip_mm[:count] for end in ends]
+            [1e3 * end.predictions.slip_mm[:count] for end in ends]
         ),
         "interval_um": torch.stack([1e3 * end.interval_mm[:count] for end in ends]),
         "pupil": pairs[0][1],

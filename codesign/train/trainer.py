@@ -600,13 +600,12 @@ class Trainer:
             )
             if pose is not None:
                 # behind closed lids the pose is not known: no error, no gradient
-                found = prediction.axis.detach(), prediction.points.detach()
-                axis = torch.where(is_open, pose.axis, found[0])
+                axis = torch.where(is_open, pose.axis, prediction.axis.detach())
                 points = pose.points / frame_width
                 loss = loss + losses.pose_loss(
                     prediction,
                     axis,
-                    torch.where(is_open[:, None], points, found[1]),
+                    torch.where(is_open[:, None], points, prediction.points.detach()),
                     axis_weight=self.inner.axis_weight,
                     point_weight=self.inner.point_weight,
                 )
