@@ -137,7 +137,7 @@ def plan_next_mask(
     ]
 
     def bias_table_nm(x: Array) -> Array:
-        return propose_correction(design, x, response=response, old=old).bias_nm
+        return _bias_table(design, x, response, old)[-1]
 
     table_open = reason_left_open(result, bias_table_nm)
     map_open = reason_left_open(result, uneven_nm, part=MAP)
@@ -150,28 +150,48 @@ def plan_next_mask(
 
 
 def propose_correction(
-    design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: int = 13
+    design: Lens, x: Array, *, response: Sensitivity, old: Bias
 ) -> MaskCorrection:
     """Bias table and corrected diameter map for fitted process parameters.
 
     Drawn diameter = mask rule at (corrected diameter - bias of the process); the table
-    is designed minus drawn, at ``knots`` evenly spaced designed diameters.
+    is designed minus drawn, at evenly spaced designed diameters.
 
     Args:
         design: as designed. x: all parameters of a lens, in the fit's order.
         response: of the pillars to height, index and side wall.
         old: bias that the present mask was drawn with.
-        knots: of the table.
 
     Raises:
         ConfigError: pillars of two sizes, or the table would be steeper than the layout
             can invert.
     """
+    designed_um, corrected_um, drawn_nm, bias_nm = _bias_table(design, x, response, old)
+    return MaskCorrection(
+        drawn_nm,
+        bias_nm,
+        old.at(drawn_nm),
+        designed_um,
+        corrected_um,
+        _with_even_bias(design, x),
+    )
+
+
+def _bias_table(
+    design: Lens, x: Array, response: Sensitivity, old: Bias
+) -> tuple[Array, Array, Array, Array]:
+    """Designed and corrected diameters in um, drawn diameters and bias in nm.
+
+    Each is (knots,). Arguments as of :func:`propose_correction`.
+
+    Raises:
+        ConfigError: as :func:`propose_correction`.
+    """
     if design.pairs is not None:
         raise ConfigError("pillars of two sizes have no bias table of one size")
     diameter = design.diameters.diameter_um
     least = float(diameter.min(where=diameter > 0, initial=np.inf))
-    designed_um = np.linspace(least, float(diameter.max()), knots)
+    designed_um = np.linspace(least, float(diameter.max()), 13)
     corrected_um = _corrected_diameters_um(design, designed_um, x, response)
     drawn_nm = old.drawn_nm(corrected_um * 1e3 - process_state_of(x)["bias_nm"])
     bias_nm = designed_um * 1e3 - drawn_nm
@@ -181,14 +201,7 @@ def propose_correction(
             f"the table would change by {slope:.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
             "lens is too far from its design for a table; correct height or index in the process instead"
         )
-    return MaskCorrection(
-        drawn_nm,
-        bias_nm,
-        old.at(drawn_nm),
-        designed_um,
-        corrected_um,
-        _with_even_bias(design, x),
-    )
+    return designed_um, corrected_um, drawn_nm, bias_nm
 
 
 def predict_lenses(
@@ -370,20 +383,11 @@ def _with_even_bias(design: Lens, x: Array) -> Lens:
     """The design with the bias's deviation from its mean subtracted from every
     diameter.
     """
-    diameters = design.diameters
     state = process_state_of(x)
-    constant = state["bias_nm"] * 1e-3
-    change = np.empty(diameters.diameter_um.shape, np.float32)
-    for start in range(0, len(change), 256):
-        rows = slice(start, start + 256)
-        u, v = np.meshgrid(
-            diameters.x_um / diameters.radius_um,
-            diameters.y_um[rows] / diameters.radius_um,
-        )
-        change[rows] = state.bias_um(u, v) - constant
-    return _with_diameters(
-        design, diameters.diameter_um - change, diameters.diameter_um > 0
-    )
+    diameter = design.diameters.diameter_um
+    uneven_um = as_built.on_pillars(design.diameters, state.bias_um)
+    uneven_um -= state["bias_nm"] * 1e-3
+    return _with_diameters(design, diameter - uneven_um, diameter > 0)
 
 
 def _drawn_with(design: Lens, plan: MaskCorrection, x_fit: Array) -> Lens:

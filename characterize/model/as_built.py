@@ -58,13 +58,13 @@ def as_built_transmission(
     """
     d = lens.diameters
     state = process_state_of(x)
-    bias = _on_pillars(d, state.bias_um) + noise_um
+    bias = on_pillars(d, state.bias_um) + noise_um
     if lens.pairs is not None:
         t = _of_two_sizes(lens, response, bias, state.response_amounts())
     else:
         t = _of_one_size(lens, response, x, bias, angle_rad)
     if state.has_wavefront_error():
-        t = t * np.exp(1j * _on_pillars(d, state.phase_rad))
+        t = t * np.exp(1j * on_pillars(d, state.phase_rad))
     geometric = np.exp(1j * np.asarray(lens.geometric_rad(slice(None))))
     return np.asarray(np.where(d.diameter_um > 0, t * geometric, 0))
 
@@ -114,16 +114,21 @@ def _of_one_size(
     return np.asarray(t * bias_ratio(response, np.nan_to_num(grown, nan=low), bias_um))
 
 
-def _on_pillars(
+def on_pillars(
     diameters: DiameterMap, low_order: Callable[[Array, Array], Array]
 ) -> Array:
     """(y, x) values at every pillar of a polynomial ``low_order`` in (u, v).
 
     Interpolated from Gauss-Legendre nodes, exact where these are one more than its
     degree along each axis.
+
+    Args:
+        diameters: map whose sites are meant.
+        low_order: polynomial of places over the lens radius, along each axis.
     """
     node = legendre.gauss_legendre_nodes(_NODES)[0]
-    axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
+    radius_um = diameters.radius_um
+    axes = (axis / radius_um for axis in (diameters.x_um, diameters.y_um))
     along_x, along_y = (legendre.interpolation_matrix(len(node), axis) for axis in axes)
     return np.asarray(along_y @ low_order(*np.meshgrid(node, node)) @ along_x.T)
 
@@ -138,7 +143,7 @@ def built_lens(design: Lens, x: Array) -> Lens:
         x: all parameters.
     """
     d = design.diameters
-    bias = _on_pillars(d, process_state_of(x).bias_um)
+    bias = on_pillars(d, process_state_of(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
     built = d.diameter_um > 0

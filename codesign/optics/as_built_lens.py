@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from characterize.inference import AsBuilt
-from characterize.model import PLACE, parameter_vector, process_state_of
+from characterize.model import PLACE, as_built, parameter_vector, process_state_of
 from codesign.optics.stack import OpticsConfig, PixelPsfStack, sampled_light
 from metalens.core.arrays import Array
 from metalens.design import Focus, profiles
@@ -82,8 +82,8 @@ class PillarCells:
 
     cells: (2, y, x) real and imaginary part. half_um, centre_um: (x, y) half width of
     the cell array, and its centre. pillars: returns (y, x) the complex t of each, 0
-    where there is none, pitch_um apart about the axis. added_rad: (x_um, y_um) to a
-    phase of the wave front as a whole; None for none.
+    where there is none, pitch_um apart about the axis, the added phase included.
+    added_rad: (x_um, y_um) to a phase of the wave front as a whole; None for none.
     """
 
     focus: Focus
@@ -116,7 +116,10 @@ class PillarCells:
             angle_rad: angle of the light to the axis.
         """
         t = interpolate_cells(self.cells, (x_um, y_um), self.centre_um, self.half_um)
-        return self._with_added_phase(t, x_um, y_um)
+        if self.added_rad is None:
+            return t
+        added = torch.remainder(self.added_rad(x_um, y_um), 2 * math.pi).float()
+        return t * torch.polar(torch.ones_like(added), added)
 
     def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
         """(y, x) complex t of every pillar, for the error of averaging over cells.
@@ -124,23 +127,7 @@ class PillarCells:
         Args:
             wavelength_um: of the light. angle_rad: angle of the light to the axis.
         """
-        t = self.pillars()
-        y, x = (
-            (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * self.pitch_um
-            for n in t.shape
-        )
-        return self._with_added_phase(t, *torch.meshgrid(x, y, indexing="xy"))
-
-    def _with_added_phase(self, t: Tensor, x_um: Tensor, y_um: Tensor) -> Tensor:
-        """t exp(i added phase) at points of the lens; t itself without an added
-        phase.
-        """
-        if self.added_rad is None:
-            return t
-        added = torch.remainder(self.added_rad(x_um, y_um), 2 * math.pi).to(
-            torch.float32
-        )
-        return t * torch.polar(torch.ones_like(added), added)
+        return self.pillars()
 
 
 class MadeLens:
@@ -252,13 +239,18 @@ class MadeLens:
             place = (x_um / self._rim_um).numpy(), (y_um / self._rim_um).numpy()
             return torch.from_numpy(state.phase_rad(*place))
 
+        def pillars() -> Tensor:
+            t = self.pillars(state, factor=factor)
+            added = as_built.on_pillars(d, state.phase_rad)
+            return t * torch.from_numpy(np.exp(1j * added).astype(np.complex64))
+
         return PillarCells(
             self.focus,
             self._rim_um + d.pitch_um / 2,
             torch.from_numpy(np.stack([filled.real, filled.imag])).float(),
             half_um,
             d.pitch_um,
-            lambda: self.pillars(state, factor=factor),
+            pillars,
             (centre_um[0], centre_um[1]),
             added_rad if state.has_wavefront_error() else None,
         )
