@@ -24,9 +24,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted(
     [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")]
 )
-MADE = re.compile(
-    r"(\.\./)?reference/(\w+)\.md"
-)  # pages that the site makes from the code
+# pages that the site makes from the code
+MADE = re.compile(r"(\.\./)?reference/(\w+)\.md")
 OF_A_CAPTURE = {
     "pixel_um",
     "pixel_sigma_um",

@@ -39,9 +39,8 @@ MODULES = {
     for package in PACKAGES
     for path in (ROOT / package).rglob("*.py")
 }
-TABLES = {
-    "metalens.cli"
-}  # names the verbs of every package: the one place that knows them all
+# names the verbs of every package: the one place that knows them all
+TABLES = {"metalens.cli"}
 
 
 def _folder(module):

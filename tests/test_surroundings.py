@@ -56,9 +56,8 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing_but_its_journal(tmp_p
     """Of a command that has claimed its output and would go on for minutes."""
     (tmp_path / "study.toml").write_text("pitches_um = [0.3]\nheights_um = [0.7]\n")
     words = [sys.executable, "-m", "metalens", "study", "study.toml", "-o", "out"]
-    told = tmp_path.with_name(
-        tmp_path.name + ".told"
-    )  # not a pipe: workers hold its end while they last
+    # not a pipe: workers hold its end while they last
+    told = tmp_path.with_name(tmp_path.name + ".told")
     with open(told, "w") as said:
         child = subprocess.Popen(
             words,
@@ -76,9 +75,8 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing_but_its_journal(tmp_p
     # all is done: 130 to a shell, too
     assert child.returncode in (130, -signal.SIGINT), told
     assert "interrupted; the output is as it was before" in told
-    assert (
-        {"study.toml"} <= set(os.listdir(tmp_path)) <= {"study.toml", "out.resume"}
-    )  # by where it was
+    # by where it was
+    assert {"study.toml"} <= set(os.listdir(tmp_path)) <= {"study.toml", "out.resume"}
 
 
 WORDS = f"{sys.executable} -m metalens info ."

@@ -73,9 +73,8 @@ def lens(strength_rad: float = 0.0) -> Lens:
     )[0]
 
 
-GLASS = Layers(
-    behind=(Film(Index(1.4), 245.0),)
-)  # Σ t / n from the pillars is 70 um less than the distance
+# Σ t / n from the pillars is 70 um less than the distance
+GLASS = Layers(behind=(Film(Index(1.4), 245.0),))
 
 
 def row(radius_um: float = 20.0, **more: object) -> Lens:

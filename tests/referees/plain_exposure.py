@@ -197,9 +197,8 @@ class Resist:
         apart = ((points[:, None] - at) ** 2).sum(-1)
         total = np.zeros(len(points))
         for a, energy in self._far:
-            width = (
-                a**2 + mean_square
-            )  # a disc of diameter D adds D^2 / 8 to the square of the 1/e radius
+            # a disc of diameter D adds D^2 / 8 to the square of the 1/e radius
+            width = a**2 + mean_square
             total += energy / np.pi * (np.exp(-apart / width) @ (mass / width))
         return total
 

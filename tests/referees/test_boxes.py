@@ -125,9 +125,8 @@ def test_jones_matrices_are_those_of_another_fourier_method_within_the_bar(
     moved = max(np.abs(a - b).max() for a, b in zip(before, want, strict=True))
     found = rcwa.jones(cell, size, wavelength, **about)
     error = max(np.abs(found.t - want[0]).max(), np.abs(found.r - want[1]).max())
-    assert (
-        error < min(found.t_error, 0.02) + 4 * moved
-    )  # of errors that fall as reach^-2, a third or more is left
+    # of errors that fall as reach^-2, a third or more is left
+    assert error < min(found.t_error, 0.02) + 4 * moved
     assert found.t_error < 0.12
     if case is hook:
         assert abs(want[0][0, 1]) > 0.05  # what comes as one light leaves as the other

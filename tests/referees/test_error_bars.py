@@ -80,13 +80,11 @@ def test_the_fit_knows_how_much_its_frames_tell():
         parameter_vector(session.values | dict.fromkeys(hidden.PLANE, 0.0))
     )[0]
     frames = to_electrons(seen.capture)
-    counted = (
-        frames.gain.gain_e / session.gain_e
-    )  # electrons of the fit for one of the referee
+    # electrons of the fit for one of the referee
+    counted = frames.gain.gain_e / session.gain_e
     start[PLACE["log_gain"]] = np.log(counted * (light * bare).sum() / (bare**2).sum())
-    assert frames.gain.gain_e == pytest.approx(
-        session.gain_e, rel=0.1
-    )  # four of its sigma
+    # four of its sigma
+    assert frames.gain.gain_e == pytest.approx(session.gain_e, rel=0.1)
     task = SearchTask(
         model, data_of(frames, (slice(None), slice(None))), start, {}, None
     )
@@ -101,6 +99,5 @@ def test_the_fit_knows_how_much_its_frames_tell():
             information * counted, rel=0.05
         ), name
     claimed = np.sqrt(np.diag(found.covariance))
-    assert (
-        claimed >= np.diag(found.information) ** -0.5
-    ).all()  # others are unknown too
+    # others are unknown too
+    assert (claimed >= np.diag(found.information) ** -0.5).all()

@@ -29,9 +29,8 @@ def test_the_table_is_what_the_solver_says_between_its_entries():
     for diameter, height, wave in ((0.1337, 0.691, 0.8512), (0.1891, 0.7073, 0.8483)):
         cell = dataclasses.replace(DEFAULT_CELL, height_um=height)
         want = modal.solve(cell, diameter, wave, tolerance=1e-4).t
-        assert (
-            abs(pillar_table.load().at(diameter, height, wave) - want) < 3e-3
-        )  # quartic over the height, 1e-3 of bars
+        # quartic over the height, 1e-3 of bars
+        assert abs(pillar_table.load().at(diameter, height, wave) - want) < 3e-3
 
 
 @pytest.mark.parametrize("stitch_nm", [0.0, 900.0])
@@ -143,9 +142,8 @@ def test_uneven_light_is_found_fitted_and_the_rest_comes_back(response):
         "light_x, light_y, light_r fitted too" in words for words in found.cautions
     )
     low, high = found.interval("light_x")
-    assert (
-        low < np.log(1.15 / 0.85) < high
-    )  # half the ln of the ratio of the rims' irradiances
+    # half the ln of the ratio of the rims' irradiances
+    assert low < np.log(1.15 / 0.85) < high
     for name in ("decentre_x_um", "bias_x_nm", "astigmatism_rad"):
         low, high = found.interval(name)
         assert low < session.of(name) < high, name

@@ -35,9 +35,8 @@ def test_shapes_lie_on_the_surfaces_that_rays_meet():
     assert brown.min() > 0
     face, triangles, _ = traced_shapes._face(p, bank, CameraRig(), CAMERA)
     depth = renderer.render(STATES[:1], camera=CAMERA).frames.depth_um[0, 0]
-    assert 1e3 * face[:, 2].min() < float(
-        depth.min()
-    )  # the mesh is wider than the frame
+    # the mesh is wider than the frame
+    assert 1e3 * face[:, 2].min() < float(depth.min())
     assert triangles.max() < len(face)
 
 
@@ -48,9 +47,8 @@ def test_skin_and_iris_are_as_bright_as_traced_ones(tmp_path):
     pytest.importorskip("mitsuba")
     made = pathtraced.compare(STATES, camera=CAMERA, samples=256)
     assert made.ratio("skin") == pytest.approx(1, abs=0.1)
-    assert made.ratio("iris") == pytest.approx(
-        1, abs=0.2
-    )  # noise of few paths through the cornea: 3 %
+    # noise of few paths through the cornea: 3 %
+    assert made.ratio("iris") == pytest.approx(1, abs=0.2)
     assert made.error() < 0.3
     dark = made.regions["pupil"]
     assert made.traced[dark].mean() < 0.3 * made.traced[made.regions["iris"]].mean()

@@ -78,12 +78,10 @@ def test_index_and_height_act_together(response):
     found = perturbed_transmission(
         hidden.lens().proxy, response, D, 0.85, amounts(0.012, -0.04)
     )
-    assert (
-        np.abs(found - want)[:4].max() < 6e-3
-    )  # the mixed derivative and the third by the index are left out
-    assert (
-        np.abs(found - want)[4] < 0.05
-    )  # 0.1994 um: next to a resonance, which the index moves
+    # the mixed derivative and the third by the index are left out
+    assert np.abs(found - want)[:4].max() < 6e-3
+    # 0.1994 um: next to a resonance, which the index moves
+    assert np.abs(found - want)[4] < 0.05
     alone = perturbed_transmission(
         hidden.lens().proxy, response, D, 0.85, amounts(0.012)
     )
@@ -98,9 +96,8 @@ def test_rates_are_derivatives_of_the_factor(response):
         up[n] += step
         down[n] -= step
         want = np.log(ready.factor(up) / ready.factor(down)) / (2 * step)
-        assert ready.rates(at)[n] == pytest.approx(
-            want, rel=1e-6, abs=1e-8
-        )  # third derivative times step²
+        # third derivative times step²
+        assert ready.rates(at)[n] == pytest.approx(want, rel=1e-6, abs=1e-8)
 
 
 def test_few_functions_hold_every_change(response):

@@ -58,10 +58,8 @@ def build(
         out["fold"] = _mesh(mitsuba, "fold", *fold)
     for k in range(model.LED_COUNT):
         place = (p[model.LED + 3 * k : model.LED + 3 * k + 3] * 1e-3).tolist()
-        emitter = {
-            "type": "area",
-            "radiance": 400 / LAMP_RADIUS_MM**2,
-        }  # irradiance pi at 20 mm: radiance 1 of white
+        # irradiance pi at 20 mm: radiance 1 of white
+        emitter = {"type": "area", "radiance": 400 / LAMP_RADIUS_MM**2}
         out[f"lamp{k}"] = {
             "type": "sphere",
             "center": place,
@@ -187,9 +185,8 @@ def _iris(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
     y = radius[:, None] * torch.sin(turn)
     albedo = plain_eye.pigment(p, bank, x, y, torch.sqrt(x * x + y * y + 1))
     albedo[:3] = p[model.PUPIL]
-    kept = (
-        1 - 0.94 / p[model.INDEX] ** 2
-    )  # of diffuse light from inside; 6 % of that from outside
+    # of diffuse light from inside; 6 % of that from outside
+    kept = 1 - 0.94 / p[model.INDEX] ** 2
     lost = ((p[model.INDEX] - 1) / (p[model.INDEX] + 1)) ** 2
     albedo = albedo / ((1 - lost) * (1 - kept) + kept * albedo)
     return (

@@ -38,9 +38,8 @@ def test_photon_transfer_finds_gain_and_read_noise():
     found = clean.photon_transfer(flat, dark)
     assert abs(found.gain_e - GAIN) < 4 * found.gain_sigma_e
     assert found.gain_sigma_e < 0.02 * GAIN
-    assert (
-        abs(found.read_noise_e - READ) < 0.1
-    )  # sqrt(2 / 43200) of 5 e, with quantisation
+    # sqrt(2 / 43200) of 5 e, with quantisation
+    assert abs(found.read_noise_e - READ) < 0.1
 
 
 def test_flats_that_are_copies_are_refused():
@@ -132,9 +131,8 @@ def test_brackets_merge_to_the_true_rate_with_the_stated_variance():
         )
     z = np.array(z)
     assert abs(z.mean()) < 0.03  # 1 / sqrt(50000) is 0.005, weights are estimated
-    assert (
-        0.9 < z.std() < 1.05
-    )  # the dark of one frame counts as noisy here, though it is exact
+    # the dark of one frame counts as noisy here, though it is exact
+    assert 0.9 < z.std() < 1.05
 
 
 @pytest.mark.parametrize("levels", [(700.0, 1900.0, 3300.0), (2600.0,)])
@@ -154,24 +152,19 @@ def test_gain_and_its_error_bar_cover_a_gain_of_3_7(levels):
         found = clean.photon_transfer(flat, np.stack([counts(0.0) for _ in range(4)]))
         z.append((found.gain_e - gain) / found.gain_sigma_e)
         reads.append(found.read_noise_e)
-    assert (
-        abs(np.mean(z)) < 0.5
-    )  # 1 / sqrt(60) = 0.13, and 6 sigma of clipping in the variance
+    # 1 / sqrt(60) = 0.13, and 6 sigma of clipping in the variance
+    assert abs(np.mean(z)) < 0.5
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.3  # 60 draws: 9 %
-    assert np.mean(reads) == pytest.approx(
-        read, rel=0.01
-    )  # sqrt(1 / 9600 / 60) = 0.001; the gain's mean 0.003
+    # sqrt(1 / 9600 / 60) = 0.001; the gain's mean 0.003
+    assert np.mean(reads) == pytest.approx(read, rel=0.01)
 
 
 def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
     """Frames of no light, a flat of 0.6 and 1.4 halves, one dark of four: the scatter
     of the electrons is as stated.
     """
-    rng, gain, read = (
-        np.random.default_rng(13),
-        3.7,
-        2.1,
-    )  # rounding: 3.7² / 12 = 1.14 beside 4.41
+    # rounding: 3.7² / 12 = 1.14 beside 4.41
+    rng, gain, read = (np.random.default_rng(13), 3.7, 2.1)
     shade = np.where(np.arange(60) < 30, 0.6, 1.4) * np.ones((60, 1))
 
     def counts(light_e):
@@ -190,9 +183,8 @@ def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
         z.append(found.electrons / np.sqrt(found.variance_e2))
     left, right = np.split(np.array(z), 2, axis=-1)
     for half in (left, right):
-        assert half.std() == pytest.approx(
-            1, abs=0.04
-        )  # 65000 draws over shared darks: 0.01
+        # 65000 draws over shared darks: 0.01
+        assert half.std() == pytest.approx(1, abs=0.04)
 
 
 @pytest.mark.parametrize(

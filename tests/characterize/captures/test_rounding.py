@@ -14,12 +14,10 @@ def test_dark_level_and_noise_are_found_below_a_count(level, noise):
     true = level + 0.08 * rng.standard_normal((31, 27))
     found = DarkStatistics.of(np.rint(true + noise * rng.standard_normal((9, 31, 27))))
     off = found.level - true
-    assert found.noise == pytest.approx(
-        noise, abs=0.025
-    )  # 7500 draws, of which a sixth tell: 0.01
-    assert (
-        abs(off.mean()) < 0.05
-    )  # the mean of the counts is off by 0.1 to 0.27 but at 9.5
+    # 7500 draws, of which a sixth tell: 0.01
+    assert found.noise == pytest.approx(noise, abs=0.025)
+    # the mean of the counts is off by 0.1 to 0.27 but at 9.5
+    assert abs(off.mean()) < 0.05
     assert off.std() < 1.25 * np.sqrt((found.error**2).mean())
 
 

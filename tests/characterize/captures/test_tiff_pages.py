@@ -76,9 +76,8 @@ def test_what_imagej_lays_behind_the_head_of_one_image_is_a_stack(
         FRAMES.shape,
     )
     begins = 8 + 2 + 9 * 12 + 4
-    plain = (
-        (lambda v: v << 16) if order == ">" else int
-    )  # a short lies at the start of its word
+    # a short lies at the start of its word
+    plain = (lambda v: v << 16) if order == ">" else int
     tags = (
         (256, 4, 1, width),
         (257, 4, 1, height),

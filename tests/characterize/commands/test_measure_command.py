@@ -59,16 +59,14 @@ def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
     with open(tmp_path / "out" / "frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     for row, sigma in zip(rows, sigmas, strict=True):
-        wide = math.hypot(
-            sigma, 0.9 / math.sqrt(12) * 0
-        )  # drawn at the pixels' middles
+        # drawn at the pixels' middles
+        wide = math.hypot(sigma, 0.9 / math.sqrt(12) * 0)
         assert float(row["fwhm_um"]) == pytest.approx(2.3548 * wide, rel=0.02)
         assert float(row["mtf50_x_per_um"]) == pytest.approx(0.18739 / wide, rel=0.02)
         assert float(row["centroid_x_um"]) == pytest.approx(0.7, abs=0.1)
         assert float(row["centroid_y_um"]) == pytest.approx(-0.4, abs=0.1)
-        assert float(row["efficiency"]) != float(
-            row["efficiency"]
-        )  # no reference: not known
+        # no reference: not known
+        assert float(row["efficiency"]) != float(row["efficiency"])
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     (best,) = told["best_depth"]
     assert 690 < best["depth_um"] < 760
@@ -100,9 +98,8 @@ def test_light_beside_that_of_an_empty_aperture_is_the_efficiency(tmp_path):
     words = ["--reference-e", str(1.25 * light), "-o", str(tmp_path / "out"), "--quiet"]
     assert main(["measure", str(tmp_path / "shots"), *words]) == 0
     row = json.loads((tmp_path / "out" / "measure.json").read_text())["frames"][1]
-    assert row["efficiency"] == pytest.approx(
-        0.998 / 1.25, rel=0.02
-    )  # pixels cut by the circle, the border's median
+    # pixels cut by the circle, the border's median
+    assert row["efficiency"] == pytest.approx(0.998 / 1.25, rel=0.02)
 
 
 def test_an_edge_gives_the_modulation_across_it(tmp_path):
@@ -132,9 +129,8 @@ def test_an_edge_gives_the_modulation_across_it(tmp_path):
     f = rows[:, 0] * 2.4
     want = np.sinc(f) * np.exp(-2 * (math.pi * f * 1.7) ** 2)
     low = f < 0.2
-    assert (
-        np.abs(rows[low, 1] - want[low]).max() < 0.02
-    )  # of the metric; the box of a pixel is nearly a Gaussian
+    # of the metric; the box of a pixel is nearly a Gaussian
+    assert np.abs(rows[low, 1] - want[low]).max() < 0.02
     half = float(np.interp(-0.5, -want[f < 0.4], f[f < 0.4])) / 2.4
     assert json.loads((out / "measure.json").read_text())[
         "mtf50_per_um"
@@ -245,9 +241,8 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
     assert main([*arguments, "4.068", "-o", str(tmp_path / "out")]) == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["place_is_clear"]
-    assert told["pitch_over_design"] == pytest.approx(
-        1.017, abs=5e-4
-    )  # 0.1 pixels at either end of 4 x 100
+    # 0.1 pixels at either end of 4 x 100
+    assert told["pitch_over_design"] == pytest.approx(1.017, abs=5e-4)
     assert told["bias_nm"] == []
     assert not (tmp_path / "out" / "bias.toml").exists()
     better = capsys.readouterr().out.split("--pixel-nm ")[1].split()[0]

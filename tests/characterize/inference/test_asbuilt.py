@@ -77,9 +77,8 @@ def against_all_pillars(model, **more):
 
 
 def test_reduced_model_agrees_with_the_sum_over_every_pillar(model):
-    assert (
-        against_all_pillars(model) < 1e-3
-    )  # low-rank pillars 5e-4 in t, window operators 5e-4
+    # low-rank pillars 5e-4 in t, window operators 5e-4
+    assert against_all_pillars(model) < 1e-3
 
 
 def test_tilt_and_source_beside_the_axis_agree_too(model):
@@ -104,11 +103,8 @@ def test_low_rank_pillars_know_their_error():
     assert pillars.error < 1e-3
 
 
-SIDES = (
-    "width_nm",
-    "length_nm",
-    "turn_deg",
-)  # of rectangles, below: round pillars have none
+# of rectangles, below: round pillars have none
+SIDES = ("width_nm", "length_nm", "turn_deg")
 FILMS = ("pedestal_nm", "cap_nm")  # of pillars in layers
 
 
@@ -133,9 +129,8 @@ def slopes_are_differences(model, name, x):
     down[PLACE[name]] -= h
     want = (model.images(up)[0] - model.images(down)[0]) / (2 * h)
     slope = model.images(x, [name])[1][0]
-    assert (
-        np.abs(slope - want).max() < 2e-2 * np.abs(want).max()
-    )  # operators of derivatives are cut at 3e-3 of all
+    # operators of derivatives are cut at 3e-3 of all
+    assert np.abs(slope - want).max() < 2e-2 * np.abs(want).max()
 
 
 @pytest.fixture(scope="module")
@@ -191,9 +186,8 @@ def test_a_point_source_is_not_thrown_to_the_bound_of_its_size():
     i = found.names.index("pinhole_um")
     assert found.trusted
     assert found.value[i] < 4
-    assert (
-        0.3 < found.sigma[i] < 10
-    )  # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
+    # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
+    assert 0.3 < found.sigma[i] < 10
 
 
 def test_hidden_lens_is_found_within_its_intervals(fitted):
@@ -341,28 +335,24 @@ def test_samples_have_the_posterior_covariance_but_for_what_bounds_cut_off(fitte
         np.array([getattr(row, side) for row in rows]) - fitted.value
         for side in ("low", "high")
     )
-    reach = np.clip(
-        [low / fitted.sigma, high / fitted.sigma], -1e3, 1e3
-    )  # no infinity times 0
+    # no infinity times 0
+    reach = np.clip([low / fitted.sigma, high / fitted.sigma], -1e3, 1e3)
     draws = fitted.samples(count, seed=0)
     want = fitted.sigma * clipped(*reach)
-    assert draws.std(0) == pytest.approx(
-        want, rel=4 / np.sqrt(2 * count)
-    )  # 4 sigma of a standard deviation
+    # 4 sigma of a standard deviation
+    assert draws.std(0) == pytest.approx(want, rel=4 / np.sqrt(2 * count))
     far = np.abs(reach).min(0) > 3  # there bounds take less than 0.005 of the variance
     assert far.sum() > 15
-    own = (
-        fitted.within_covariance + fitted.bench
-    )  # what the mask takes along is not drawn anew
+    # what the mask takes along is not drawn anew
+    own = fitted.within_covariance + fitted.bench
     for drawn, covariance in (
         (draws, fitted.covariance),
         (fitted.lens_samples(count, seed=3), own),
     ):
         sigma = np.sqrt(np.diag(covariance))
         unlike = (np.cov(drawn.T) - covariance) / np.outer(sigma, sigma)
-        assert np.abs(unlike[np.ix_(far, far)]).max() < 0.005 + 4 * np.sqrt(
-            2 / count
-        )  # 4 sigma of a variance
+        # 4 sigma of a variance
+        assert np.abs(unlike[np.ix_(far, far)]).max() < 0.005 + 4 * np.sqrt(2 / count)
     sigma = fitted.sigma
     assert (
         np.linalg.eigvalsh((fitted.covariance - own) / np.outer(sigma, sigma)) > -1e-9
@@ -454,9 +444,8 @@ def test_effective_index_slopes_scale_as_a_waveguide():
     height, index, wall = found.at(d)[:3]
     k = 2 * np.pi / 0.85
     phase = b.lens().proxy.phase_rad(d, 0.85)
-    assert np.allclose(
-        np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02
-    )  # phase = k n_eff h
+    # phase = k n_eff h
+    assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)
     assert (height.imag > k).all()  # guided: n_eff above that of air
     assert (index.imag > 0).all()
     assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light

@@ -300,9 +300,8 @@ def test_turned_frames_of_a_round_lens_are_declared():
 
 @pytest.mark.slow
 def test_light_of_ten_nanometres_is_right_or_refused():
-    found = fit_or_cause(
-        b.capture(b.electrons(bandwidth_nm=4.2))
-    )  # 10 nm at half height
+    # 10 nm at half height
+    found = fit_or_cause(b.capture(b.electrons(bandwidth_nm=4.2)))
     assert (
         "chi-square" in found
         if isinstance(found, str)
@@ -314,9 +313,8 @@ def test_light_of_ten_nanometres_is_right_or_refused():
 def test_psf_cropped_at_half_width_is_right():
     shots = b.capture(b.electrons())
     found = fit(frames_of(shots, shots.frames[:, :, 4:12]))
-    edges = {
-        "background_x_e": 0.5 * b.VALUES["background_x_e"]
-    }  # of the narrower window
+    # of the narrower window
+    edges = {"background_x_e": 0.5 * b.VALUES["background_x_e"]}
     assert right(found, **edges)
 
 

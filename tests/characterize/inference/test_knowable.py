@@ -117,9 +117,8 @@ def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
     assert len(words) == 2
     assert "(correlation -0.910)" in words[0]
     assert "SEM" in words[0]
-    assert words[1].startswith(
-        "bias_nm comes from prior knowledge (0.37)"
-    )  # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
+    # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
+    assert words[1].startswith("bias_nm comes from prior knowledge (0.37)")
 
 
 def asbuilt(**more):

@@ -128,9 +128,8 @@ def test_a_straight_model_has_the_covariance_of_normal_equations():
     left = (image - np.tensordot(value, shapes, 1)) / sigma * usable
     assert found.information == pytest.approx(information, rel=1e-9)
     assert found.covariance == pytest.approx(covariance, rel=1e-9)
-    assert found.value == pytest.approx(
-        value, rel=1e-7
-    )  # it stops when a step moves 1e-6 sigma
+    # it stops when a step moves 1e-6 sigma
+    assert found.value == pytest.approx(value, rel=1e-7)
     assert found.residual_sigma == pytest.approx(left, abs=1e-5)
     assert found.chi2_per_dof == pytest.approx(
         (left**2).sum() / (usable.sum() - 2), rel=1e-7

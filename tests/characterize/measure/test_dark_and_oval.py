@@ -52,16 +52,14 @@ def test_dark_tops_within_bright_rims_are_measured_at_their_outer_edge(
     picture, diameter = drawn(top=top, ground=ground, rim=1.0, width=4.0)
     found = sem.measure_diameters(picture, sem.SemMicrograph(1.0, stated))
     assert found.lattice.kind == "square"
-    assert found.lattice.pitch_px == pytest.approx(
-        PITCH, rel=0.03
-    )  # four pillars a side, waves as weak as what their sizes differ by
+    # four pillars a side, waves as weak as what their sizes differ by
+    assert found.lattice.pitch_px == pytest.approx(PITCH, rel=0.03)
     assert len(found.row) >= 9
     assert not (found.missing | found.collapsed | found.oval).any()
     wrong = wrong_by(found, diameter)
     assert 0 < wrong.mean() < 1
-    assert (
-        wrong.std() < 0.15
-    )  # noise: 0.03; diameters differ by 11, and a rim's peak with them
+    # noise: 0.03; diameters differ by 11, and a rim's peak with them
+    assert wrong.std() < 0.15
 
 
 @pytest.mark.parametrize(("long", "oval"), [(1.1, False), (1.25, True), (1.6, True)])

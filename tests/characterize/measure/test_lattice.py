@@ -92,9 +92,8 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
     apart = np.linalg.norm(seen[:, None] - place[None], axis=2)
     assert apart.min(1).max() < 0.3  # pixels
     error_px = (found.diameter_nm - truth[apart.argmin(1)]) / PIXEL
-    assert (
-        abs(error_px.mean()) < 0.6
-    )  # blur of 1.2 px moves the half level of a rim 5 px wide by less
+    # blur of 1.2 px moves the half level of a rim 5 px wide by less
+    assert abs(error_px.mean()) < 0.6
     assert error_px.std() < 0.25
 
 
@@ -131,9 +130,8 @@ def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(
     shape = (420, 470)
     place = lattice(turn_deg, angle_deg, ratio, shape)
     turn = np.radians(turn_deg)
-    back = np.array(
-        [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    )  # (row, column) of the mask
+    # (row, column) of the mask
+    back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     steps_px = np.array(made.steps_um[::-1]) * 1e3 / PIXEL
     index = np.rint((place - [11.3, 17.9]) @ back.T / steps_px).astype(int) + np.array(
         [20, 22]
@@ -150,9 +148,8 @@ def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(
     assert np.array_equal(
         overlay.register_to_mask(found, laid).site, index[apart.argmin(1)]
     )
-    assert np.nanmean(laid.error_nm) == pytest.approx(
-        -3.1, abs=0.6 * PIXEL
-    )  # edges of a blurred rim: as below
+    # edges of a blurred rim: as below
+    assert np.nanmean(laid.error_nm) == pytest.approx(-3.1, abs=0.6 * PIXEL)
     assert overlay.lattice_scale(found, PIXEL, made) == pytest.approx(1.0, abs=1e-3)
     assert np.count_nonzero(laid.outlier) < 2
 

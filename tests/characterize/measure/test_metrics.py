@@ -95,9 +95,8 @@ def test_efficiency_needs_its_aperture():
     found = metrics.focusing_efficiency(
         image, reference, step_um=STEP, aperture_um=2 * radius
     )
-    assert (
-        abs(found - 0.25) < 0.01
-    )  # half the light within the half-maximum circle, half the reference
+    # half the light within the half-maximum circle, half the reference
+    assert abs(found - 0.25) < 0.01
 
 
 def test_through_focus_grows_with_defocus():

@@ -62,18 +62,16 @@ def test_edge_of_either_lean_on_pixels_of_their_own_size(degrees):
     want = np.exp(-2 * (math.pi * f * sigma) ** 2) * np.abs(
         np.sinc(f * pixel * math.cos(lean)) * np.sinc(f * pixel * math.sin(lean))
     )
-    assert (
-        np.abs(found.modulation - want)[f < 0.4 / pixel].max() < 0.025
-    )  # bins and window, as of the upright case
+    # bins and window, as of the upright case
+    assert np.abs(found.modulation - want)[f < 0.4 / pixel].max() < 0.025
 
 
 def test_spot_of_an_oblong_beam_off_the_middle():
     found = metrics.measure_spot(gauss(2.1, 1.3, x0=2.7, y0=-1.9), step_um=STEP)
     assert found.centroid_um == pytest.approx((2.7, -1.9), abs=1e-3)
     assert found.d4sigma_um == pytest.approx((8.4, 5.2), rel=1e-3)
-    u = np.linspace(
-        0, 12, 60001
-    )  # light within r of an oblong Gaussian, by quadrature over the angle
+    # light within r of an oblong Gaussian, by quadrature over the angle
+    u = np.linspace(0, 12, 60001)
     angle = (np.arange(360) + 0.5) * 2 * math.pi / 360
     slope = (
         np.exp(
@@ -83,9 +81,8 @@ def test_spot_of_an_oblong_beam_off_the_middle():
         )
     ).mean(1) * u
     share = np.cumsum(slope) / slope.sum()
-    assert found.ee80_um == pytest.approx(
-        float(np.interp(0.8, share, u)), abs=0.03
-    )  # samples cut by the rim
+    # samples cut by the rim
+    assert found.ee80_um == pytest.approx(float(np.interp(0.8, share, u)), abs=0.03)
     radii = np.array([1.1, 2.3, 3.9])
     inside = metrics.encircled_energy(
         gauss(2.1, 1.3, x0=2.7, y0=-1.9), step_um=STEP, radius_um=radii

@@ -20,9 +20,8 @@ def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5)
     random = np.random.default_rng(seed)
     n, p, over = len(diameters_nm), PITCH / PIXEL, 3
     size = int(n * p)
-    wander = drift_px * np.sin(
-        np.arange(size * over) / (size * over) * 5
-    )  # of the scan, line by line
+    # of the scan, line by line
+    wander = drift_px * np.sin(np.arange(size * over) / (size * over) * 5)
     axis = np.arange(size * over) / over + 0.5 / over - 0.5
     image = np.full((size * over, size * over), 0.25)
     for j, i in np.ndindex(n, n):

@@ -93,9 +93,7 @@ def test_errors_of_small_discs_hold_their_noise(diameter, blur):
         for seed in range(3)
     ]
     score = np.concatenate([error / sigma for error, sigma in every])
-    assert (
-        np.abs(score) < 1.96
-    ).mean() > 0.84  # of about 70: 2.6 % from chance, four times that
-    assert (
-        0.7 < score.std() < 1.3
-    )  # 9 % from chance, and errors of which a picture's discs share one of its blur
+    # of about 70: 2.6 % from chance, four times that
+    assert (np.abs(score) < 1.96).mean() > 0.84
+    # 9 % from chance, and errors of which a picture's discs share one of its blur
+    assert 0.7 < score.std() < 1.3

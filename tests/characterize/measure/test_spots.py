@@ -74,9 +74,8 @@ def test_a_spot_near_the_border_of_its_frame_is_found_there(place):
     """
     counts = 40 + 30000 * pixels(0 * U, (31, 36), 1.0, place)
     (found,) = frames.measure_frames(capture(counts, 1.0), design=DESIGN).frames
-    assert found.strehl == pytest.approx(
-        1, abs=0.02
-    )  # less of the rings is seen: 1 % of the light
+    # less of the rings is seen: 1 % of the light
+    assert found.strehl == pytest.approx(1, abs=0.02)
 
 
 def test_the_strehl_ratio_of_an_aberrated_spot_is_that_of_its_peak():
@@ -114,9 +113,8 @@ def test_noise_is_no_light_of_its_own():
                 noisy, 1.7 * spot.sum(), step_um=pixel, aperture_um=6 * pixel
             )
         )
-    wide = math.hypot(
-        1.21, 1 / math.sqrt(12)
-    )  # samples are taken as even over their pixels
+    # samples are taken as even over their pixels
+    wide = math.hypot(1.21, 1 / math.sqrt(12))
     assert np.mean(found) == pytest.approx(
         wide * pixel * math.sqrt(2 * math.log(5)), rel=0.02
     )

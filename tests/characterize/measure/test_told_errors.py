@@ -65,18 +65,13 @@ def test_nineteen_of_twenty_true_diameters_lie_within_two_errors(long):
         )
     whole = np.concatenate(score)
     whole = whole[np.isfinite(whole)]
-    assert (
-        len(whole) >= 320
-    )  # of 324: in much noise one seems longer than what is measured
-    assert (
-        0.91 < (np.abs(whole) < 1.96).mean() < 0.98
-    )  # 1.2 % from chance, three times that
-    assert (
-        0.8 < whole.std() < 1.1
-    )  # 4 % from chance; below 1 where a tenth of what blur takes is most of what is told
-    assert (
-        abs(whole.mean()) < 0.4
-    )  # a rim is its brightest place, a gap its darkest: in noise, a little too much
-    assert (
-        max((np.abs(of) > 1.96).mean() for of in score) < 0.2
-    )  # of 36 discs: 3.6 % from chance, four times that
+    # of 324: in much noise one seems longer than what is measured
+    assert len(whole) >= 320
+    # 1.2 % from chance, three times that
+    assert 0.91 < (np.abs(whole) < 1.96).mean() < 0.98
+    # 4 % from chance; below 1 where a tenth of what blur takes is most of what is told
+    assert 0.8 < whole.std() < 1.1
+    # a rim is its brightest place, a gap its darkest: in noise, a little too much
+    assert abs(whole.mean()) < 0.4
+    # of 36 discs: 3.6 % from chance, four times that
+    assert max((np.abs(of) > 1.96).mean() for of in score) < 0.2

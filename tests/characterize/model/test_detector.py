@@ -101,9 +101,8 @@ def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over
 
 
 def test_sampling_is_fine_enough_at_twice_the_highest_frequency():
-    assert (
-        detector.fine_enough(2.0, 0.75) == 3
-    )  # 3 samples a pixel of 2: 1.5 a um, twice 0.75
+    # 3 samples a pixel of 2: 1.5 a um, twice 0.75
+    assert detector.fine_enough(2.0, 0.75) == 3
     assert detector.fine_enough(2.0, 0.76) == 4
     assert detector.fine_enough(2.0, 0.1) == 1
 

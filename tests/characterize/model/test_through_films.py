@@ -83,9 +83,8 @@ def test_paths_are_those_of_snell_s_rays():
         films.chief_um(DISTANCE + 0.5, tangents),
         films.chief_um(DISTANCE - 0.5, tangents),
     )
-    assert films.drift(tangents) == pytest.approx(
-        moved, rel=1e-12
-    )  # reach is a straight line of the gap
+    # reach is a straight line of the gap
+    assert films.drift(tangents) == pytest.approx(moved, rel=1e-12)
     near = 1e-4  # paraxial: the terms left out are its square
     assert films.reduced_um(DISTANCE) == pytest.approx(
         snell(near, media)[0] / near, rel=1e-7
@@ -98,9 +97,8 @@ def test_a_lens_in_air_has_none():
     assert FilmStack.of(Layers(), WAVELENGTH) is AIR
     found = FilmStack.of(lens(1.31).layers, WAVELENGTH)
     assert (found.front, found.behind, found.filling) == (FRONT, BEHIND, 1.31)
-    assert not FilmStack.of(
-        Layers(cover=Index(1.31)), WAVELENGTH
-    ).none_behind  # what fills the gap bends light too
+    # what fills the gap bends light too
+    assert not FilmStack.of(Layers(cover=Index(1.31)), WAVELENGTH).none_behind
 
 
 def incident(at, tangents, depth):
@@ -115,9 +113,8 @@ def incident(at, tangents, depth):
             / steep
         )
     radii = np.hypot(at[0] + beside * tangents[0], at[1] + beside * tangents[1])
-    some = np.linspace(
-        radii.min(), radii.max(), 400
-    )  # less than half a wave apart: turns can be told
+    # less than half a wave apart: turns can be told
+    some = np.linspace(radii.min(), radii.max(), 400)
     media = [(1.0, depth), *FRONT]
     turns = np.unwrap(
         referee.source_phase(media, depth, radii.min(), some, WAVELENGTH, count=20000)

@@ -17,9 +17,8 @@ SPEC = PupilSpec(
     0.9, 0.52, 0.13, window=34, phase_order=5, amplitude_order=2, drift_order=1
 )
 Z = 0.3 * (np.arange(13) - 6.0)
-OFF = (
-    np.array([-50, -40, -45, -10, -70, -5, -30, 30, 30, 40, 25, 0, 25]) * 1e-3
-)  # 36 nm rms of 300
+# 36 nm rms of 300
+OFF = np.array([-50, -40, -45, -10, -70, -5, -30, 30, 30, 40, 25, 0, 25]) * 1e-3
 TRUE = {
     "oblique astigmatism": 0.31,
     "astigmatism": -0.22,
@@ -125,9 +124,8 @@ def test_planes_off_their_places_move_no_pupil_beyond_its_interval():
         )
         - OFF
     )
-    assert (
-        np.abs(rest - np.polyval(np.polyfit(Z, rest, 1), Z)).max() < 0.012
-    )  # 4 nm each
+    # 4 nm each
+    assert np.abs(rest - np.polyval(np.polyfit(Z, rest, 1), Z)).max() < 0.012
     assert not any(name.startswith("stage") for name in exact.names)
 
 

@@ -97,9 +97,8 @@ def test_share_won_back_is_that_of_the_gap():
         0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50)
     )
     assert replace(told, before=scattered).gap_mm > 0
-    assert (
-        replace(told, before=scattered).recovered is None
-    )  # a gap of 2.0 um, with a standard error of 2.4 um
+    # a gap of 2.0 um, with a standard error of 2.4 um
+    assert replace(told, before=scattered).recovered is None
     assert list(told.rows()) == ["designed", "nominal", "before", "after", "known"]
     assert list(replace(told, known=None).rows()) == [
         "designed",
@@ -115,9 +114,8 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     for _ in range(200):
         low, high = assess.bootstrap_interval(rng.exponential(1.0, 200), draws=200)
         hits += low <= 1.0 <= high
-    assert (
-        0.88 <= hits / 200 <= 0.99
-    )  # 95 %, with the spread of 200 trials and the bootstrap's own bias
+    # 95 %, with the spread of 200 trials and the bootstrap's own bias
+    assert 0.88 <= hits / 200 <= 0.99
 
 
 def test_a_single_subject_has_its_own_value_for_an_interval():
@@ -320,9 +318,8 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
         float((a - b).norm() / b.norm())
         for a, b in (centres, _units(found.judges[0], found.nominal))
     )
-    assert moved == pytest.approx(
-        told, rel=0.35
-    )  # depths differ: the image places its own nodes
+    # depths differ: the image places its own nodes
+    assert moved == pytest.approx(told, rel=0.35)
     bare = PixelPsfStack(found.nominal.intensity, found.nominal.depths_um)
     with pytest.raises(TrainingError, match="PSFs on axis alone"):
         image_formation.make_imager(settings, torch.zeros(0), 43, margin=4, made=bare)

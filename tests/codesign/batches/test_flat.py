@@ -70,9 +70,8 @@ def test_eyes_as_one_surface_are_near_their_two_sheets():
         flatten_layers(made.frames, SCENES.states(0, 8).scale), _imager()
     )
     error = (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
-    assert (
-        float(error) < 0.05
-    )  # of the contrast: occlusion at the lids, where the sheets are millimetres apart
+    # of the contrast: occlusion at the lids, where the sheets are millimetres apart
+    assert float(error) < 0.05
 
 
 def test_spare_rows_continue_the_border():
@@ -110,9 +109,8 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
     slope = torch.autograd.functional.jvp(value, at, way)[1]
     step = 5e-3
     ahead, behind = (float(value(at + s * way)) for s in (step, -step))
-    assert float(slope) == pytest.approx(
-        (ahead - behind) / (2 * step), rel=0.02
-    )  # what the kept kernels do not show
+    # what the kept kernels do not show
+    assert float(slope) == pytest.approx((ahead - behind) / (2 * step), rel=0.02)
 
 
 def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass():
@@ -144,9 +142,8 @@ def test_slippage_of_a_pool_is_that_of_the_renderer_at_its_scale():
 def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
     depth = torch.linspace(18_000, 24_000, 4000, dtype=torch.float64)
     factor = draw_depth_scales(depth, (18e3, 24e3), 0.4, np.random.default_rng(0))
-    assert (
-        abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05
-    )  # 3 / sqrt(4000)
+    # 3 / sqrt(4000)
+    assert abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05
     assert torch.equal(
         draw_depth_scales(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
         torch.ones(4000).double(),
@@ -175,9 +172,8 @@ def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
     with elsewhere():
         got = sensor_irradiance(frames, imager.to(AWAY)).cpu()
     contrast = (want - want.mean((1, 2), keepdim=True)).norm()
-    assert (
-        float((got - want).norm() / contrast) < 1e-3
-    )  # single precision, and a pixel between two codes of 4096
+    # single precision, and a pixel between two codes of 4096
+    assert float((got - want).norm() / contrast) < 1e-3
     near = SingleSurfaceFrames(light, np.full_like(depth, 16_000), frames.scale)
     assert float((sensor_irradiance(near, imager) - want).norm() / contrast) > 0.05
 

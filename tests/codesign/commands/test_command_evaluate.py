@@ -81,9 +81,8 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     assert values["lenses"]["a"]["scene_ratios"]["gaze"] == [1.0, 1.0, 1.0]
     assert np.shape(values["lenses"]["b"]["information_per_mm2"]) == (2, 2, 3)
     energy = values["lenses"]["a"]["encircled_energy"][0]
-    assert max(energy) > max(
-        values["lenses"]["b"]["encircled_energy"][0]
-    )  # b is focused far behind this range
+    # b is focused far behind this range
+    assert max(energy) > max(values["lenses"]["b"]["encircled_energy"][0])
     read = values["reader"]["lenses"]
     assert set(read) == {"a", "b"}
     assert all(

@@ -109,9 +109,8 @@ def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch
             "image_tolerance_problem",
             lambda settings, image: "the image's error is too large",
         )
-        assert (
-            _retrain(folder, *truth, "--resume") == 1
-        )  # everything is there: the same story again
+        # everything is there: the same story again
+        assert _retrain(folder, *truth, "--resume") == 1
     assert capsys.readouterr().out.endswith(
         "\n  FAILED: the image's error is too large\n"
     )

@@ -72,17 +72,15 @@ def test_full_lens_agrees_with_the_pupil_model():
         want = axial_information(
             near, far, step_um=setting.step_um, sample_um=0.75, pixel_um=pixel
         )
-        assert got.information[0, k].numpy() == pytest.approx(
-            want.numpy(), rel=0.05
-        )  # oblique rim, window edge
+        # oblique rim, window edge
+        assert got.information[0, k].numpy() == pytest.approx(want.numpy(), rel=0.05)
     assert float(got.encircled.min()) > 0.5
     assert float(got.encircled.max()) <= 1.0
     small = evaluate.measure_axial_information(
         _lens(2000.0), replace(setting, radius_um=4.5, binnings=(1,))
     )
-    held = evaluate.most_encircled(
-        near, 0.75, radius_um=4.5
-    )  # of all light behind the pupil
+    # of all light behind the pupil
+    held = evaluate.most_encircled(near, 0.75, radius_um=4.5)
     assert small.encircled[0].numpy() == pytest.approx(held.numpy(), rel=0.05)
     assert float(held.min()) < 0.8
 
@@ -98,9 +96,8 @@ def test_encircled_energy_is_that_of_the_best_circle(size):
         light = 0.5 * disc / disc.sum() + 0.5 / size**2
         want = 0.5 + 0.5 * math.pi * 6.0**2 / (0.75 * size) ** 2
         got = evaluate.most_encircled(light[None], 0.75, radius_um=6.0)
-        assert float(got) == pytest.approx(
-            want, abs=2e-3
-        )  # staircase of the circle on samples of 0.75 um
+        # staircase of the circle on samples of 0.75 um
+        assert float(got) == pytest.approx(want, abs=2e-3)
 
 
 def test_scene_energies_tell_lenses_apart():
@@ -129,9 +126,8 @@ def test_bootstrap_interval_covers_the_true_ratio():
         )
         _, low, high = bootstrap_ratio(a, b, draws=400, seed=k)
         covered += low <= 1.5 <= high
-    assert (
-        85 <= covered <= 100
-    )  # 95 asked; binomial sd 2.2, percentile bootstrap of 40 scenes a little short
+    # 95 asked; binomial sd 2.2, percentile bootstrap of 40 scenes a little short
+    assert 85 <= covered <= 100
 
 
 def test_nothing_to_evaluate_is_refused():

@@ -68,9 +68,8 @@ def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
     x, y = np.radians(trial.stimulus_deg).T
     wanted = np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)
     for found, want in zip((right, down, out), wanted, strict=True):
-        assert (
-            np.abs(found - want).max() < 1e-6
-        )  # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
+        # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
+        assert np.abs(found - want).max() < 1e-6
     other, _ = experiment.draw_trials(SMALL, 2, scenes)
     assert float(other.trait("size")[0]) != float(states.trait("size")[0])
 
@@ -163,9 +162,8 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in told["runs"]] == ["run 1", "run 2"]
-    assert all(
-        r["ratio"] == 1.0 for r in told["ratios"]
-    )  # the same run twice, the same noise
+    # the same run twice, the same noise
+    assert all(r["ratio"] == 1.0 for r in told["ratios"])
     assert told["beyond_training_mm"]["run 1"] == [
         [-5, 0, 0],
         [-2.5, 0, 0],
@@ -221,9 +219,8 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     alone, _ = experiment.calibrated_gaze(
         read, trial, config, personal.SphereCalibrator(CameraRig(), hidden=0)
     )
-    assert (
-        personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5
-    )  # the pupil tells nothing here
+    # the pupil tells nothing here
+    assert personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5
 
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
@@ -237,9 +234,8 @@ def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder
     assert found.model.mean.shape == (36, 2)
     assert np.isfinite(found.model.mean).all()
     assert np.array_equal(found.model.mean, again.model.mean)
-    assert not np.allclose(
-        found.middle, dim.middle, rtol=1e-3
-    )  # in the light of the experiment
+    # in the light of the experiment
+    assert not np.allclose(found.middle, dim.middle, rtol=1e-3)
 
 
 @pytest.mark.parametrize("people", [0, 1])

@@ -189,9 +189,8 @@ def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys)
 
 @pytest.mark.slow
 def test_one_command_measures_and_compares(tmp_path, capsys):
-    text = m.TINY.replace(
-        "[optics]", "[optics]\nimage_tolerance = 0.5"
-    )  # a toy's PSFs change from pixel to pixel
+    # a toy's PSFs change from pixel to pixel
+    text = m.TINY.replace("[optics]", "[optics]\nimage_tolerance = 0.5")
     for name in ("a", "b"):
         m.finished_run(tmp_path / name, text)
     words = [

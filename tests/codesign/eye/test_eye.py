@@ -160,9 +160,8 @@ def test_gradient_of_the_parameters_is_exact():
     def packed(gaze, slip):
         moved = replace(states, gaze_rad=gaze, slip_um=slip)
         p = model.rows(moved, CameraRig(), 0.0045)
-        return torch.cat(
-            [p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1
-        )  # edge and exposure are held
+        # edge and exposure are held
+        return torch.cat([p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1)
 
     held = (
         states.gaze_rad.clone().requires_grad_(True),

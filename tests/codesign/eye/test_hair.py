@@ -8,16 +8,10 @@ import torch
 
 from codesign.eye.appearance import draw_lashes
 
-SIZE, TOP, BOTTOM, LEFT, RIGHT = (
-    120,
-    44,
-    79,
-    25,
-    96,
-)  # rows TOP ... BOTTOM, columns LEFT ... RIGHT of the opening
-LONG = (0.12 + 0.2 * 0.4) * (
-    RIGHT - LEFT + 1
-)  # of a lash of the upper lid, pixels, times 0.4 to 1.2
+# rows TOP ... BOTTOM, columns LEFT ... RIGHT of the opening
+SIZE, TOP, BOTTOM, LEFT, RIGHT = (120, 44, 79, 25, 96)
+# of a lash of the upper lid, pixels, times 0.4 to 1.2
+LONG = (0.12 + 0.2 * 0.4) * (RIGHT - LEFT + 1)
 
 
 def drawn(sink, rise):
@@ -32,14 +26,8 @@ def drawn(sink, rise):
 
 def test_lashes_that_neither_sink_nor_rise_lie_on_the_margins():
     rows, picture = drawn(0.0, 0.0)
-    assert set(rows) <= {
-        TOP - 1,
-        TOP,
-        TOP + 1,
-        BOTTOM - 1,
-        BOTTOM,
-        BOTTOM + 1,
-    }  # a soft stroke of one pixel
+    # a soft stroke of one pixel
+    assert set(rows) <= {TOP - 1, TOP, TOP + 1, BOTTOM - 1, BOTTOM, BOTTOM + 1}
     assert {TOP, BOTTOM} <= set(rows)
     assert 110 / 255 - 0.01 < picture.max() <= 1.0
 
@@ -48,9 +36,8 @@ def test_lashes_that_rise_lie_outside_and_those_of_the_lower_lid_are_half_as_lon
     rows, _ = drawn(0.0, 0.7)
     reach = 1.4 * 0.7 * LONG
     assert not set(rows) & set(range(TOP + 2, BOTTOM - 1))
-    assert TOP - rows.min() == pytest.approx(
-        1.1 * reach, abs=0.1 * reach + 1
-    )  # the longest of 92: 1.0 to 1.2
+    # the longest of 92: 1.0 to 1.2
+    assert TOP - rows.min() == pytest.approx(1.1 * reach, abs=0.1 * reach + 1)
     assert rows.max() - BOTTOM == pytest.approx(0.55 * reach, abs=0.05 * reach + 1)
 
 

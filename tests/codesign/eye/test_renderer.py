@@ -30,9 +30,8 @@ def test_compiled_frames_agree_with_the_twin():
     light, cover, depth, pupil = plain_eye.render_in_torch(
         _p(STATES), CameraRig(), SMALL
     )
-    assert (
-        float((light - out.frames.radiance).abs().max()) < 1e-3
-    )  # float32 on edges a pixel wide
+    # float32 on edges a pixel wide
+    assert float((light - out.frames.radiance).abs().max()) < 1e-3
     assert float((cover - out.frames.coverage).abs().max()) < 1e-3
     assert float(((depth - out.frames.depth_um) * (cover > 0)).abs().max()) < 0.5  # um
     assert float((pupil - out.pupil).abs().max()) < 1e-3
@@ -136,9 +135,8 @@ def test_a_pupil_smaller_than_a_pixel_is_seen_as_whole_as_it_is():
     )
     out = renderer.render(wide, rig=CameraRig(elevation_rad=0.0), camera=coarse)
     area = out.pupil.sum((-1, -2))
-    assert (
-        float(area.max()) < 0.8 < float(out.labels.visible.min())
-    )  # pixels are sampled, not integrated: 0.85
+    # pixels are sampled, not integrated: 0.85
+    assert float(area.max()) < 0.8 < float(out.labels.visible.min())
 
 
 def test_nothing_is_seen_behind_closed_lids():
@@ -158,9 +156,8 @@ def test_mask_is_centred_on_the_refracted_outline():
         slip_um=torch.zeros(4, 3, dtype=torch.float64),
     )
     labels = renderer.render(wide, rig=frontal, camera=PinholeCamera()).labels
-    assert (
-        float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4
-    )  # oblique refraction: under 0.4 px
+    # oblique refraction: under 0.4 px
+    assert float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4
     assert float(labels.visible.min()) > 0.97
 
 

@@ -40,9 +40,8 @@ def test_a_lamp_falls_off_with_the_square_and_the_cosine_and_wraps():
         )
     behind = [-x for x in n]
     assert float(plain_eye.lamp(*v, *behind, 0.35)) == 0
-    grazing = [
-        number(x) for x in (0.8, 0.6, 0.0)
-    ]  # at right angles to the lamp: only the wrap is left
+    # at right angles to the lamp: only the wrap is left
+    grazing = [number(x) for x in (0.8, 0.6, 0.0)]
     assert float(plain_eye.lamp(*v, *grazing, 0.3)) == pytest.approx(
         0.3 * 400 / 170, rel=1e-12
     )
@@ -108,24 +107,17 @@ def test_the_mirror_lobe_peaks_where_the_half_vector_is_the_normal(off):
     |h|² + 0.001 keeps it finite.
     """
     sharp, turn = 900.0, 0.5
-    view = [
-        number(math.sin(turn)),
-        number(0.0),
-        number(math.cos(turn)),
-    ]  # from the camera
-    lamp = [
-        number(1e6 * math.sin(turn)),
-        number(0.0),
-        number(-1e6 * math.cos(turn)),
-    ]  # its mirror image about z
+    # from the camera
+    view = [number(math.sin(turn)), number(0.0), number(math.cos(turn))]
+    # its mirror image about z
+    lamp = [number(1e6 * math.sin(turn)), number(0.0), number(-1e6 * math.cos(turn))]
     normal = [number(math.sin(off)), number(0.0), number(-math.cos(off))]
     p = parameters(AXIS=[0.0, 0.0, -1.0])
     outer, inner, shine = plain_eye.wet_lamp(p, *lamp, *normal, *view, sharp)
     square = 4 * math.cos(turn) ** 2
     apart = 1 - math.cos(off) ** 2 * square / (square + 1e-3)
-    assert float(shine) == pytest.approx(
-        1 / (1 + sharp / 2 * apart) ** 2, rel=1e-3
-    )  # the lamp's own 1 mm in 1 m
+    # the lamp's own 1 mm in 1 m
+    assert float(shine) == pytest.approx(1 / (1 + sharp / 2 * apart) ** 2, rel=1e-3)
     fall = 4e8 / (1e12 + 1e6)
     assert float(outer) == pytest.approx((math.cos(turn - off) + 0.3) * fall, rel=1e-5)
     assert float(inner) == pytest.approx((math.cos(turn) + 0.15) * fall, rel=1e-5)
@@ -207,9 +199,8 @@ def test_creases_margins_and_brow_of_the_skin():
     assert skin(lower=-2600.0) == pytest.approx(0.8 + rim)
     pouch = 1 - 0.20 / (1 + (2270 / 420) ** 2)
     assert skin(lower=-330.0) == pytest.approx(pouch + 0.10 / 0.52)
-    assert skin(gy=-17000.0) == pytest.approx(
-        1 - 0.75 * 1.0
-    )  # 1.25 * 0.8 of the brow's opacity
+    # 1.25 * 0.8 of the brow's opacity
+    assert skin(gy=-17000.0) == pytest.approx(1 - 0.75 * 1.0)
     assert skin(gy=-17000.0 - 6000**2 / 60000.0 + 2600.0, gx=6000.0) == pytest.approx(
         1 - 0.75 * 0.5
     )
@@ -236,9 +227,8 @@ def test_rays_on_the_axis_meet_sphere_lids_and_cornea_where_they_stand():
         [16.7e3, 0, 0, -1, 1]
     )
     s, openness, gx, gy, upper, lower, nx, ny, nz = plain_eye.lids(p, *ahead)
-    assert float(s) == pytest.approx(
-        17.1e3
-    )  # the shell; the plane stands 10 mm behind it
+    # the shell; the plane stands 10 mm behind it
+    assert float(s) == pytest.approx(17.1e3)
     arch = 1 - (700 / 11e3) ** 2
     assert [float(v) for v in (openness, gx, gy)] == pytest.approx([1, 0, 0])
     assert [float(v) for v in (upper, lower)] == pytest.approx(

@@ -75,11 +75,8 @@ def test_light_that_falls_off_is_a_plane_through_1_in_the_middle():
 
 def test_a_shadow_takes_its_share_far_inside_and_nothing_far_outside():
     draws = np.full(12, 0.0)
-    draws[8], draws[9], draws[10] = (
-        0.25,
-        0.0,
-        0.6,
-    )  # edge along x, 6 % below the middle, 2 % wide
+    # edge along x, 6 % below the middle, 2 % wide
+    draws[8], draws[9], draws[10] = (0.25, 0.0, 0.6)
     out = put_on(scene(), draws, shade=0.6)
     ratio = (out.pinhole() / scene().pinhole())[0]
     assert ratio[-1].tolist() == pytest.approx([0.4] * N, abs=1e-4)
@@ -110,22 +107,14 @@ def test_glints_lie_on_the_eye_at_their_distance_from_the_pupil():
 
 def test_a_rim_hides_what_is_behind_it_and_stands_nearer():
     draws = np.full(12, 0.3)
-    draws[6], draws[7] = (
-        1.0,
-        0.0,
-    )  # a wide circle whose right side is 0.351 frames right of the middle
+    # a wide circle whose right side is 0.351 frames right of the middle
+    draws[6], draws[7] = (1.0, 0.0)
     before = scene(left=50)
     out = put_on(before, draws, rim=0.08)
     cover = out.frames.coverage[0]
     torch.testing.assert_close(cover.sum(0), torch.ones(N, N), rtol=0, atol=1e-5)
-    assert torch.nonzero(cover[1, 31] < 0.5)[:, 0].tolist() == [
-        54,
-        55,
-        56,
-        57,
-        58,
-        59,
-    ]  # centres in 54.46 … 59.58
+    # centres in 54.46 … 59.58
+    assert torch.nonzero(cover[1, 31] < 0.5)[:, 0].tolist() == [54, 55, 56, 57, 58, 59]
     hidden = (cover[1] < 0.5) & (before.frames.coverage[0, 1] > 0.5)
     assert out.frames.depth_um[0, 0][hidden].unique().tolist() == [14e3]  # 0.7 of 20 mm
     assert float((out.pupil[0] - before.pupil[0] * cover[1]).abs().max()) < 1e-5
@@ -153,9 +142,8 @@ def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
 def test_dressed_frames_have_a_depth_wherever_they_are_seen():
     made = SCENES.rendered(4, 8)  # a rim is among them
     flat = flatten_layers(made.frames, torch.ones(8))
-    assert (
-        flat.depth_um.min() > 4000
-    )  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
+    # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
+    assert flat.depth_um.min() > 4000
 
 
 def test_mirrored_windows_add_light_and_hide_nothing():
@@ -180,9 +168,8 @@ def test_a_movement_spreads_by_its_length_along_its_way(length, angle):
     assert (kernel * y).sum() == pytest.approx(0, abs=1e-6)
     along = x * math.cos(angle) + y * math.sin(angle)
     across = y * math.cos(angle) - x * math.sin(angle)
-    assert (
-        -0.01 <= (kernel * along**2).sum() - length**2 / 12 <= 0.25
-    )  # 32 places of the line: 0.1 % less
+    # 32 places of the line: 0.1 % less
+    assert -0.01 <= (kernel * along**2).sum() - length**2 / 12 <= 0.25
     assert 0 <= (kernel * across**2).sum() <= 0.25
 
 

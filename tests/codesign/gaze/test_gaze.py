@@ -99,9 +99,8 @@ def test_pupil_on_the_sensor_by_similar_triangles():
     found = gaze.optical_axis(
         torch.tensor([[1.7 * x / z, 1.7 * y / z]], dtype=torch.float64), moved, geometry
     )
-    assert found[0].tolist() == pytest.approx(
-        [0.48, 0.6, -0.64]
-    )  # faces the camera: the near side
+    # faces the camera: the near side
+    assert found[0].tolist() == pytest.approx([0.48, 0.6, -0.64])
 
 
 def test_a_missing_ray_points_to_the_place_on_the_sphere_nearest_to_it():

@@ -65,9 +65,8 @@ def _known(gaze, every):
 def test_face_angles_undo_the_tilt_of_the_camera():
     s, c = math.sin(0.7), math.cos(0.7)
     tilted = CameraRig(elevation_rad=0.7)
-    ahead = np.array(
-        [[0.0, -s, -c]]
-    )  # out of a face that the camera sees from 0.7 rad below
+    # out of a face that the camera sees from 0.7 rad below
+    ahead = np.array([[0.0, -s, -c]])
     assert np.allclose(personal.face_angles(ahead, tilted), 0, atol=1e-12)
     turned = ahead * math.cos(0.2) + math.sin(0.2) * np.array([[1.0, 0.0, 0.0]])
     assert np.allclose(personal.face_angles(turned, tilted), [[math.degrees(0.2), 0.0]])
@@ -89,9 +88,8 @@ def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
     assert known.sum() == 49
     assert error.mean() < 0.15
     assert personal.angle_deg(alone.sphere(pupil, slip), gaze).mean() < 0.25
-    assert (
-        np.abs(alone.own[4:6] + np.array([5.0, 1.5])).max() < 1.5
-    )  # kappa trades with the centre to first order
+    # kappa trades with the centre to first order
+    assert np.abs(alone.own[4:6] + np.array([5.0, 1.5])).max() < 1.5
 
 
 def test_noisy_slippage_makes_the_regressor_careful():
@@ -154,7 +152,6 @@ def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
     )
     left = -(slope @ at) / (at @ at)
     assert left > 0
-    assert (
-        np.abs(slope + left * at).max() < 0.01 * left * np.abs(at).max()
-    )  # where the search ends: 1e-4 of it
+    # where the search ends: 1e-4 of it
+    assert np.abs(slope + left * at).max() < 0.01 * left * np.abs(at).max()
     assert np.abs(at).min() > 0.02  # none is at the mean, which would say nothing

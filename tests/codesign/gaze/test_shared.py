@@ -33,9 +33,8 @@ def test_variances_of_a_balanced_layout_are_those_of_the_analysis_of_variance():
     assert found.noise == pytest.approx(within, rel=1e-5)
     assert found.variance[0] == pytest.approx((between - within) / m, rel=1e-5)
     assert found.mean[0] == pytest.approx(answers.mean(0), rel=1e-9)
-    new = np.array(
-        [[1.0, 2.0], [1.8, 0.4], [2.9, 1.1]]
-    )  # of another person: drawn to the mean by σ² / (σ² + 3 τ²)
+    # of another person: drawn to the mean by σ² / (σ² + 3 τ²)
+    new = np.array([[1.0, 2.0], [1.8, 0.4], [2.9, 1.1]])
     pull = within / (within + 3 * found.variance[0])
     want = (1 - pull) * new.mean(0) + pull * found.mean[0]
     assert found.own(np.ones((3, 1)), new)[0] == pytest.approx(want, rel=1e-6)
@@ -113,9 +112,8 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
     assert error < 2 * 0.25 * np.sqrt(1.4)
     off = read.axis_deg - gaze
     raw = off[10:] - off[:10].mean(0)
-    assert (
-        np.linalg.norm(raw, axis=1).mean() > 2.0
-    )  # 0.2 deg/mm² of products up to 25 mm²
+    # 0.2 deg/mm² of products up to 25 mm²
+    assert np.linalg.norm(raw, axis=1).mean() > 2.0
 
 
 def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_path):

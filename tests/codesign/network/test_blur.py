@@ -34,9 +34,8 @@ def test_power_is_that_of_the_windows_own_fourier_transform():
             got = float(
                 power[1, fx * windows.ROWS + fy + windows.WAVES - 1, row, column]
             )
-            assert got == pytest.approx(
-                want[fy, fx], rel=1e-4, abs=1e-5
-            )  # float32 sums of 256 terms
+            # float32 sums of 256 terms
+            assert got == pytest.approx(want[fy, fx], rel=1e-4, abs=1e-5)
         assert float(mean[1, 0, row, column]) == pytest.approx(
             (cut * weight).sum() / weight.sum(), rel=1e-4, abs=1e-6
         )
@@ -62,9 +61,8 @@ def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
 
 
 def test_waves_beyond_nyquist_are_left_out_on_few_pixels():
-    power, _ = windows.window_spectra(
-        _frames(size=24)
-    )  # 6 pixels a window: 3 periods and no more
+    # 6 pixels a window: 3 periods and no more
+    power, _ = windows.window_spectra(_frames(size=24))
     grid = power.reshape(2, windows.COLUMNS, windows.ROWS, blur.GRID, blur.GRID)
     assert bool((grid[:, :4, windows.WAVES - 1 - 3 : windows.WAVES + 3] > 0).all())
     assert not bool(grid[:, 4:].any())
@@ -120,9 +118,8 @@ def test_all_windows_tell_each_their_mean_and_their_spread():
         block.take.weight.copy_(
             torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]])
         )
-        block.take.bias.copy_(
-            torch.tensor([4.0, 5.0])
-        )  # beyond 3 hardswish is its argument
+        # beyond 3 hardswish is its argument
+        block.take.bias.copy_(torch.tensor([4.0, 5.0]))
         block.give.weight.copy_(torch.tensor([[1.0, 0.0], [0.0, 3.0]]))
         block.give.bias.copy_(torch.tensor([0.1, 0.2]))
         x = torch.zeros(1, 2, blur.GRID, blur.GRID)
@@ -146,9 +143,8 @@ def test_windows_hold_the_vergence_under_them():
         (1e3 / z - blur.VERGENCE_PER_M) / blur.VERGENCE_UNIT_PER_M for z in (25.0, 12.5)
     )
     assert torch.allclose(got[:, 1:], torch.full_like(got[:, 1:], far), atol=1e-5)
-    assert float(got[0, 0, 2]) == pytest.approx(
-        (far + near) / 2, abs=1e-5
-    )  # half of a symmetric weight
+    # half of a symmetric weight
+    assert float(got[0, 0, 2]) == pytest.approx((far + near) / 2, abs=1e-5)
     assert float(blur.depth_mm(torch.tensor(near))) == pytest.approx(12.5, rel=1e-6)
 
 
@@ -165,9 +161,8 @@ def test_depth_loss_is_least_at_the_truth_and_at_the_true_spread():
         )
         return float(losses.depth_loss(told, truth))
 
-    assert loss(0.37) == pytest.approx(
-        0.5 + math.log(0.37), abs=0.005
-    )  # 2e5 draws: 0.0016
+    # 2e5 draws: 0.0016
+    assert loss(0.37) == pytest.approx(0.5 + math.log(0.37), abs=0.005)
     assert loss(0.37) < min(loss(0.3), loss(0.45), loss(0.37, 0.2))
 
 
@@ -182,12 +177,10 @@ def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():
 
     coarse, fine = 40 * disc(16)[None], (disc(64) > 0).float()[None]
     assert float(losses.mask_iou(coarse, fine)) > 0.9
-    assert (
-        float(losses.mask_iou(coarse, fine, pixels=64)) > 0.97
-    )  # a smooth edge is interpolated well within a cell
-    shifted = (
-        40 * torch.roll(disc(16), 1, 1)[None]
-    )  # one cell of 16: of a disc of radius r, shifted by d: closed form
+    # a smooth edge is interpolated well within a cell
+    assert float(losses.mask_iou(coarse, fine, pixels=64)) > 0.97
+    # one cell of 16: of a disc of radius r, shifted by d: closed form
+    shifted = 40 * torch.roll(disc(16), 1, 1)[None]
     r, d = 0.2, 1 / 16
     both = 2 * r**2 * math.acos(d / (2 * r)) - d / 2 * math.sqrt(4 * r**2 - d**2)
     want = both / (2 * math.pi * r**2 - both)

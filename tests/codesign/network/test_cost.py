@@ -22,9 +22,8 @@ from metalens.core.errors import ConfigError
 def _counted(net, architecture, size):
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, size, size), architecture)
-    return (
-        counter.get_total_flops() // 2 + windows.STEP_MACS
-    )  # steps are sums of slices, which it does not count
+    # steps are sums of slices, which it does not count
+    return counter.get_total_flops() // 2 + windows.STEP_MACS
 
 
 def test_count_equals_a_counted_forward_pass_for_24_subnets():
@@ -42,9 +41,8 @@ def test_count_equals_a_counted_forward_pass_for_24_subnets():
 def test_published_counts_of_mobilenet_v3():
     assert mobilenet_v3.counted("large") / 1e6 == pytest.approx(216.6, abs=0.05)
     assert mobilenet_v3.counted("small") / 1e6 == pytest.approx(56.5, abs=0.05)
-    without = mobilenet_v3.counted(
-        "large", classes=0
-    )  # the last row of Table 1: 1280 channels to 1000 classes
+    # the last row of Table 1: 1280 channels to 1000 classes
+    without = mobilenet_v3.counted("large", classes=0)
     assert mobilenet_v3.counted("large") - without == 1280 * 1000
 
 
@@ -105,8 +103,7 @@ def test_cost_falls_with_pitch_and_impossible_pitch_is_refused():
     counts = [
         float(cost.macs_of_size(space, smallest_architecture(space), s)) for s in sizes
     ]
-    assert (
-        counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85
-    )  # heads and windows of the blur are no pixels
+    # heads and windows of the blur are no pixels
+    assert counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85
     with pytest.raises(ConfigError, match=r"leaves 12\.0 pixels"):
         cost.input_size(1200.0, 100.0, 1.0)

@@ -20,9 +20,8 @@ def test_dice_is_zero_for_the_right_mask_and_nearly_one_for_its_complement():
     mask = _mask()
     assert float(losses.dice_loss(200 * (mask - 0.5), mask)) < 1e-12
     wrong = float(losses.dice_loss(-200 * (mask - 0.5), mask))
-    assert wrong == pytest.approx(
-        1 - 1 / (16 * 16 + 1), abs=1e-9
-    )  # no overlap: only the smoothing is left
+    # no overlap: only the smoothing is left
+    assert wrong == pytest.approx(1 - 1 / (16 * 16 + 1), abs=1e-9)
 
 
 def test_all_blink_batch_is_finite_with_finite_gradient():
@@ -101,9 +100,8 @@ def test_masks_are_held_to_the_finer_grid_of_the_two():
     """
     mask = torch.zeros(1, 12, 12, dtype=torch.float64)
     mask[0, :, :7] = 1  # cells of three pixels: the third holds one of them
-    steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(
-        1, 4, 4
-    )  # 0 at x = 7 pixels
+    # 0 at x = 7 pixels
+    steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(1, 4, 4)
     assert float(losses.segmentation_loss(steep, mask)) < 0.1
     entropy = (math.log(3) + 2 * math.log(3 / 2)) / 3 / 4  # of one column of four
     assert (
@@ -124,9 +122,8 @@ def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
     told = points + torch.tensor([[[0.002, 0.0], [0.0, 0.1], [3.0, 3.0]]])
     turned = axis + torch.tensor([[0.01, 0.0, -0.2]])
     found = Prediction(*(torch.zeros(1) for _ in range(5)), points=told, axis=turned)
-    seen = (
-        (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2
-    )  # two coordinates, two points inside
+    # two coordinates, two points inside
+    seen = (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2
     looked = (0.1**2 / 2 / 0.3 + (2.0 - 0.15)) / 3
     got = losses.pose_loss(found, axis, points, axis_weight=0.7, point_weight=3.0)
     assert float(got) == pytest.approx(0.7 * looked + 3.0 * seen, rel=1e-5)

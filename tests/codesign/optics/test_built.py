@@ -52,16 +52,14 @@ def _engine(x, settings):
 def test_psfs_agree_with_the_sum_over_every_pillar(x):
     got = as_built_lens.MadeLens(m.small(), m.OPTICS).stack(x)
     want = _engine(x, m.OPTICS)
-    assert (
-        as_built_lens.psf_error(got, want) < 6e-3
-    )  # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
+    # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
+    assert as_built_lens.psf_error(got, want) < 6e-3
     assert (
         got.intensity.sum((1, 2)) / want.intensity.sum((1, 2)) - 1
     ).abs().max() < 0.02  # half a pitch at the rim is 1.3 % of the light
     far = as_built_lens.MadeLens(m.small(), m.OPTICS).stack()
-    assert (
-        x is not X or as_built_lens.psf_error(far, want) > 0.05
-    )  # the errors of this lens are far above the tolerance
+    # the errors of this lens are far above the tolerance
+    assert x is not X or as_built_lens.psf_error(far, want) > 0.05
 
 
 def test_every_pillar_can_be_asked_as_it_was_made():
@@ -78,9 +76,8 @@ def test_every_pillar_can_be_asked_as_it_was_made():
         .plane.wave.pillar_transmission(0.85, 0.0)
         .numpy()
     )
-    assert (
-        np.abs(got - want).max() < 4e-4
-    )  # half a step of the table, 5e-6 um of 79 rad/um
+    # half a step of the table, 5e-6 um of 79 rad/um
+    assert np.abs(got - want).max() < 4e-4
 
 
 def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
@@ -95,9 +92,8 @@ def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
     )
     axis = (torch.arange(15, dtype=torch.float64) - 7) * 3.0
     x, y = ((light.sum(d) * axis).sum(1) / light.sum((1, 2)) for d in (1, 2))
-    slope = (
-        3 * np.pi * 2 / 0.24 * 10e-3 / 2
-    )  # rad at the rim: phase is 3 turns over 0.24 um of diameter ...
+    # rad at the rim: phase is 3 turns over 0.24 um of diameter ...
+    slope = 3 * np.pi * 2 / 0.24 * 10e-3 / 2
     expected = slope / 60.0 / (2 * np.pi / 0.85) * 300.0
     assert abs(y).max() < 0.02
     assert x.min() > 0.3 * expected > 0
@@ -133,6 +129,5 @@ def test_the_design_matches_the_smooth_lens_of_training():
     """Pillars against the phase they were made for: two ways to the same samples."""
     got = as_built_lens.MadeLens(m.small(), m.OPTICS).stack()
     want = optics.lens_psf_stack(m.OPTICS, torch.zeros(0))
-    assert (
-        as_built_lens.psf_error(got, want) < 0.25
-    )  # the grids of both windows cut the band at different harmonics
+    # the grids of both windows cut the band at different harmonics
+    assert as_built_lens.psf_error(got, want) < 0.25

@@ -100,15 +100,13 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
     phase = np.asarray(turn(lens, 0.85))
     inside = phase - phase[0] <= 2 * math.pi
     rate = np.gradient(phase, lens)[inside]
-    mean = np.trapezoid(rate, phase[inside]) / (
-        2 * math.pi
-    )  # phases fill the turn evenly
+    # phases fill the turn evenly
+    mean = np.trapezoid(rate, phase[inside]) / (2 * math.pi)
     bias = state.bias_um(u.numpy(), v.numpy())
     got = lens_errors.wave_front_rad(state, u, v, SETTINGS.phase_rates).numpy()
     assert got[0] == pytest.approx(0, abs=1e-12)
-    assert got == pytest.approx(
-        mean * (bias - bias[0]), rel=0.01, abs=1e-12
-    )  # 400 phases of the turn
+    # 400 phases of the turn
+    assert got == pytest.approx(mean * (bias - bias[0]), rel=0.01, abs=1e-12)
 
 
 @pytest.mark.parametrize(

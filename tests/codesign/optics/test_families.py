@@ -35,9 +35,8 @@ def test_free_terms_are_rings_and_waves_in_their_order():
     assert len(free) == 23 < len(orders)
     for (n, m), term in zip(orders, free, strict=False):
         want = rho**n * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta))
-        assert term.numpy() == pytest.approx(
-            want, abs=1e-13
-        )  # rounding of a dozen products below 3
+        # rounding of a dozen products below 3
+        assert term.numpy() == pytest.approx(want, abs=1e-13)
     across = families.phase_terms(
         torch.from_numpy(x), torch.from_numpy(y)[:, None], 5, "free"
     )  # of a row and a column

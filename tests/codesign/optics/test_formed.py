@@ -52,15 +52,12 @@ def test_on_the_axis_it_holds_the_psfs_of_the_other_engine(whole):
         box = np.sinc(f)[:, None] * np.sinc(f)
         want = np.fft.fft2(one.numpy() / float(one.sum())) * box
         got = np.fft.fft2(whole.stack[middle[0], middle[1], k].numpy())
-        low = (np.abs(f)[:, None] < 0.35) & (
-            np.abs(f) < 0.35
-        )  # beyond, what the other engine cuts off folds in
-        assert (
-            np.abs(got - want)[low].max() < 0.06
-        )  # of 1; the window's edge cuts 2 % here, of either's own ringing
-        assert (
-            np.abs(got - want.conj())[low].max() > 0.1
-        )  # a mirrored lens is not this one
+        # beyond, what the other engine cuts off folds in
+        low = (np.abs(f)[:, None] < 0.35) & (np.abs(f) < 0.35)
+        # of 1; the window's edge cuts 2 % here, of either's own ringing
+        assert np.abs(got - want)[low].max() < 0.06
+        # a mirrored lens is not this one
+        assert np.abs(got - want.conj())[low].max() > 0.1
 
 
 def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
@@ -95,16 +92,14 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     )
     with torch.no_grad():
         want = float(image(BENT + 2e-3 * way) - image(BENT - 2e-3 * way)) / 4e-3
-    assert float(moving.grad @ way) == pytest.approx(
-        want, rel=0.02
-    )  # float32 images: 1e-3 of a difference of 4e-3
+    # float32 images: 1e-3 of a difference of 4e-3
+    assert float(moving.grad @ way) == pytest.approx(want, rel=0.02)
 
     few = BENT.clone().requires_grad_()
     pairs = draw_nodes(whole.plan, 240, torch.Generator().manual_seed(1))
     replace(ready, pairs=pairs).pass_on(SMALL, few)
-    assert float((few.grad - moving.grad).norm()) < 0.6 * float(
-        moving.grad.norm()
-    )  # 240 draws of 25 points
+    # 240 draws of 25 points
+    assert float((few.grad - moving.grad).norm()) < 0.6 * float(moving.grad.norm())
 
 
 def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_were_drawn(
@@ -145,9 +140,8 @@ def test_flat_frames_take_the_true_image_as_one_sheet(whole):
         torch.cat([cover, 0 * cover], 1),
         depth,
     )
-    assert torch.allclose(
-        got, whole(one), atol=2e-5
-    )  # as a near sheet it comes to the same
+    # as a near sheet it comes to the same
+    assert torch.allclose(got, whole(one), atol=2e-5)
 
 
 def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
@@ -201,9 +195,8 @@ def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole
     assert isinstance(whole, Imager)
     far = image_formation.uniform_image_error(SMALL, 3 * BENT, FRAME, margin=MARGIN)
     still = replace(SMALL, polynomials=0, focus_mm=22.0)
-    near = image_formation.uniform_image_error(
-        still, torch.zeros(0), 20, margin=5
-    )  # a round lens over half of the field
+    # a round lens over half of the field
+    near = image_formation.uniform_image_error(still, torch.zeros(0), 20, margin=5)
     assert 0.02 < near < far < 1.0
 
 
@@ -214,14 +207,12 @@ def test_made_lenses_differ_and_lose_light_to_haze():
     plain = image_formation.make_imager(loose, BENT, 20, margin=5)
     assert torch.allclose(made.stack.sum((-2, -1)), torch.ones(()), atol=1e-4)
     kept = math.exp(-variance_rad2(error.state(), loose.phase_rates))
-    shadow = (11 * 12.0) ** 2 / (
-        math.pi * 150.0**2
-    )  # of the window in the shadow of the aperture
+    # of the window in the shadow of the aperture
+    shadow = (11 * 12.0) ** 2 / (math.pi * 150.0**2)
     ratio = float(made.energy.mean() / plain.energy.mean())
     assert kept < 0.99
-    assert ratio == pytest.approx(
-        kept + (1 - kept) * shadow, rel=0.01
-    )  # of 0.977 in the window, 1 was taken
+    # of 0.977 in the window, 1 was taken
+    assert ratio == pytest.approx(kept + (1 - kept) * shadow, rel=0.01)
     assert math.isfinite(made.error)
 
 
@@ -236,18 +227,15 @@ def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
     lit = [
         stack.lens_psf_stack(s, none).intensity.sum((1, 2)) for s in (open_, stopped)
     ]
-    near = (
-        1 - 300 / 1.45 / (float(stopped.depths_um[0]) - 300 + 300 / 1.45)
-    ) ** -2  # the shadow is wider than the hole
-    assert float(lit[1][0] / lit[0][0]) == pytest.approx(
-        0.25 * near, rel=0.03
-    )  # of the light beyond the window
+    # the shadow is wider than the hole
+    near = (1 - 300 / 1.45 / (float(stopped.depths_um[0]) - 300 + 300 / 1.45)) ** -2
+    # of the light beyond the window
+    assert float(lit[1][0] / lit[0][0]) == pytest.approx(0.25 * near, rel=0.03)
     through = [image_formation.optics_of(s, none) for s in (open_, stopped)]
     assert [plane.layers.stop for plane in through] == [None, Stop(75.0, 300.0)]
     assert through[0].wave.focus.layers.front == glass
     image = image_formation.make_imager(stopped, none, FRAME, margin=MARGIN)
     middle = image.energy[len(image.plan.y_um) // 2, len(image.plan.x_um) // 2]
-    assert (
-        float(middle.min()) > 0.85
-    )  # of the light on the stop; the rest is bent beyond the window
+    # of the light on the stop; the rest is bent beyond the window
+    assert float(middle.min()) > 0.85
     assert float(middle.max()) < 1.02

@@ -83,9 +83,8 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
     )
     want = _on_samples(fine.double(), wide)
     got = optics.lens_psf_stack(wide, coefficients).intensity
-    assert (
-        float((got - want).norm() / want.norm()) < 1e-3
-    )  # light outside the window of the reference
+    # light outside the window of the reference
+    assert float((got - want).norm() / want.norm()) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -169,9 +168,8 @@ def test_a_shifted_sensor_is_a_shifted_focus():
         for v in (vergence, 2 / 20_000.0 - vergence)
     ]
     same, opposite = (abs(float(with_error[0].max()) - p) for p in peaks)
-    assert (
-        same < 0.02 * float(with_error[0].max()) < opposite
-    )  # fourth order in the aperture is left
+    # fourth order in the aperture is left
+    assert same < 0.02 * float(with_error[0].max()) < opposite
 
 
 def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():

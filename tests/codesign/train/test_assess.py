@@ -32,10 +32,8 @@ def test_answers_are_scaled_and_errors_are_means_over_frames():
     off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.8, 0.1]])
     scale = torch.tensor([0.5, 2.0, 4.0])
     logits, mask = -torch.ones(3, 5, 5), torch.zeros(3, 5, 5)
-    logits[0, :2], mask[0, 1:3] = (
-        1.0,
-        1.0,
-    )  # 10 and 10 pixels, 5 of them shared: 5 of 15
+    # 10 and 10 pixels, 5 of them shared: 5 of 15
+    logits[0, :2], mask[0, 1:3] = (1.0, 1.0)
     logits[1, 0], mask[1, 0] = 1.0, 1.0
     seen = SensorFrames(torch.zeros(3, 1, 5, 5), mask, truth, 2, torch.zeros(3, 7, 7))
     net = Typed((truth + off) / scale, logits)
@@ -46,9 +44,8 @@ def test_answers_are_scaled_and_errors_are_means_over_frames():
     assert float(error[:2].mean()) == pytest.approx(
         (0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.8) / 6
     )
-    assert float(got.iou.mean()) == pytest.approx(
-        (1 / 3 + 1 + 1) / 3
-    )  # two empty masks agree
+    # two empty masks agree
+    assert float(got.iou.mean()) == pytest.approx((1 / 3 + 1 + 1) / 3)
     assert [len(part) for part in assess.batched_frames(seen)] == [2, 1]
 
 

@@ -79,9 +79,8 @@ def test_candidates_born_together_do_not_know_of_each_other():
     one = _run(plan=EvolutionSettings(8, 3, 30))
     four = _run(plan=EvolutionSettings(8, 3, 30, together=4))
     assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
-    assert (
-        four[1].history == one[7].history
-    )  # the first population is drawn, whoever is judged when
+    # the first population is drawn, whoever is judged when
+    assert four[1].history == one[7].history
     middle = evolution.state_from_json(evolution.state_to_json(four[3]), SPACE)
     assert (
         _run(plan=EvolutionSettings(8, 3, 30, together=4), start=middle)[-1] == four[-1]
@@ -204,9 +203,8 @@ def test_a_network_is_fitted_by_resolution_alone():
     assert evolution.fit_resolution(space, top, count, 2 * count(top)) == top
     budget = 0.4 * count(top)
     made = evolution.fit_resolution(space, top, count, budget)
-    assert (
-        0.95 * budget < count(made) <= budget
-    )  # steps of a hundredth of the range, and of whole pixels
+    # steps of a hundredth of the range, and of whole pixels
+    assert 0.95 * budget < count(made) <= budget
     assert dataclasses.replace(made, resolution=1.0) == top
     least = evolution.fit_resolution(space, top, count, 1.0)
     assert least.resolution == pytest.approx(space.resolution[0])

@@ -117,9 +117,8 @@ def test_read_noise_of_an_area_falls_as_the_inverse_of_the_pitch(exact):
         electrons = _normal(mean, sensor, generator, reads)
     variance = electrons.var()
     (slope,) = torch.autograd.grad(variance, pitch)
-    assert float(variance.detach()) == pytest.approx(
-        400 + 900, rel=0.03
-    )  # 57 600 pixels: 0.6 % each, 5 sigma
+    # 57 600 pixels: 0.6 % each, 5 sigma
+    assert float(variance.detach()) == pytest.approx(400 + 900, rel=0.03)
     assert float(slope) == pytest.approx(-2 * 900 / 8.0, rel=0.06)
 
 
@@ -147,9 +146,8 @@ def test_frames_for_a_coarser_grid_are_the_same_and_know_only_the_reads():
         (slope,) = torch.autograd.grad((frames * weights).sum(), pitch)
         found[resized] = frames.detach(), float(slope)
     torch.testing.assert_close(found[True][0], found[False][0], rtol=1e-5, atol=1e-5)
-    assert (
-        found[True][1] == 0.0
-    )  # no read noise, so nothing that a coarser grid would see
+    # no read noise, so nothing that a coarser grid would see
+    assert found[True][1] == 0.0
     assert found[False][1] != 0.0
 
 

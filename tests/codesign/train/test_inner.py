@@ -117,9 +117,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole, stop, tmp_path):
 
 def test_optics_and_pitch_move_only_inside_their_schedules():
     trainer = _trainer(MOVING)
-    trainer.model.log_pitch.register_hook(
-        lambda slope: slope.abs() + 0.1
-    )  # it begins at its coarsest
+    # it begins at its coarsest
+    trainer.model.log_pitch.register_hook(lambda slope: slope.abs() + 0.1)
     list(trainer.run(until=5))
     lens = trainer.model.coefficients_rad.detach().clone()
     pitch = float(trainer.model.log_pitch.detach())
@@ -133,13 +132,11 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
 
 
 def test_a_budget_drives_the_pitch_up():
-    space = SearchSpace(
-        resolution=(0.6, 1.0)
-    )  # which leaves room for pixels up to 16 um
+    # which leaves room for pixels up to 16 um
+    space = SearchSpace(resolution=(0.6, 1.0))
     member = replace(smallest_architecture(space), resolution=1.0)
-    start_um = (
-        SIZE * OPTICS.sample_um / 40.5
-    )  # 40 and 41 pixels differ in cost: between others the count is flat
+    # 40 and 41 pixels differ in cost: between others the count is flat
+    start_um = SIZE * OPTICS.sample_um / 40.5
     pitch_um = []
     for weight in (0.0, 100.0):
         made = training.make_model(OPTICS, pitch_um=start_um, seed=2, space=space)
@@ -150,9 +147,8 @@ def test_a_budget_drives_the_pitch_up():
         )  # or nothing would drive
         assert trainer.pitch_held_um is None
         pitch_um.append(float(trainer.model.pitch_um.detach()))
-    assert (
-        pitch_um[1] > 1.01 * start_um
-    )  # Adam's steps have the size of the rate: 0.03 in all
+    # Adam's steps have the size of the rate: 0.03 in all
+    assert pitch_um[1] > 1.01 * start_um
     assert pitch_um[1] > 1.005 * pitch_um[0]
 
 
@@ -180,9 +176,8 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
         records = list(trainer.run(until=20))
         assert records[-1].pitch_um == pytest.approx(limit, rel=1e-9)
-        assert trainer.pitch_held_um == pytest.approx(
-            limit, rel=1e-9
-        )  # and it says that it was held
+        # and it says that it was held
+        assert trainer.pitch_held_um == pytest.approx(limit, rel=1e-9)
 
 
 def test_budgets_of_a_run_are_trained_in_turn():
@@ -305,9 +300,8 @@ def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
     assert record.loss > 1e4
     pairs = zip(before, trainer.model.net.parameters(), strict=True)
     longest = max(float((a - b.detach()).square().mean().sqrt()) for a, b in pairs)
-    assert (
-        0 < longest < trainer.inner.weights.rate
-    )  # with what is left of the momentum before
+    # with what is left of the momentum before
+    assert 0 < longest < trainer.inner.weights.rate
 
 
 def test_only_the_weights_of_the_network_decay():

@@ -17,10 +17,8 @@ SMALL = {
     "inner": {"steps": 4, "batch": 8},
     "sensor": {"bits": 16},
 }
-TRUE = {
-    "optics": {"image_tolerance": 0.4},
-    "scenes": {"pixels": 32},
-}  # few nodes of the true image over the field
+# few nodes of the true image over the field
+TRUE = {"optics": {"image_tolerance": 0.4}, "scenes": {"pixels": 32}}
 
 
 def _going(change=None, frozen=()):
@@ -97,9 +95,8 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
         one, other = (
             getattr(trainer.model, names[part]).grad for trainer in (plain, moved)
         )
-        assert float((one - other).norm()) <= 5e-2 * float(one.norm()), (
-            part
-        )  # a count that falls the other way: 1e-2
+        # a count that falls the other way: 1e-2
+        assert float((one - other).norm()) <= 5e-2 * float(one.norm()), part
     for name, p in plain.model.net.named_parameters():
         assert there[name].shape == p.shape
 

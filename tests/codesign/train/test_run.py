@@ -120,9 +120,8 @@ def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_withi
     steps = run.train_run(first, tmp_path / "part")
     next(steps), next(steps)
     second = run.resume_run(tmp_path / "part", settings)
-    assert (
-        second.trainer.step == 1
-    )  # the checkpoint of the second step is written after the record is taken
+    # the checkpoint of the second step is written after the record is taken
+    assert second.trainer.step == 1
     list(run.train_run(second, tmp_path / "part"))
     births = search.search_architectures(second, tmp_path / "part")
     next(births), next(births)
@@ -213,9 +212,8 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     pixels = math.ceil(settings.scenes.pixels * settings.optics.sample_um / pitch)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, pixels, pixels), chosen)
-    assert (
-        going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS
-    )  # taken by slices: not counted
+    # taken by slices: not counted
+    assert going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS
 
 
 def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys):

@@ -16,12 +16,8 @@ from layout.formats.library import (
 )
 from layout.mask.plan import PillarArray
 
-NAMES = (
-    "THIN",
-    "",
-    "WIDER_ONE",
-    "MIDST",
-)  # of unequal length; the second class has no cell and does not occur
+# of unequal length; the second class has no cell and does not occur
+NAMES = ("THIN", "", "WIDER_ONE", "MIDST")
 
 
 def assembly(block, turn=5):

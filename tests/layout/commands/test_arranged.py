@@ -160,9 +160,8 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
         # step of the grid
         assert {(p.x, p.y) for p in found} == wanted
         pads = db.Region(there.top_cell().begin_shapes_rec(there.layer(1, 1)))
-        assert pads.count() == 60 * len(
-            dies
-        )  # 1.5 of the dose: a datatype of their own
+        # 1.5 of the dose: a datatype of their own
+        assert pads.count() == 60 * len(dies)
         assert pads.area() == 60 * len(dies) * 2000 * 1000
     sizes = [
         (tmp_path / "m" / file).stat().st_size for file in ("mask.gds", "mask.oas")

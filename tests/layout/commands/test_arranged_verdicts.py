@@ -113,9 +113,8 @@ def test_shapes_of_a_file_without_corrected_doses_fail_and_are_said(
         )
         assert "proximity correction" in said
         assert "passes its own checks" not in said
-    assert (
-        run(folder, text, target, "plain.toml") == 0
-    )  # one dose is what was asked for
+    # one dose is what was asked for
+    assert run(folder, text, target, "plain.toml") == 0
     table = folder / "doses.csv"
     table.write_text("layer,datatype,relative_dose\n1,0,0.87\n")
     try:

@@ -144,9 +144,8 @@ def test_a_corrected_mask_is_certified_and_hands_on_its_lens(
         lens.load(path).diameters.diameter_um
         for path in (target / "made.h5", lens_file)
     )
-    assert (
-        np.abs(made - designed).max() < 2.1e-3
-    )  # half a step of 2 nm, and 1 nm of the exposure
+    # half a step of 2 nm, and 1 nm of the exposure
+    assert np.abs(made - designed).max() < 2.1e-3
     assert (target / "fields.csv").read_text().startswith("sequence,")
     assert "The mask passes its own checks." in (target / "job.txt").read_text()
 

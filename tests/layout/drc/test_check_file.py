@@ -177,9 +177,8 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "no space below 70 nm, minimum width 170.0 nm" in told
     assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
-    values = json.loads(
-        capsys.readouterr().out, parse_constant=pytest.fail
-    )  # no Infinity, which JSON does not know
+    # no Infinity, which JSON does not know
+    values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert (values["minimum_space_nm"], values["minimum_width_nm"]) == (None, 170.0)
 
 
@@ -225,9 +224,8 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
         read_mask(path), DesignRules(minimum_gap_nm=50, minimum_feature_nm=102)
     )
     assert thin.counts["width"] == 20
-    assert (
-        thin.minimum_space_nm == 49
-    )  # of the first row and column to the bar: 100 less 51
+    # of the first row and column to the bar: 100 less 51
+    assert thin.minimum_space_nm == 49
     assert not region.space_check(50, False, db.Region.Euclidian).is_empty()
     assert region.space_check(49, False, db.Region.Euclidian).is_empty()
 

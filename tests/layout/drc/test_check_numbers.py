@@ -148,9 +148,8 @@ def test_windows_reach_over_the_last_rows_and_columns():
     small = check_plan(
         plan, dataclasses.replace(LOOSE, maximum_density=0.1, density_window_um=0.1)
     )
-    assert small.maximum_density == pytest.approx(
-        320 * 200 / (400 * 300)
-    )  # a window is two pillars wide at least
+    # a window is two pillars wide at least
+    assert small.maximum_density == pytest.approx(320 * 200 / (400 * 300))
 
 
 def test_feet_are_told_once_a_lattice():

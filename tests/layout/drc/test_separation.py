@@ -11,14 +11,8 @@ from layout.drc.geometry import contour_edges, measure_separation
 from tests.referees.convex import convex_gap
 
 ANGLE = np.array([(0, 0), (900, 0), (900, 100), (120, 100), (120, 700), (0, 700)])
-HOLE = [
-    (800, 500),
-    (800, 200),
-    (200, 200),
-    (200, 800),
-    (800, 800),
-    (800, 500),
-]  # cut in along y = 500
+# cut in along y = 500
+HOLE = [(800, 500), (800, 200), (200, 200), (200, 800), (800, 800), (800, 500)]
 RING = np.array(
     [(0, 0), (1000, 0), (1000, 500), *HOLE, (1000, 500), (1000, 1000), (0, 1000)]
 )
@@ -55,9 +49,8 @@ def test_a_triangle_beside_an_angle(dx, dy, wanted):
 
 
 def test_what_lies_in_a_hole_that_is_cut_in_is_apart_and_what_lies_on_the_ring_is_not():
-    assert (
-        distance(RING, TURNED, 500, 350) == 110
-    )  # its lowest corner at 310, the hole begins at 200
+    # its lowest corner at 310, the hole begins at 200
+    assert distance(RING, TURNED, 500, 350) == 110
     assert distance(RING, TURNED, 100, 100) == 0
     assert distance(RING, TURNED, 740, 500) == 0  # across the cut
     big = np.array([(-5000, -4000), (5000, -4000), (5000, 6000), (-5000, 6000)])

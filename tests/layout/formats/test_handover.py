@@ -79,9 +79,8 @@ def test_areas_of_both_tones_are_the_die():
         * 1e-6
     )
     positive = library_of(layout.plan(lens_map(), PROCESS, furnished=False)).areas_um2()
-    assert positive[1, 0] == pytest.approx(
-        lens, rel=2e-3
-    )  # steps of 2 nm average out, polygons to 1e-3
+    # steps of 2 nm average out, polygons to 1e-3
+    assert positive[1, 0] == pytest.approx(lens, rel=2e-3)
 
 
 def test_the_charge_is_dose_times_area(made):

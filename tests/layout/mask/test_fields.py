@@ -131,9 +131,8 @@ def test_the_loss_is_what_the_variance_of_the_ramps_says():
                 weights=weight,
             )
         )
-    assert 1 - report.strehl.mean() == pytest.approx(
-        np.mean(want), rel=0.2
-    )  # sampled peak, two sets of 400 draws
+    # sampled peak, two sets of 400 draws
+    assert 1 - report.strehl.mean() == pytest.approx(np.mean(want), rel=0.2)
 
 
 def test_the_clearance_is_that_of_what_is_drawn():
@@ -143,6 +142,5 @@ def test_the_clearance_is_that_of_what_is_drawn():
     plan = fields.split_write_fields(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
     drawn_um = float(bias.written_diameter_nm(250.0)) * 1e-3
     assert drawn_um > 0.269  # drawn wider by what the process takes
-    assert plan.clearance_um == pytest.approx(
-        (0.4 - drawn_um) / 2, abs=0.5e-3
-    )  # half a diameter step, halved
+    # half a diameter step, halved
+    assert plan.clearance_um == pytest.approx((0.4 - drawn_um) / 2, abs=0.5e-3)

@@ -65,10 +65,8 @@ def middles(bars, axis):
 def test_a_shift_of_n_steps_makes_bar_n_meet_and_no_other(axis, n):
     made = process()
     (drawn, opened), _, _ = parts(layout.plan(lens_map(), made), made)
-    still, moved = (
-        middles(drawn, axis),
-        middles(opened, axis) - n * STEP_NM,
-    )  # d = n (p1 - p2)
+    # d = n (p1 - p2)
+    still, moved = (middles(drawn, axis), middles(opened, axis) - n * STEP_NM)
     assert len(still) == len(moved) == 21
     assert np.flatnonzero(still == moved).tolist() == [10 + n]
     assert set(np.diff(still)) == {1000 * PITCH_UM}
@@ -88,9 +86,8 @@ def test_middle_bars_are_longer_and_both_scales_lie_side_by_side():
             one[:, 1 - axis].min() - two[:, 3 - axis].max(),
             two[:, 1 - axis].min() - one[:, 3 - axis].max(),
         )
-        assert (
-            max(between) == 4000
-        )  # twice the 2 um from the film's edge, on one side of it
+        # twice the 2 um from the film's edge, on one side of it
+        assert max(between) == 4000
 
 
 def test_a_box_in_a_box_has_equal_margins_that_differ_by_twice_a_shift():

@@ -48,9 +48,8 @@ def test_drawn_diameters_are_within_half_a_step(step, seed):
     assert np.array_equal(found.classes > 0, there)
     drawn = found.diameters_nm[found.classes[there].astype(int) - 1]
     wanted = Process().written_diameter_nm(source.diameter_um[there] * 1e3)
-    assert (
-        np.abs(drawn - wanted).max() <= step / 2 + 1 / 16
-    )  # the table of designed diameters has 1/16 nm
+    # the table of designed diameters has 1/16 nm
+    assert np.abs(drawn - wanted).max() <= step / 2 + 1 / 16
     assert np.array_equal(np.bincount(found.classes.ravel())[1:], found.counts)
 
 
@@ -131,9 +130,8 @@ def test_the_axis_of_the_lens_is_the_origin_and_coordinates_are_those_of_the_len
     lattice = plan.lattices[0]
     half = (n - 1) * 200
     assert (lattice.x0, lattice.y0) == (-half, half)
-    assert (
-        lattice.whole()[n - 1, n - 1] == 1
-    )  # the map's first row, at negative y, is the lowest of the mask
+    # the map's first row, at negative y, is the lowest of the mask
+    assert lattice.whole()[n - 1, n - 1] == 1
     assert plan.axis == (0, 0)
 
 

@@ -132,12 +132,10 @@ def test_every_turned_pillar_is_drawn_at_its_place_and_turn(tmp_path, suffix):
         corners = there[round(1e3 * d.x_um[column]), round(1e3 * d.y_um[row])]
         turn, area = axis_of(corners)
         off = (turn - d.angle_rad[row, column] + math.pi / 2) % math.pi - math.pi / 2
-        assert (
-            abs(math.degrees(off)) < 0.5 + 0.35
-        )  # half a step of the turns; corners on the grid: 1 nm of 120
-        assert area == pytest.approx(
-            240 * 132, rel=0.012
-        )  # half a nm along each edge of 240 and 132
+        # half a step of the turns; corners on the grid: 1 nm of 120
+        assert abs(math.degrees(off)) < 0.5 + 0.35
+        # half a nm along each edge of 240 and 132
+        assert area == pytest.approx(240 * 132, rel=0.012)
 
 
 @pytest.mark.parametrize(
@@ -152,9 +150,8 @@ def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(
     tmp_path, shape, area
 ):
     made = lens(shape, turned=False, rows=12, columns=12)
-    d = dataclasses.replace(
-        made.diameters, diameter_um=np.full((12, 12), 0.24)
-    )  # the map is symmetric, the shape not
+    # the map is symmetric, the shape not
+    d = dataclasses.replace(made.diameters, diameter_um=np.full((12, 12), 0.24))
     _, found = written(dataclasses.replace(made, diameters=d), tmp_path, "oas")
     assert len(found) == 144
     assert (
@@ -197,10 +194,8 @@ def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, sh
     plan, found = written(made, tmp_path, "gds")
     placed = {(x, y): np.ptp(corners, axis=0) for x, y, corners in found}
     assert len(found) == there.sum()
-    d, grid = (
-        made.diameters,
-        1.0 if shape.kind == "rectangle" else 2.0,
-    )  # corners of ellipses keep the area
+    # corners of ellipses keep the area
+    d, grid = (made.diameters, 1.0 if shape.kind == "rectangle" else 2.0)
     for row, column in np.argwhere(there):
         at = (
             round(1e3 * d.x_um[column] + plan.axis[0]),
@@ -227,9 +222,8 @@ def test_pillars_of_a_hexagonal_lattice_stand_on_it(tmp_path, suffix):
         np.abs(got[np.lexsort(got.T)] - want[np.lexsort(np.rint(want).T)]).max() < 1e-6
     )
     apart = np.hypot(*(got[:, None] - got).T)
-    assert np.sort(apart[apart > 0])[0] == pytest.approx(
-        336, abs=0.02
-    )  # hypot(168, 291) = 336.01
+    # hypot(168, 291) = 336.01
+    assert np.sort(apart[apart > 0])[0] == pytest.approx(336, abs=0.02)
 
 
 def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
@@ -267,9 +261,8 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
             foot_nm=np.array([c.diameter_nm + 20.0 for c in plan.classes]),
         )
         assert found.minimum_space_nm == pytest.approx(least)
-        assert found.minimum_foot_space_nm == pytest.approx(
-            least - 20, abs=1.1
-        )  # round ones by circles
+        # round ones by circles
+        assert found.minimum_foot_space_nm == pytest.approx(least - 20, abs=1.1)
         assert found.shapes == len(rows)
 
 
@@ -313,15 +306,13 @@ def test_edges_of_a_lone_pillar_of_any_shape_move_by_what_it_lacks(shape):
     number, kinds = drawn_of(made, LONE)
     among, lone = kinds[number[15, 8]], kinds[number[15, 28]]
     spread = np.ptp(lone.outline, axis=0) - np.ptp(among.outline, axis=0)
-    assert (
-        np.abs(spread - 14).max() <= 1
-    )  # corners on a grid of 1 nm on both sides, both of the same design
+    # corners on a grid of 1 nm on both sides, both of the same design
+    assert np.abs(spread - 14).max() <= 1
     edge = kinds[number[15, 21]]  # at a straight rim
     lost = sum(math.exp(-((0.4 * i / 0.6) ** 2)) for i in range(1, 9))
     share = lost * (1 + 2 * lost) / ((1 + 2 * lost) ** 2 - 1)
-    assert (
-        abs(edge.diameter_nm - 200 - 14 * share) <= 1.01
-    )  # a step of 2 nm; the other side 1.4 of half a step
+    # a step of 2 nm; the other side 1.4 of half a step
+    assert abs(edge.diameter_nm - 200 - 14 * share) <= 1.01
     assert (
         np.abs(
             np.ptp(edge.outline, axis=0) - np.ptp(among.outline, axis=0) - 14 * share
@@ -561,9 +552,8 @@ def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
         assert not is_kept(math.floor(value) + 1)
     outline = made.cell.outline(0.22)
     solid, space = (1e3 * v for v in outline.spans_um)
-    assert found.minimum_width_nm == pytest.approx(
-        solid, abs=1.5
-    )  # corners on a grid of 1 nm
+    # corners on a grid of 1 nm
+    assert found.minimum_width_nm == pytest.approx(solid, abs=1.5)
     assert found.minimum_space_nm <= space + 1.5
 
 
@@ -573,15 +563,12 @@ def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
         PROCESS.rules, minimum_feature_nm=65, minimum_gap_nm=105
     )
     found = check_plan(build.plan(made, PROCESS, furnished=False), rules)
-    few = int(
-        (made.diameters.diameter_um == 0.22).sum()
-    )  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
+    # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
+    few = int((made.diameters.diameter_um == 0.22).sum())
     assert found.counts["width"] == few
     assert found.counts["notch"] == few
-    assert {round(v.value) for v in found.violations} == {
-        60,
-        98,
-    }  # flats of the circles stand on whole nm
+    # flats of the circles stand on whole nm
+    assert {round(v.value) for v in found.violations} == {60, 98}
 
 
 @pytest.mark.parametrize("kind", ["rectangular", "hexagonal"])
@@ -650,9 +637,8 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
     (stays, _, die), (drawn, area, _) = found
     assert (drawn & stays).is_empty()
     assert ((drawn + stays) ^ die).is_empty()
-    assert area == sum(
-        p.area2() for p in drawn.each()
-    )  # nothing is drawn (and exposed) twice
+    # nothing is drawn (and exposed) twice
+    assert area == sum(p.area2() for p in drawn.each())
     assert (
         check_plan(plan, PROCESS.rules).shapes > (made.diameters.diameter_um > 0).sum()
     )

@@ -86,9 +86,8 @@ def test_deep_inside_equal_pillars_the_background_is_their_density():
     dose, _ = corrected(DiameterMap(np.full((101, 101), 0.24), PITCH), settings)
     density = np.pi / 4 * 0.24**2 / PITCH**2
     own = rim_of_own_disc(0.24, 0.01) / 1.6
-    want = 0.5 / (
-        own + 0.6 / 1.6 * density
-    )  # the edge is 6.7 beta away; the lattice sum has no ripple
+    # the edge is 6.7 beta away; the lattice sum has no ripple
+    want = 0.5 / (own + 0.6 / 1.6 * density)
     assert dose[50, 50] == pytest.approx(float(want), rel=1.2e-3)  # half a class
 
 
@@ -125,9 +124,8 @@ def test_a_measured_function_is_corrected_like_the_formula_it_was_made_from(tmp_
     dose, _ = corrected(written, exposure(csv=table, tolerance=0.01))
     edges = exact_edges(written, dose, truth)
     spread = edges / edges.mean() - 1
-    assert (
-        abs(spread).max() < 0.01 + 0.015
-    )  # dose classes, and 1 % of energy that the fit puts elsewhere
+    # dose classes, and 1 % of energy that the fit puts elsewhere
+    assert abs(spread).max() < 0.01 + 0.015
 
 
 def test_fewer_doses_than_needed_are_used_where_the_writer_holds_no_more():

@@ -65,9 +65,8 @@ def test_a_rectangle_and_its_hole_are_products_of_error_functions():
         )
 
     want = plain(0.13, 0.06) - plain(0.05, 0.021)
-    assert shape.exposure_at(1, at, width) == pytest.approx(
-        want, abs=1e-6
-    )  # four Gauss points on 0.8 widths
+    # four Gauss points on 0.8 widths
+    assert shape.exposure_at(1, at, width) == pytest.approx(want, abs=1e-6)
 
 
 def level_of_a_rectangle(a, b):

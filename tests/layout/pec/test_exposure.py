@@ -37,9 +37,8 @@ def test_exposure_by_a_disc_is_the_integral_of_the_point_exposure(distance, widt
     points = disc_points(0.1)
     r2 = (points[:, 0] - distance) ** 2 + points[:, 1] ** 2
     want = np.exp(-r2 / width**2).mean() * 0.1**2 / width**2
-    assert disc_exposure(distance, 0.2, width) == pytest.approx(
-        want, rel=1e-3
-    )  # the sum over 40 000 points: 5e-4
+    # the sum over 40 000 points: 5e-4
+    assert disc_exposure(distance, 0.2, width) == pytest.approx(want, rel=1e-3)
 
 
 @pytest.mark.parametrize("width", [0.002, 0.01, 0.1, 1.0, 30.0])
@@ -55,9 +54,8 @@ def test_own_rim_and_its_slope_are_the_disc_seen_at_its_radius(width):
 
 
 def test_a_wide_disc_clears_at_one_half():
-    assert rim_of_own_disc(200.0, 0.01) == pytest.approx(
-        0.5, abs=1e-4
-    )  # curvature: a / (2 sqrt(pi) D)
+    # curvature: a / (2 sqrt(pi) D)
+    assert rim_of_own_disc(200.0, 0.01) == pytest.approx(0.5, abs=1e-4)
 
 
 def test_the_double_gaussian_holds_all_energy_in_the_asked_ratio():
@@ -130,9 +128,8 @@ def test_the_error_of_a_fit_is_against_the_integral_of_its_table():
     radius = np.array([1.0, 4.0, 9.0])
     density = np.array([1.0, 1 / 8, 1 / 8 * (4 / 9) ** 2])
     rings = np.array([4 * np.pi * (2 - 1), 2 * np.pi * density[1] * 16 * np.log(9 / 4)])
-    narrow = PointExposure(
-        np.array([1e-6]), np.array([1.0])
-    )  # all of its energy lies within the first radius
+    # all of its energy lies within the first radius
+    narrow = PointExposure(np.array([1e-6]), np.array([1.0]))
     assert _fit_error(narrow, radius, density) == pytest.approx(rings.sum(), rel=1e-9)
     whole = PointExposure(np.array([2.7]), np.array([1.0]))
     within = np.exp(-((1 / 2.7) ** 2)) - np.exp(-((radius[1:] / 2.7) ** 2))

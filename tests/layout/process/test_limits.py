@@ -31,9 +31,8 @@ def test_designs_at_the_limits_are_drawn_within_the_rules(tmp_path, text):
         layout.plan(DiameterMap(sizes, 0.4), rules, furnished=False), rules.rules
     )
     assert found.ok, found.summary
-    assert (
-        found.minimum_space_nm < 90 + 10
-    )  # and they give away no more than a step or two
+    # and they give away no more than a step or two
+    assert found.minimum_space_nm < 90 + 10
     assert found.minimum_width_nm < 100 + 10
 
 

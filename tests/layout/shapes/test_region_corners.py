@@ -10,9 +10,8 @@ TRIANGLE = np.array([[10, -20], [70, -10], [30, 50]])
 def test_a_triangle_stays():
     (found,) = region.union_contours([TRIANGLE])
     assert len(found) == 3
-    assert (
-        abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10
-    )  # of the sides (60, 10) and (20, 70)
+    # of the sides (60, 10) and (20, 70)
+    assert abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10
 
 
 def test_a_triangle_cut_off_a_square_is_left():
@@ -34,9 +33,8 @@ def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
     assert len(pieces) == 2
     corners = {tuple(p) for p in np.concatenate([square, hole]).tolist()}
     assert {tuple(p) for piece in pieces for p in piece.tolist()} == corners
-    assert all(
-        len(np.unique(piece, axis=0)) == len(piece) for piece in pieces
-    )  # no way there and back
+    # no way there and back
+    assert all(len(np.unique(piece, axis=0)) == len(piece) for piece in pieces)
     assert sum(map(polygon.twice_area, pieces)) == 2 * 401 * 400 - polygon.twice_area(
         hole
     )

@@ -60,9 +60,8 @@ def test_the_reduced_sum_is_the_plain_sum_at_all_depths_and_for_a_collimated_bea
     exact = plain_sum.field(lens, amplitude(lens), where)
     ready = focus.prepare_focus(lens, where)
     fast = ready.light(ready.project(amplitude(lens)[None].astype(np.complex64)))[0]
-    assert (
-        abs(fast - exact).max() < 3e-6 * abs(exact).max()
-    )  # float32 sums of 1e4 terms
+    # float32 sums of 1e4 terms
+    assert abs(fast - exact).max() < 3e-6 * abs(exact).max()
 
 
 def test_shifted_pillars_send_their_light_from_where_they_are():
@@ -117,9 +116,8 @@ def test_light_behind_films_is_that_of_plane_waves_through_them():
     rough = RNG.uniform(0.7, 1.0, lit.shape) * np.exp(
         1j * RNG.normal(0, 0.2, lit.shape)
     )
-    aimed = (
-        rough * np.exp(-2j * np.pi / 0.85 * (x**2 + y**2) / (2 * 104.0)) * lit
-    )  # near the focus
+    # near the focus
+    aimed = rough * np.exp(-2j * np.pi / 0.85 * (x**2 + y**2) / (2 * 104.0)) * lit
     media = [(1.31, 150.0 - 62.0), (1.52, 55.0), (2.1, 7.0)]
     stack = films.Stack(media, wavelength=0.85, step=0.4, count=800)
     at = np.array([395, 398, 399, 402, 407])

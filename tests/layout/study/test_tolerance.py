@@ -192,12 +192,10 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
     report = tolerance.analyse_tolerance(
         lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10
     )
-    near = 1 / (
-        1 / 1500 + 3.5 * 0.85 / lens.diameters.radius_um**2
-    )  # the rim 1.75 waves out; beyond: ten times as far
-    assert report.step_um == pytest.approx(
-        9 * near / 50, rel=0.02
-    )  # both ends rounded to two digits
+    # the rim 1.75 waves out; beyond: ten times as far
+    near = 1 / (1 / 1500 + 3.5 * 0.85 / lens.diameters.radius_um**2)
+    # both ends rounded to two digits
+    assert report.step_um == pytest.approx(9 * near / 50, rel=0.02)
     where = dataclasses.replace(
         report.window, depths_um=np.array([1200.0, 1200.0 + report.step_um])
     )
@@ -342,13 +340,10 @@ def test_sensitivities_agree_with_an_independent_solver():
     lean = 0.008
     leans = (dataclasses.replace(cell, sidewall_rad=sign * lean) for sign in (-1, 1))
     wall = rate(*leans, lean, 3e-4)  # 1.3 % from that at 1e-4, at a quarter of its cost
-    assert (
-        abs(found.rates[0, 0] / height - 1) < 0.03
-    )  # truncation of the plane waves: 1 to 2 % here
+    # truncation of the plane waves: 1 to 2 % here
+    assert abs(found.rates[0, 0] / height - 1) < 0.03
     assert abs(found.rates[1, 0] / index - 1) < 0.05
-    assert (
-        abs(found.rates[2, 0] / wall - 1) < 0.08
-    )  # and 4 %; differences at four harmonics had the other sign
-    assert (
-        2 * np.pi / 0.85 < found.rates[0, 0].imag < 2 * np.pi / 0.85 * 3.6
-    )  # between air and bulk
+    # and 4 %; differences at four harmonics had the other sign
+    assert abs(found.rates[2, 0] / wall - 1) < 0.08
+    # between air and bulk
+    assert 2 * np.pi / 0.85 < found.rates[0, 0].imag < 2 * np.pi / 0.85 * 3.6

@@ -19,10 +19,8 @@ from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from tests.referees import plain_sum
 
 X_UM, Y_UM = np.linspace(0.1, 0.3, 51), np.linspace(0.12, 0.28, 41)  # one step of 4 nm
-LIGHTS = {
-    "x": (19.0, 9.0, 0.93),
-    "y": (8.0, 21.0, 0.97),
-}  # rad per um of width and of length, |t| of the thinnest
+# rad per um of width and of length, |t| of the thinnest
+LIGHTS = {"x": (19.0, 9.0, 0.93), "y": (8.0, 21.0, 0.97)}
 
 
 def formula(width_um, length_um, light):

@@ -204,7 +204,6 @@ def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
     made = rows.lens(designed)
     d, want = made.diameters.diameter_um, designed.diameters.diameter_um
     assert np.array_equal(d > 0, want > 0)
-    assert (
-        np.abs(d - want)[want > 0].max() < 2.1e-3
-    )  # 1 nm of the step, 1 nm of the exposure
+    # 1 nm of the step, 1 nm of the exposure
+    assert np.abs(d - want)[want > 0].max() < 2.1e-3
     assert made.profile == "as-written"

@@ -58,9 +58,8 @@ def corrected(source, process, **options):
 def lens(shape, lattice, sizes, turned, empty=0.25):
     """Sizes at random on a round aperture off the centre, a share of the sites empty."""
     pitch, rng = 0.4, np.random.default_rng(23)
-    rows, columns = (
-        (21, 33) if lattice.centred else (9, 11) if turned else (19, 17)
-    )  # each turn has its own polygon
+    # each turn has its own polygon
+    rows, columns = (21, 33) if lattice.centred else (9, 11) if turned else (19, 17)
     row_um = 0.346 if lattice.centred else None
     d = np.rint(1e3 * rng.uniform(*sizes, (rows, columns))) * 1e-3
     y = np.arange(rows)[:, None] - (rows - 1) / 2
@@ -150,9 +149,8 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     made = rows.lens(source).diameters.diameter_um
     want = source.diameters.diameter_um
     assert np.array_equal(made > 0, want > 0)
-    assert (
-        np.abs(made - want).max() < 2.1e-3
-    )  # 1 nm of the step of sizes, 1 nm of the exposure, the grid
+    # 1 nm of the step of sizes, 1 nm of the exposure, the grid
+    assert np.abs(made - want).max() < 2.1e-3
 
 
 def certified(content, plan, table, process):

@@ -27,9 +27,8 @@ def test_it_lands_where_a_traced_ray_does(case, angle):
     found = chief_ray(made(case), (math.radians(angle), 0.0), depth)
     at = rays.middle(angle, depth)
     assert found.at_um == pytest.approx(at, abs=1e-6)
-    assert found.meets_um == pytest.approx(
-        rays.lands(at, angle, depth), abs=6e-4
-    )  # 2e-6 of the distance
+    # 2e-6 of the distance
+    assert found.meets_um == pytest.approx(rays.lands(at, angle, depth), abs=6e-4)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -79,9 +78,8 @@ def test_foci_of_scattered_phases_differ_by_their_error():
     for seed in range(40):
         rough = chief_ray(made("off-centre", scatter_rad=0.2, seed=seed), angle, 1900.0)
         off.append((rough.focus_um - even.focus_um) / rough.focus_error_um)
-    assert np.sqrt(np.mean(np.square(off), 0)) == pytest.approx(
-        [1.0, 1.0], abs=0.34
-    )  # 11 % each, three of them
+    # 11 % each, three of them
+    assert np.sqrt(np.mean(np.square(off), 0)) == pytest.approx([1.0, 1.0], abs=0.34)
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.24)
     assert rough.focus_error_um.min() > 20 * even.focus_error_um.max()
 
@@ -151,9 +149,8 @@ def test_the_middle_of_a_lens_is_that_of_its_pillars():
         "map",
     )
     found = chief_ray(half)
-    assert found.at_um == pytest.approx(
-        [4 * 62.0 / (3 * math.pi), 0.0], abs=0.3
-    )  # centroid of half a disc
+    # centroid of half a disc
+    assert found.at_um == pytest.approx([4 * 62.0 / (3 * math.pi), 0.0], abs=0.3)
     assert found.meets_um == pytest.approx([0.0, 0.0], abs=2e-3)
 
 

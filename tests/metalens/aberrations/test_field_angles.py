@@ -67,9 +67,8 @@ def _counted(case, angle, step_um):
     """
     rays, depth = CASES[case]
     middle, out = rays.middle(angle, depth), np.zeros(2)
-    reach = (
-        np.arange(-60.0, 60.1, step_um) + 0.137
-    )  # about the middle of what the hole lights
+    # about the middle of what the hole lights
+    reach = np.arange(-60.0, 60.1, step_um) + 0.137
     for x in reach + middle[0]:
         for y in reach + middle[1]:
             u = rays.crossing((x, y), angle, depth)
@@ -108,9 +107,8 @@ def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
     """
     rays, depth = CASES[case]
     level = made(case).diameters
-    each = (
-        3 if rays.stop else 11
-    )  # the border of the stop's light is cut at random: 0.15 % of it
+    # the border of the stop's light is cut at random: 0.15 % of it
+    each = 3 if rays.stop else 11
     place = [
         (x, y)
         for x in level.x_um[1::each]

@@ -89,9 +89,8 @@ def test_shapes_alike_along_x_and_y_follow_their_lattice():
     assert not Cell(0.5, shape=Rectangle(1.3)).is_isotropic
     assert not Cell(0.5, shape=RegularPolygon(5)).is_isotropic
     assert Cell(0.5, shape=RegularPolygon(6), lattice=hexagonal).is_isotropic
-    assert Cell(
-        0.5, shape=RegularPolygon(3, 0.2), lattice=hexagonal
-    ).is_isotropic  # by thirds of a turn
+    # by thirds of a turn
+    assert Cell(0.5, shape=RegularPolygon(3, 0.2), lattice=hexagonal).is_isotropic
     assert not Cell(0.5, shape=RegularPolygon(4), lattice=hexagonal).is_isotropic
     assert not Cell(0.5, lattice=Lattice("rectangular", 1.2)).is_isotropic
 
@@ -142,9 +141,8 @@ def test_sizes_end_where_a_foot_a_pedestal_or_a_coat_comes_near_and_where_a_top_
     )
     layered = Cell(pitch, 0.7, shape=Square(), layers=pedestal)
     assert layered.widening_um == pytest.approx((-0.04, 0.09))
-    assert layered.widest_um(0.06) == pytest.approx(
-        0.98 * pitch - 0.09, abs=0.002
-    )  # the boundary is stepped
+    # the boundary is stepped
+    assert layered.widest_um(0.06) == pytest.approx(0.98 * pitch - 0.09, abs=0.002)
     assert layered.size_um(0.03) == pytest.approx(0.04 + 0.02 * pitch)
 
 
@@ -214,9 +212,8 @@ def test_silica_ends_where_its_source_does():
     for wavelength_um in (0.2099, 3.7101):
         with pytest.raises(MaterialError, match=r"from 0.21 to 3.71 um"):
             materials.index("SiO2", wavelength_um)
-    assert materials.index("SiO2", 0.2101).real == pytest.approx(
-        1.5383, abs=3e-4
-    )  # Malitson's table: 1.53836 at 0.21
+    # Malitson's table: 1.53836 at 0.21
+    assert materials.index("SiO2", 0.2101).real == pytest.approx(1.5383, abs=3e-4)
 
 
 def test_a_table_in_nanometres_is_that_in_micrometres(tmp_path):

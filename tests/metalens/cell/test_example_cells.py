@@ -19,10 +19,8 @@ from metalens.library import axes
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"
 FILES = sorted(FOLDER.glob("*.toml"))
-COARSE = {
-    "samples": 80,
-    "tolerance": 1e-2,
-}  # of 40, more than half of the error would be the proxy's, and be refused
+# of 40, more than half of the error would be the proxy's, and be refused
+COARSE = {"samples": 80, "tolerance": 1e-2}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -48,9 +46,8 @@ def test_the_titania_pitch_keeps_the_aperture_it_promises():
 def test_widest_pillar_leaves_the_gap():
     wanted = config.load(FOLDER / "a_si_rectangle_940.toml", CellFile)
     size = wanted.cell.widest_um(0.06)
-    assert size == pytest.approx(
-        0.40 - 0.06, abs=0.004
-    )  # rows of rectangles along x are the nearest
+    # rows of rectangles along x are the nearest
+    assert size == pytest.approx(0.40 - 0.06, abs=0.004)
     assert math.isclose(
         config.load(FOLDER / "tio2_532.toml", CellFile).cell.widest_um(0.05), 0.27
     )
@@ -147,9 +144,8 @@ def test_rectangles_with_geometric_phase_from_toml_to_mask(tmp_path, capsys):
     light = found["circular"]
     assert light["hand"] == "right"
     assert light["converted"] > 0.95
-    assert (
-        light["converted"] + light["unconverted"] <= 1 + light["converted_error"]
-    )  # the rest is reflected
+    # the rest is reflected
+    assert light["converted"] + light["unconverted"] <= 1 + light["converted_error"]
     shown = main(
         [
             "psf",

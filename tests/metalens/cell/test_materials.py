@@ -22,9 +22,8 @@ ROUNDING = 1e-14  # of a few sums and products below 4: 4e-16 each
     [(0.4861327, 1.46313), (0.5875618, 1.45846), (0.6562725, 1.45637)],
 )
 def test_fused_silica_at_the_fraunhofer_lines(wavelength_um, want):
-    assert (
-        abs(materials.index("SiO2", wavelength_um) - want) < 5.1e-6
-    )  # catalogue values, five decimals
+    # catalogue values, five decimals
+    assert abs(materials.index("SiO2", wavelength_um) - want) < 5.1e-6
 
 
 @pytest.mark.parametrize(
@@ -77,9 +76,8 @@ def test_own_table_with_shuffled_columns_and_comments(tmp_path: Path):
     assert materials.index(str(file), 0.8) == 3.5 + 0.1j
     assert materials.find_material(str(file)).source == "run 7, ellipsometer"
     file.write_text("wavelength_um,n,k\n0.8,2,0\n0.9,2,0\n")
-    assert (
-        abs(materials.index(str(file), 0.85) - 2) < ROUNDING
-    )  # a file that changed is read again
+    # a file that changed is read again
+    assert abs(materials.index(str(file), 0.85) - 2) < ROUNDING
 
 
 @pytest.mark.parametrize("mark", [";", "\t"])

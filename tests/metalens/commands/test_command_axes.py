@@ -49,9 +49,8 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
     assert told["failures"] == []
     assert told["usable"] == 1.0
     library = axes.load_axes_library(tmp_path / "axes.h5")
-    assert (
-        told["entries"] == library.t_error.size == 24 * 17
-    )  # 17 steps of 150/23 nm are more than the 110 nm along x
+    # 17 steps of 150/23 nm are more than the 110 nm along x
+    assert told["entries"] == library.t_error.size == 24 * 17
     assert np.diff(library.x_um) == pytest.approx(np.diff(library.y_um)[0])
     assert "cell.toml" in library.provenance.inputs
     i, j = 9, 17
@@ -61,9 +60,8 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
     )
     assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
     panels = artefacts.axes_panels(tmp_path / "axes.h5")
-    assert panels[1].values[1, 0, j, i] == pytest.approx(
-        abs(library.t[0, i, j, 1, 1])
-    )  # rows of the image: along y
+    # rows of the image: along y
+    assert panels[1].values[1, 0, j, i] == pytest.approx(abs(library.t[0, i, j, 1, 1]))
     assert main(["view", str(tmp_path / "axes.h5"), "--quiet"]) == 0
 
 

@@ -59,9 +59,8 @@ def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
     light = Incidence(0.83, np.radians(12.0), "y")
     grid = {"x_um": held["x_um"], "y_um": held["y_um"], "z_um": [0.1, 0.3]}
     same = rcwa.near_field(cell, 0.2, light, **grid, tolerance=0.5)
-    assert (
-        np.abs(held["xy/h"] - same.h).max() < 1e-9 * np.abs(same.h).max()
-    )  # products of other widths: three planes
+    # products of other widths: three planes
+    assert np.abs(held["xy/h"] - same.h).max() < 1e-9 * np.abs(same.h).max()
     assert np.array_equal(held["xy/index"], same.index)
     assert stored.attributes["error_xy"] == pytest.approx(same.error, rel=1e-6)
     assert stored.attributes["wavelength_um"] == 0.83
@@ -97,9 +96,8 @@ def test_a_bar_above_the_tolerance_is_a_failure(here, monkeypatch, capsys):
         "FAILED: xz, yz, xy above the tolerance 1e-06 at 13 orders: allow a larger one; fields"
         in told
     )
-    assert (
-        main([*WORDS[:-2], "--force"]) == 0
-    )  # none is stated: what is reached is told
+    # none is stated: what is reached is told
+    assert main([*WORDS[:-2], "--force"]) == 0
     told = capsys.readouterr().out
     assert (
         "  xz, yz, xy above the tolerance 0.1 at 13 orders: allow a larger one" in told

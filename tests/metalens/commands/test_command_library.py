@@ -84,9 +84,8 @@ def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
 def test_a_proxy_that_misses_its_tolerances_fails_its_check(cell, tmp_path, capsys):
     assert cell(QUICK + "[proxy]\nphase_tolerance_rad = 1e-15\n") == 1
     told = capsys.readouterr().out
-    assert (
-        "a lens needs 1: the pillars cover 1." in told
-    )  # more samples, not another cell
+    # more samples, not another cell
+    assert "a lens needs 1: the pillars cover 1." in told
     assert "where 1e-15 and" in told
     assert any(
         "where 1e-15 and" in note
@@ -261,14 +260,12 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
     )  # a stretch this short
     found = json.loads((out / "cell_study.json").read_text())
     assert found["study"]["min_diameter_um"] >= 0.31
-    assert (
-        0.23 <= found["study"]["min_gap_um"] < 0.24
-    )  # 0.24 between drawn polygons, whose flats lie inside the circle
+    # 0.24 between drawn polygons, whose flats lie inside the circle
+    assert 0.23 <= found["study"]["min_gap_um"] < 0.24
     verdict = found["verdicts"][0]
     assert verdict["pitch_um"] == 0.62
-    assert verdict["max_angle_deg"] == pytest.approx(
-        48.9, abs=0.4
-    )  # sin = 1.55/0.62 - 1.7462
+    # sin = 1.55/0.62 - 1.7462
+    assert verdict["max_angle_deg"] == pytest.approx(48.9, abs=0.4)
     capsys.readouterr()
     path.write_text(ANY_CELL.replace("[cell]", 'pillar = "Si"\n[cell]'))
     assert main(["study", str(path), "-o", str(out), "--force"]) == 2

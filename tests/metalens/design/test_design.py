@@ -49,9 +49,8 @@ def test_hyperbolic_phase_makes_all_paths_equal():
     path = np.hypot(x, 2000.0) + np.hypot(x, 20_000.0)
     phase = profiles.hyperbolic_phase(x, np.zeros(1), FOCUS)
     total = phase + 2 * np.pi / 0.85 * (path - 22_000.0)
-    assert (
-        np.abs(total).max() < 1e-8
-    )  # double precision of a path of 2.2e4 um times k = 7.4: 3e-11 relative
+    # double precision of a path of 2.2e4 um times k = 7.4: 3e-11 relative
+    assert np.abs(total).max() < 1e-8
 
 
 @given(st.floats(1.0, 1e3), st.floats(10.0, 1e5))
@@ -92,9 +91,8 @@ def test_every_pillar_makes_the_wanted_phase(proxy):
     d = made.diameters
     wanted = profiles.hyperbolic_phase(d.x_um, d.y_um[:, None], FOCUS)
     error = np.angle(np.exp(1j * (made.phase_rad() - wanted)))[d.diameter_um > 0]
-    assert (
-        np.abs(error).max() < 2e-5
-    )  # float32 diameters: 2e-8 um x 90 rad/um, and the proxy's inverse
+    # float32 diameters: 2e-8 um x 90 rad/um, and the proxy's inverse
+    assert np.abs(error).max() < 2e-5
     assert quality.max_phase_error_rad < 2e-5
     assert quality.strehl == pytest.approx(
         made.transmission()[d.diameter_um > 0].mean() ** 2
@@ -209,9 +207,8 @@ def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):
         proxy=proxy,
     )
     with pytest.raises(LensError, match=r"phase of shape \(20,\) .*need \(20, 20\)"):
-        make(
-            lambda x, y: profiles.hyperbolic_phase(x, y, focus)
-        )  # positions along the diagonal alone
+        # positions along the diagonal alone
+        make(lambda x, y: profiles.hyperbolic_phase(x, y, focus))
     with pytest.raises(LensError, match=r"phase of shape \(\) "):
         make(lambda x, y: 0.0)
 
@@ -264,9 +261,8 @@ def test_profiles_at_a_site_off_both_axes():
     of x and y unlike.
     """
     focus, x, y, radius = Focus(0.94, 210.0, 930.0), 7.0, -4.0, 11.0
-    paths = sum(
-        math.hypot(x, y, z) - z for z in (210.0, 930.0)
-    )  # 0.15 um of 210: 13 digits are left
+    # 0.15 um of 210: 13 digits are left
+    paths = sum(math.hypot(x, y, z) - z for z in (210.0, 930.0))
     focal = -2 * math.pi / 0.94 * paths
     assert float(
         profiles.hyperbolic_phase(np.array(x), np.array(y), focus)

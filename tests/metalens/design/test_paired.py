@@ -84,9 +84,8 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
     wrong = dataclasses.replace(
         made_lens.for_polarization("y"), sensor_distance_um=NEAR.sensor_distance_um
     )
-    assert (
-        design.check_focus(wrong, axial=False).figures.strehl < 0.7
-    )  # a depth of focus away
+    # a depth of focus away
+    assert design.check_focus(wrong, axial=False).figures.strehl < 0.7
     assert split.leaked == pytest.approx((LEAK**2, LEAK**2 / 4))
     assert split.wavefront_efficiency_error[0] == pytest.approx(
         2 * math.sqrt(split.x.wavefront_efficiency) * 0.01 + 1e-4
@@ -174,9 +173,8 @@ def test_one_phase_for_both_keeps_any_polarisation():
 def test_less_than_a_turn_is_stated():
     _, split = made(both=False, library=library((0.6, 0.6)))
     assert split.x.strehl < 0.95
-    assert (
-        split.x.max_phase_error_rad > 0.8
-    )  # 0.2 turns beyond either end, and the steps
+    # 0.2 turns beyond either end, and the steps
+    assert split.x.max_phase_error_rad > 0.8
 
 
 def test_what_is_not_printed_is_not_used_and_nothing_left_is_refused():

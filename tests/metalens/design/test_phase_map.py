@@ -18,9 +18,8 @@ from metalens.design.profiles import PhaseMap
 STEP = 2.0
 X = (np.arange(24) - 11.5) * STEP
 Y = (np.arange(20) - 9.5) * STEP
-PHASE = (
-    0.02 * X + 0.05 * Y[:, None] + 0.001 * X * Y[:, None]
-)  # no symmetry: a turned or mirrored axis shows
+# no symmetry: a turned or mirrored axis shows
+PHASE = 0.02 * X + 0.05 * Y[:, None] + 0.001 * X * Y[:, None]
 
 
 def zemax_text(phase, *, step_mm=STEP * 1e-3, unit=0, dec=(0.0, 0.0), nodata=()):
@@ -43,9 +42,8 @@ def write(folder, kind):
         np.savetxt(path, PHASE, delimiter=",", fmt="%.17g")
     elif kind == "csv-semicolon":
         text = "\n".join(";".join(f"{v:.17g}" for v in row) for row in PHASE)
-        path.write_text(
-            "\ufeff" + text, encoding="utf-8"
-        )  # Excel starts with a byte-order mark
+        # Excel starts with a byte-order mark
+        path.write_text("\ufeff" + text, encoding="utf-8")
     elif kind in (
         "csv-decimal-comma",
         "txt-decimal-comma",
@@ -89,9 +87,8 @@ def test_every_format_gives_the_same_samples(tmp_path, kind):
     x, y = np.array([-7.3, 0.0, 12.1]), np.array([-15.2, 3.3])
     got = phase_map.interpolate_phase(samples, x, y)
     want = 0.02 * x + 0.05 * y[:, None] + 0.001 * x * y[:, None]
-    assert got == pytest.approx(
-        want, abs=2e-4
-    )  # phasors turn by 0.15 rad a step: error of the chord 0.15³/60
+    # phasors turn by 0.15 rad a step: error of the chord 0.15³/60
+    assert got == pytest.approx(want, abs=2e-4)
 
 
 def test_zemax_units_and_decentre(tmp_path):
@@ -101,9 +98,8 @@ def test_zemax_units_and_decentre(tmp_path):
         )
         samples = phase_map.read_phase_map(PhaseMap(tmp_path / "g.dat"))
         assert samples.step_um == pytest.approx((STEP, STEP), rel=1e-12)
-        assert samples.centre_um == pytest.approx(
-            (4.0, -6.0), rel=1e-9
-        )  # up in the file is -y here
+        # up in the file is -y here
+        assert samples.centre_um == pytest.approx((4.0, -6.0), rel=1e-9)
         shifted = phase_map.interpolate_phase(
             samples, np.array([4 + X[5]]), np.array([Y[3] - 6])
         )
@@ -111,9 +107,8 @@ def test_zemax_units_and_decentre(tmp_path):
 
 
 def test_points_without_data_matter_inside_the_aperture_alone(tmp_path):
-    (tmp_path / "g.dat").write_text(
-        zemax_text(PHASE, nodata={0, 1, 24})
-    )  # the upper left corner
+    # the upper left corner
+    (tmp_path / "g.dat").write_text(zemax_text(PHASE, nodata={0, 1, 24}))
     samples = phase_map.read_phase_map(PhaseMap(tmp_path / "g.dat"))
     assert np.isnan(samples.phase_rad).sum() == 3
     x = np.linspace(-17, 17, 30)

@@ -94,18 +94,16 @@ def test_no_other_diameter_and_no_other_piston_lowers_the_sum_over_wavelengths(t
         _, near, far = paths(lens, focus)
         phases.append(-2 * np.pi / focus.wavelength_um * (near + far))
     t = answers(size, ACHROMATIC)
-    pistons = np.angle(
-        (t * np.exp(-1j * np.array(phases))).sum(1)
-    )  # the best for these pillars
+    # the best for these pillars
+    pistons = np.angle((t * np.exp(-1j * np.array(phases))).sum(1))
     goal = np.exp(1j * (np.array(phases) + pistons[:, None]))
     found = weights @ np.abs(t - goal) ** 2
     every = answers(np.linspace(*SPAN, 20_001), ACHROMATIC)
     least = np.array(
         [(weights @ np.abs(every - one[:, None]) ** 2).min() for one in goal.T]
     )
-    assert (
-        (found - least).max() < 2e-3
-    )  # pistons settled to 1e-3 rad: 1e-3 times the slope of a sum, about 2
+    # pistons settled to 1e-3 rad: 1e-3 times the slope of a sum, about 2
+    assert (found - least).max() < 2e-3
     assert (found - least).mean() < 2e-5
 
 
@@ -137,9 +135,8 @@ def test_what_serves_all_serves_the_others_better_than_a_lens_for_one():
         abs((t * np.exp(2j * np.pi / RED * (near + far))).sum()) ** 2
         / np.abs(t).sum() ** 2
     )
-    assert (
-        own[0].strehl > 0.99
-    )  # of one wavelength nothing is given up but for |T|, which varies
+    # of one wavelength nothing is given up but for |T|, which varies
+    assert own[0].strehl > 0.99
     assert strehl < 0.02
     assert min(one.strehl for one in qualities) > 0.25
     assert lens.wavelength_um == GREEN
@@ -180,9 +177,8 @@ def test_two_wavelengths_meet_at_distances_of_their_own():
     )
     found = design.check_focus(lens, expected=qualities[0].strehl)
     assert found.passed
-    assert found.figures.strehl == pytest.approx(
-        qualities[0].strehl, abs=0.02
-    )  # weights of the paths' lengths
+    # weights of the paths' lengths
+    assert found.figures.strehl == pytest.approx(qualities[0].strehl, abs=0.02)
 
 
 @pytest.mark.parametrize(

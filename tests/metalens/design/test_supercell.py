@@ -60,9 +60,8 @@ def test_energy_holds_and_a_mirrored_row_mirrors_its_orders(polarization):
     )
     assert there.energy == pytest.approx(1, abs=1e-9)
     assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
-    assert (
-        abs(there.order(1) - there.order(-1)) > 0.05
-    )  # the row is not its own mirror image
+    # the row is not its own mirror image
+    assert abs(there.order(1) - there.order(-1)) > 0.05
 
 
 @pytest.mark.parametrize("polarization", ["x", "y"])
@@ -123,9 +122,8 @@ def test_weak_pillars_do_not_feel_their_neighbours():
         supercell.solve_row(GLASS, [d], WAVE, polarization="y", harmonics=2).order(0)
         for d in row
     ]
-    assert whole.order(0) == pytest.approx(
-        np.mean(alone), abs=2e-3
-    )  # second order: (0.2 rad)² / 20
+    # second order: (0.2 rad)² / 20
+    assert whole.order(0) == pytest.approx(np.mean(alone), abs=2e-3)
     assert np.abs(np.diff(alone)).max() > 0.03
 
 
@@ -161,9 +159,8 @@ def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     assert (change < 0.6).all()
     model = found.at(found.sine, np.where(found.diagonal, np.pi / 4, 0.0))
     assert np.abs(model - power).max() < 0.5 * change.max()  # two terms for three rows
-    assert found.at(np.array(0.0)) == pytest.approx(
-        1.0
-    )  # nothing turned, nothing changed
+    # nothing turned, nothing changed
+    assert found.at(np.array(0.0)) == pytest.approx(1.0)
     assert np.abs(found.coarse - found.factor).max() > 0
 
 
@@ -253,9 +250,8 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     assert np.angle(predicted) < -0.3  # late, not early
     assert np.angle(whole) == pytest.approx(np.angle(predicted), abs=0.06)
     assert abs(whole) == pytest.approx(abs(predicted), abs=0.12)
-    assert (
-        abs(solved[0][0]) < abs(solved[1][0]) - 0.05
-    )  # light along the row loses more
+    # light along the row loses more
+    assert abs(solved[0][0]) < abs(solved[1][0]) - 0.05
     assert (np.abs(found.factor[0]) < np.abs(found.factor[1]) - 0.05)[:2].all()
 
 

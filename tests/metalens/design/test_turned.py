@@ -68,13 +68,11 @@ def test_every_pillar_gives_the_light_of_its_hand_the_wanted_phase(hand, sign):
     assert (d.diameter_um[there] == np.float32(SIZE)).all()
     assert 0 <= d.angle_rad.min() <= d.angle_rad.max() < math.pi
     come = np.array([1, 1j * sign]) / math.sqrt(2)
-    leave = (
-        isolated(T_X, T_Y, d.angle_rad.astype(float)[there]) @ come @ come
-    )  # the part of the other hand
+    # the part of the other hand
+    leave = isolated(T_X, T_Y, d.angle_rad.astype(float)[there]) @ come @ come
     wanted = phase(d.x_um, d.y_um)[there]
-    assert (
-        np.abs(np.angle(leave * np.exp(-1j * wanted))).max() < 2e-6
-    )  # float32 turns: 2 pi 2^-24 of twice the turn
+    # float32 turns: 2 pi 2^-24 of twice the turn
+    assert np.abs(np.angle(leave * np.exp(-1j * wanted))).max() < 2e-6
     assert np.allclose(
         leave, (lens.transmission() * np.exp(1j * lens.phase_rad()))[there], atol=2e-6
     )
@@ -156,9 +154,8 @@ def test_sites_of_a_hexagonal_lens_fill_the_aperture_about_a_pillar_on_the_axis(
     reach = np.hypot(*np.meshgrid(d.x_um, d.y_um))[d.diameter_um > 0].max()
     assert 11.0 - 0.168 - 0.336 < reach <= 11.0 - 0.168
     area = quality.pillars * d.site_um2
-    assert area == pytest.approx(
-        math.pi * (11.0 - 0.168) ** 2, rel=0.01
-    )  # pillars of the rim: 0.4 um of 22
+    # pillars of the rim: 0.4 um of 22
+    assert area == pytest.approx(math.pi * (11.0 - 0.168) ** 2, rel=0.01)
     assert quality.sampled_aperture == pytest.approx(0.85 / (math.sqrt(3) * 0.336))
     assert quality.steepest == pytest.approx(math.sin(math.atan(11 / 33)), rel=0.02)
 
@@ -191,9 +188,8 @@ def test_its_focus_lies_where_it_should_with_the_light_of_the_closed_form(hexago
         stack.intensity[0, 0][radius < 0.61 * 0.85 / math.sin(math.atan(11 / 33))].sum()
         * stack.energy_um2[0, 0]
     )
-    assert core / given == pytest.approx(
-        0.838, abs=0.03
-    )  # Airy; NA 0.32 and the edge of the pixels: 2 %
+    # Airy; NA 0.32 and the edge of the pixels: 2 %
+    assert core / given == pytest.approx(0.838, abs=0.03)
 
 
 def test_a_lattice_too_coarse_for_the_rim_is_told():

@@ -117,9 +117,8 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
     assert rows["height_nm"] == pytest.approx(1j * k * here, rel=1e-9)
     by_index = (effective(d, n + 1e-5) - effective(d, n - 1e-5)) / 2e-5
     assert rows["index"] == pytest.approx(1j * k * h * by_index, rel=1e-5)
-    z = (
-        np.arange(400) + 0.5
-    ) / 400 * h - h / 2  # a frustum: D + 2 z tan(wall), to second order in the wall
+    # a frustum: D + 2 z tan(wall), to second order in the wall
+    z = (np.arange(400) + 0.5) / 400 * h - h / 2
 
     def phase(lean):
         at = d[:, None] + 2 * z * lean
@@ -132,9 +131,8 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
 
     by_wall = (phase(wall + 1e-4) - phase(wall - 1e-4)) / 2e-4
     assert rows["sidewall_deg"] == pytest.approx(1j * by_wall, rel=1e-4)
-    by_diameter = (
-        1j * k * h * guide.slope
-    )  # of one side, the mean of both polarisations: half of it
+    # of one side, the mean of both polarisations: half of it
+    by_diameter = 1j * k * h * guide.slope
     assert rows["width_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert rows["length_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert not rows["turn_deg"].any()

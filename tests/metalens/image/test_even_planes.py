@@ -199,9 +199,8 @@ def test_derivatives_by_the_psfs_and_by_depth_are_those_of_the_direct_sum():
     vergence = (1 / deep).requires_grad_()
     (made.surface(one, 1 / vergence)[0] * slope).sum().backward()
     want = float(slope.square().sum())
-    assert float(vergence.grad.sum()) == pytest.approx(
-        want, rel=0.05
-    )  # five depth nodes
+    # five depth nodes
+    assert float(vergence.grad.sum()) == pytest.approx(want, rel=0.05)
 
 
 def test_two_sheets_of_one_depth_image_as_one_plane():

@@ -79,9 +79,8 @@ def test_bounds_match_the_scatter_of_the_best_estimate():
     estimates = np.linalg.lstsq(
         a, 0.5 * rng.standard_normal((a.shape[0], 4000)), rcond=None
     )[0]
-    assert estimates.std(1) == pytest.approx(
-        bound, rel=0.05
-    )  # 4000 draws: 1.1 % of standard error
+    # 4000 draws: 1.1 % of standard error
+    assert estimates.std(1) == pytest.approx(bound, rel=0.05)
 
 
 def test_encircled_energy_of_a_gaussian():
@@ -102,15 +101,13 @@ def test_axial_information_of_a_moving_spot_is_known():
     value = fisher.axial_information(
         near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5
     )
-    assert float(value) == pytest.approx(
-        1.0**2 / (2 * 12**2), rel=0.01
-    )  # pixel box widens w² by p²/12: 0.1 %
+    # pixel box widens w² by p²/12: 0.1 %
+    assert float(value) == pytest.approx(1.0**2 / (2 * 12**2), rel=0.01)
     by_sum = fisher.axial_information(
         near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5, normalisation="sum"
     )
-    ratio = 1.5**2 / (
-        4 * math.pi * 12**2
-    )  # sum of squares over square of sum, of a Gaussian
+    # sum of squares over square of sum, of a Gaussian
+    ratio = 1.5**2 / (4 * math.pi * 12**2)
     assert float(by_sum / value) == pytest.approx(ratio, rel=0.02)
 
 
@@ -165,9 +162,8 @@ def test_hyperbolic_lens_has_the_known_honest_information():
         )
         for b in (1, 2, 3)
     ]
-    assert honest == pytest.approx(
-        [0.24, 0.09, 0.045], rel=0.06
-    )  # measured apart, in a paraxial model
+    # measured apart, in a paraxial model
+    assert honest == pytest.approx([0.24, 0.09, 0.045], rel=0.06)
 
 
 def test_texture_information_ignores_where_the_light_lands():
@@ -249,9 +245,8 @@ def test_texture_information_is_that_of_differences_of_the_power():
             torch.rand(5, columns // 2 + 1, generator=generator, dtype=torch.float64)
             + 0.5
         )
-        half[:, 0] = (
-            half[:, 0] + half[:, 0].roll(1).flip(0)
-        ) / 2  # a real texture: S(f) = S(-f)
+        # a real texture: S(f) = S(-f)
+        half[:, 0] = (half[:, 0] + half[:, 0].roll(1).flip(0)) / 2
         if columns % 2 == 0:
             half[:, -1] = (half[:, -1] + half[:, -1].roll(1).flip(0)) / 2
         found = fisher.texture_information(psf, step_um=170.0, spectrum=half, noise=0.3)

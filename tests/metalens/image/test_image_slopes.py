@@ -85,9 +85,8 @@ def test_the_mean_over_all_draws_is_the_gradient_of_the_loss(case):
         with_psfs(made, *node_psfs(_optics(whole), made.plan))(frames) ** 2
     ).sum().backward()
     assert abs(float(whole.grad)) > 1e-3
-    assert float(strength.grad) == pytest.approx(
-        float(whole.grad), rel=1e-4
-    )  # float32 sums in another order
+    # float32 sums in another order
+    assert float(strength.grad) == pytest.approx(float(whole.grad), rel=1e-4)
 
 
 def test_a_draw_is_one_of_the_terms(case):

@@ -41,9 +41,8 @@ def test_a_window_holds_what_a_round_aperture_sends_there(period, within):
         window=window,
     )
     p = 150.0 / math.hypot(150.0, 2200.0)
-    x = (np.arange(640) + 0.5) * (
-        4 * 9.6 / 640
-    )  # a quarter of it, out to where the last sample ends
+    # a quarter of it, out to where the last sample ends
+    x = (np.arange(640) + 0.5) * (4 * 9.6 / 640)
     shown = np.clip(4 - x / 9.6, 0, 1)  # Σ of the triangles
     v = 2 * math.pi / 0.85 * p * np.hypot(x, x[:, None])
     airy = math.pi * (p / 0.85) ** 2 * (2 * j1(v) / v) ** 2
@@ -95,6 +94,5 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
     )
     found = normalise_psfs(light[None], optics, plan)[1][0, :, 0]
     want = [_relative(t, depth_um, thick_um, n) for t in (0.01, slope)]
-    assert float(found[1] / found[0]) == pytest.approx(
-        want[1] / want[0], rel=6e-3
-    )  # waves at the edge 0.18 / N, 3e-3
+    # waves at the edge 0.18 / N, 3e-3
+    assert float(found[1] / found[0]) == pytest.approx(want[1] / want[0], rel=6e-3)

@@ -133,9 +133,8 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
         value, slope = found(AWAY)
     want, steep = found(torch.device("cpu"))
     assert value == pytest.approx(want, rel=1e-5)
-    assert slope.numpy() == pytest.approx(
-        steep.numpy(), rel=1e-4
-    )  # phases are single precision: 1e-5 of a turn
+    # phases are single precision: 1e-5 of a turn
+    assert slope.numpy() == pytest.approx(steep.numpy(), rel=1e-4)
 
 
 def test_one_psf_a_depth_images_elsewhere():

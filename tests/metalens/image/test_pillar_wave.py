@@ -39,9 +39,8 @@ def lens():
     wanted = np.remainder(
         profiles.hyperbolic_phase(x, x[:, None], focus) - 0.2, 2 * math.pi
     )
-    wanted += (
-        2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
-    )  # into the range of the proxy
+    # into the range of the proxy
+    wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
     diameter = 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi)
     diameter = np.where(np.hypot(x, x[:, None]) <= 50.0, diameter, 0.0)
     cell = Cell(pitch_um=PITCH, pillar=Index(3.6), substrate=Index(1.45))
@@ -81,9 +80,8 @@ def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
         optics, 0.85, Window(SAMPLES, STEP), (at, torch.tensor([4e3]))
     )
     true = float(texture_error(got.double() / got.sum(), want / want.sum()))
-    assert (
-        0.5 * true < said < 2 * true
-    )  # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
+    # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
+    assert 0.5 * true < said < 2 * true
 
 
 ROWS = NeighbourRows(
@@ -134,9 +132,8 @@ def _differentiates(lens):
     window = Window(9, STEP)
     weight = torch.linspace(0.3, 1.9, 81).reshape(9, 9)
     step = torch.zeros_like(diameter)
-    step[150:200, 90:170] = (
-        diameter[150:200, 90:170] > 0
-    ) * 1e-3  # a patch beside the axis grows
+    # a patch beside the axis grows
+    step[150:200, 90:170] = (diameter[150:200, 90:170] > 0) * 1e-3
 
     def score(d):
         optics = Optics(PillarWave(lens, diameter_um=d), Layers(), DISTANCE)

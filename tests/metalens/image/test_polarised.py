@@ -28,14 +28,8 @@ from metalens.psf import (
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
 
-RADIUS, DISTANCE, FOCUS, STEP, WINDOW, WAVE = (
-    25.0,
-    60.0,
-    5000.0,
-    1.2,
-    21,
-    0.85,
-)  # NA 0.38
+# NA 0.38
+RADIUS, DISTANCE, FOCUS, STEP, WINDOW, WAVE = (25.0, 60.0, 5000.0, 1.2, 21, 0.85)
 LENS = SmoothWave(Focus(WAVE, DISTANCE, FOCUS), RADIUS)
 OPTICS = Optics(LENS, Layers(), DISTANCE)
 REFEREE = Referee(
@@ -83,9 +77,8 @@ def test_psfs_of_both_polarisations_are_those_of_plane_waves(place, depth, kind,
     error = float(texture_error(got, want))
     assert error < 6e-3
     three = _psf(OPTICS, place, depth, 3, flux=kind == "flux")
-    assert (
-        float(texture_error(three, want)) < error + 1.5e-3
-    )  # what three components leave
+    # what three components leave
+    assert float(texture_error(three, want)) < error + 1.5e-3
     scalar = float(texture_error(_psf(OPTICS, place, depth, 0, flux=True), want))
     if kind == "flux":
         assert scalar < error + 1e-3  # the scalar is the flux to the fourth order in NA
@@ -145,9 +138,8 @@ def test_a_pixel_counts_flux_and_an_image_says_what_one_scalar_misses_of_it():
         assert (made.plan.window.components > 0) == (polarisation != "auto")
         if tolerance < 1e-2:
             assert made.parts["polarisation"] < 2e-3  # of the scalar at NA 0.38 too
-    apart = (
-        energy - flux
-    )  # 1e-2 of the image: what a choice of one for the other would miss
+    # 1e-2 of the image: what a choice of one for the other would miss
+    apart = energy - flux
     assert np.linalg.norm(
         images["vector"] - images["flux"] - apart
     ) < 0.4 * np.linalg.norm(apart)
@@ -176,9 +168,8 @@ def test_mixtures_of_the_components_image_as_the_components_do():
     assert torch.allclose(
         mixed / mixed.sum(), plain / plain.sum(), rtol=1e-9, atol=1e-12
     )
-    assert float(mixed.sum()) == pytest.approx(
-        99 * float((weight**2).sum()), rel=1e-12
-    )  # Parseval
+    # Parseval
+    assert float(mixed.sum()) == pytest.approx(99 * float((weight**2).sum()), rel=1e-12)
     few = dominant_components(VectorPupil(parts, (1.0,) * 6), weight, 2)
     assert float(((few.pupils * weight) ** 2).sum()) == pytest.approx(
         float((weight**2).sum()), rel=1e-12
@@ -210,9 +201,8 @@ def test_the_gradient_of_both_polarisations_is_that_of_differences():
     step = 1e-2 * torch.eye(2, dtype=torch.float64)
     with torch.no_grad():
         wide = torch.stack([score(at + s) - score(at - s) for s in step]) / 2e-2
-    assert torch.allclose(
-        slope, wide, rtol=5e-3, atol=5e-3 * float(wide.abs().max())
-    )  # float32, steps of 1e-2
+    # float32, steps of 1e-2
+    assert torch.allclose(slope, wide, rtol=5e-3, atol=5e-3 * float(wide.abs().max()))
 
 
 def test_a_count_of_components_that_there_is_not_is_refused():

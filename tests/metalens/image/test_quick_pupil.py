@@ -76,9 +76,8 @@ def test_blur_of_defocus_is_the_geometric_disc():
     width = math.sqrt(float((image * s[:, None] ** 2).sum() / image.sum()))
     r = np.linspace(0, 500, 4001)
     cosine = 2000 / np.hypot(r, 2000)
-    landing = (
-        r * (1 / np.hypot(r, 9e3) - 1 / np.hypot(r, 18e3)) * 2000 / cosine**3
-    )  # oblique rays land further out
+    # oblique rays land further out
+    landing = r * (1 / np.hypot(r, 9e3) - 1 / np.hypot(r, 18e3)) * 2000 / cosine**3
     disc = math.sqrt((landing**2 * r).sum() / r.sum() / 2)
     assert width == pytest.approx(disc, rel=0.02)  # diffraction at the rim
 

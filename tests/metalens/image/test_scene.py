@@ -76,9 +76,8 @@ def test_compiled_weights_give_the_image_of_the_differentiable_path():
     frames = _eye()
     exact = _imager()(frames)
     quick = _imager(STACK.float())(_single(frames))
-    assert (
-        float((quick - exact).norm() / exact.norm()) < 2e-5
-    )  # depths that round to the next of 4096 codes
+    # depths that round to the next of 4096 codes
+    assert float((quick - exact).norm() / exact.norm()) < 2e-5
 
 
 def test_a_sharp_near_edge_hides_a_blurred_far_sheet():
@@ -106,9 +105,8 @@ def test_one_depth_is_an_ordinary_convolution():
     kernel = _stack(torch.tensor([2.0]))
     image = _imager(kernel, torch.tensor([20e3]))(flat)
     want = torch.nn.functional.conv2d(light, kernel[None])[:, 0]
-    assert (
-        image[:, 15:-15, 15:-15] - want
-    ).abs().max() < 2e-6 * want.max()  # rounding of the transforms
+    # rounding of the transforms
+    assert (image[:, 15:-15, 15:-15] - want).abs().max() < 2e-6 * want.max()
 
 
 def test_an_off_centre_psf_moves_the_image_the_same_way():
@@ -117,9 +115,8 @@ def test_an_off_centre_psf_moves_the_image_the_same_way():
     frames = _eye()
     image = _imager(kernel, torch.tensor([20e3]))(frames)
     moved = frames.radiance.sum(1)[:, 10:88, 10:85]
-    assert (
-        image[:, 12:90, 15:90] - moved
-    ).abs().max() < 4e-3  # far sheet under 1 % of coverage fades
+    # far sheet under 1 % of coverage fades
+    assert (image[:, 12:90, 15:90] - moved).abs().max() < 4e-3
 
 
 def _psfs_of(layers):
@@ -153,9 +150,8 @@ def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
         return imager(Frames(light, frames.coverage, frames.depth_um))
 
     slope = torch.func.jvp(seen, (frames.radiance,), (change,))[1]
-    assert (
-        float((slope - seen(change)).abs().max()) < 2e-5
-    )  # the two paths' depth codes
+    # the two paths' depth codes
+    assert float((slope - seen(change)).abs().max()) < 2e-5
 
 
 def test_gradient_reaches_the_psfs():
@@ -179,9 +175,8 @@ def test_gradient_reaches_the_psfs():
     slope = (energy(STACK + step * direction) - energy(STACK - step * direction)) / (
         2 * step
     )
-    assert float((psfs.grad * direction).sum()) == pytest.approx(
-        float(slope), rel=1e-3
-    )  # kink where coverage reaches 1
+    # kink where coverage reaches 1
+    assert float((psfs.grad * direction).sum()) == pytest.approx(float(slope), rel=1e-3)
 
 
 def test_mismatched_depths_and_shapes_are_refused():

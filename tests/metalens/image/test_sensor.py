@@ -19,9 +19,8 @@ IMAGE = torch.rand(40, 52, dtype=torch.float64) + 0.1
 def test_coinciding_edges_give_the_exact_area_sum():
     binned = integrate_pixels(IMAGE, 1.0, pitch_um=4.0)
     want = IMAGE.reshape(10, 4, 13, 4).sum((1, 3))
-    assert (
-        (binned - want).abs().max() < 1e-12
-    )  # the cubic passes through the cumulative at every sample edge
+    # the cubic passes through the cumulative at every sample edge
+    assert (binned - want).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("pitch", [2.0, 2.37, math.pi, 7.77, 10.0])
@@ -134,9 +133,8 @@ def test_low_snr_mode_has_the_stated_ratio():
     mean = sensors.mean_electrons(flat, 3.0, sensor=dim)[2:-2, 2:-2]
     frame = sensors.expose(mean, sensor=dim, generator=torch.Generator().manual_seed(2))
     signal = float(mean.mean()) - dim.ambient_e
-    assert 20 * math.log10(signal / float(frame.std())) == pytest.approx(
-        15, abs=0.1
-    )  # sd of 9e4 pixels: 0.02 dB
+    # sd of 9e4 pixels: 0.02 dB
+    assert 20 * math.log10(signal / float(frame.std())) == pytest.approx(15, abs=0.1)
     assert float(sensors.variance(mean, sensor=dim).mean()) == pytest.approx(
         float(frame.var()), rel=0.03
     )
@@ -178,9 +176,8 @@ def test_noise_of_a_pixel_has_photon_read_and_rounding_parts():
         sensors.variance(torch.tensor(401.0, dtype=torch.float64), sensor=sensor)
     )
     assert told == pytest.approx(401 + 5.3**2 + step**2 / 12, rel=1e-12)
-    mean = torch.linspace(
-        3000, 3000 + 12 * step, 400_000, dtype=torch.float64
-    )  # over whole steps: rounding is even
+    # over whole steps: rounding is even
+    mean = torch.linspace(3000, 3000 + 12 * step, 400_000, dtype=torch.float64)
     frame = sensors.digitise(
         sensors.expose(mean, sensor=sensor, generator=torch.Generator().manual_seed(5)),
         sensor=sensor,
@@ -196,12 +193,10 @@ def test_reads_add_their_noise_and_the_well_caps_the_light():
     frame = sensors.expose(
         mean, sensor=ODD, generator=torch.Generator().manual_seed(6), reads=3.0
     )
-    assert float(frame.mean()) == pytest.approx(
-        53.7, abs=0.1
-    )  # 11.8 / sqrt(2e5) = 0.026
-    assert float(frame.var()) == pytest.approx(
-        53.7 + 3 * 5.3**2, rel=0.02
-    )  # sqrt(2 / 2e5) = 0.003
+    # 11.8 / sqrt(2e5) = 0.026
+    assert float(frame.mean()) == pytest.approx(53.7, abs=0.1)
+    # sqrt(2 / 2e5) = 0.003
+    assert float(frame.var()) == pytest.approx(53.7 + 3 * 5.3**2, rel=0.02)
     full = sensors.expose(
         mean * 1e4, sensor=ODD, generator=torch.Generator().manual_seed(7)
     )

@@ -96,9 +96,8 @@ def _error(optics, light):
 
 def test_the_image_of_a_texture_errs_by_no_more_than_it_says(optics):
     assert optics.error < 1.2e-2
-    assert (
-        _error(optics, _texture()) < optics.error
-    )  # 8 kinds of error, none of them the referee's: its rounding is 1e-12
+    # 8 kinds of error, none of them the referee's: its rounding is 1e-12
+    assert _error(optics, _texture()) < optics.error
 
 
 def test_single_bright_points_lie_where_and_are_as_bright_as_the_referee_has_them(
@@ -145,9 +144,8 @@ def test_films_behind_the_lens_are_in_the_image():
     )
     scaled = got.double() * (want.sum() / got.sum())
     assert float(texture_error(scaled, want)) < 6e-3  # rim and fold, as in air
-    assert float(got.sum() / want.sum()) == pytest.approx(
-        0.96, abs=4e-3
-    )  # 4 % of one face at normal incidence
+    # 4 % of one face at normal incidence
+    assert float(got.sum() / want.sum()) == pytest.approx(0.96, abs=4e-3)
     assert float(texture_error(bare.double(), want)) > 0.02
 
 
@@ -260,9 +258,8 @@ def test_compiled_and_differentiable_paths_give_one_image(optics):
         )
     )
     assert slow.requires_grad
-    assert (
-        float((quick - slow.detach()).norm() / quick.norm()) < 1e-5
-    )  # single precision
+    # single precision
+    assert float((quick - slow.detach()).norm() / quick.norm()) < 1e-5
 
 
 def test_frames_of_one_sheet_are_imaged_as_a_near_sheet_too_faint_to_hide_makes_them(
@@ -275,9 +272,8 @@ def test_frames_of_one_sheet_are_imaged_as_a_near_sheet_too_faint_to_hide_makes_
     touched = alone.coverage.clone()
     touched[0, 0, 3, 2], touched[0, 1, 3, 2] = 1e-6, 1 - 1e-6
     both = optics(Frames(alone.radiance, touched, alone.depth_um))
-    assert (
-        float((optics(alone) - both).norm() / both.norm()) < 2e-5
-    )  # single precision, and the 1e-6
+    # single precision, and the 1e-6
+    assert float((optics(alone) - both).norm() / both.norm()) < 2e-5
 
 
 @pytest.mark.parametrize("kind", ["coma", "defocus"])

@@ -24,10 +24,8 @@ DEPTH = 5000.0
 STEP = 9.6
 WINDOW = 9
 HOLE, GAP, MIDDLE = 25.0, 60.0, (3.0, -2.0)
-FIELD = (
-    math.radians(35.0),
-    math.radians(-6.0),
-)  # along x 24 to 44 degrees: from 0.8 of the light to nothing
+# along x 24 to 44 degrees: from 0.8 of the light to nothing
+FIELD = (math.radians(35.0), math.radians(-6.0))
 GRID = Grid((2, 11), STEP, (3000.0, 9000.0), margin=WINDOW // 2, window=WINDOW)
 FINE = 0.6
 
@@ -160,9 +158,8 @@ def test_derivatives_of_light_through_a_stop_from_the_side_are_differences_of_pl
         sum((m + t / DISTANCE * depth) ** 2 for m, t in zip(MIDDLE, place, strict=True))
         / (depth - GAP) ** 2
     )
-    level = (
-        (1 + slope2) / (1 + (place[0] ** 2 + place[1] ** 2) / DISTANCE**2)
-    ) ** 2  # without the referee's cos⁴
+    # without the referee's cos⁴
+    level = ((1 + slope2) / (1 + (place[0] ** 2 + place[1] ** 2) / DISTANCE**2)) ** 2
 
     def own(a, b):
         behind = _Behind(

@@ -46,9 +46,8 @@ def test_unwrapping_finds_the_phase_up_to_a_constant():
     found = export.unwrap_phase(made(want))
     held = np.isfinite(found)
     assert held.sum() == (X**2 + X[:, None] ** 2 <= 19.3**2).sum()
-    assert (
-        np.abs(found - (want - want[50, 50]))[held].max() < 1e-11
-    )  # rounding of 40 rad through diameters
+    # rounding of 40 rad through diameters
+    assert np.abs(found - (want - want[50, 50]))[held].max() < 1e-11
 
 
 def test_a_grid_phase_is_read_back_as_the_same_function(tmp_path):
@@ -60,17 +59,14 @@ def test_a_grid_phase_is_read_back_as_the_same_function(tmp_path):
     )
     head = (tmp_path / "a.dat").read_text().splitlines()[0].split()
     assert [int(head[0]), int(head[1]), int(head[4])] == [161, 161, 0]
-    assert float(head[2]) == pytest.approx(
-        2 * 19.2e-3 / 160, rel=0.01
-    )  # mm; the outermost pillar, at 19.2 um
+    # mm; the outermost pillar, at 19.2 um
+    assert float(head[2]) == pytest.approx(2 * 19.2e-3 / 160, rel=0.01)
     first = [line.split() for line in (tmp_path / "a.dat").read_text().splitlines()[1:]]
     assert first[0] == ["0", "0", "0", "0", "1"]  # the corner lies outside the disc
     middle = np.array([float(words[0]) for words in first]).reshape(161, 161)
     step = float(head[2]) * 1e3
-    below, right = (
-        48 * step,
-        -31 * step,
-    )  # rows run from the largest y of the file, which is our least
+    # rows run from the largest y of the file, which is our least
+    below, right = (48 * step, -31 * step)
     want = smooth(right, below) - smooth(0, 0)
     # linear between pillars: curvature 0.1 rad/um² over 0.4 um, h²/8 of it
     assert middle[80 + 48, 80 - 31] == pytest.approx(

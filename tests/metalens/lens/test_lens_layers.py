@@ -66,9 +66,8 @@ def test_the_psf_of_a_lens_goes_through_its_films(proxy):
         for lens_ in (one, replace(one, layers=Layers()))
     )
     peaks = [float(s.intensity.max() * s.energy_um2[0, 0]) for s in (corrected, bare)]
-    assert (
-        peaks[0] > 1.5 * peaks[1]
-    )  # 69 um of glass are 15 um of focus, 0.8 of the depth of focus
+    # 69 um of glass are 15 um of focus, 0.8 of the depth of focus
+    assert peaks[0] > 1.5 * peaks[1]
 
 
 def test_films_are_kept_in_the_file(proxy, tmp_path):
@@ -140,9 +139,8 @@ def test_a_stop_is_kept_in_the_file_and_seen_by_design_and_focus_check(proxy, tm
     one, quality = made(proxy, focus)
     lens.save(tmp_path / "stop.h5", one)
     assert lens.load(tmp_path / "stop.h5").layers == behind_stop
-    lit = 21.0 / (
-        1 - (150 / 1.45) / (1850 + 150 / 1.45)
-    )  # similar triangles in reduced distances
+    # similar triangles in reduced distances
+    lit = 21.0 / (1 - (150 / 1.45) / (1850 + 150 / 1.45))
     assert quality.numerical_aperture == pytest.approx(
         1.21 * np.sin(np.arctan(lit / 200.0)), rel=1e-6
     )

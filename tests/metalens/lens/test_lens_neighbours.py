@@ -55,9 +55,8 @@ def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():
         assert made.at(np.array([0.31]), 3 * math.pi / 4)[field] == pytest.approx(
             power(0.31, 1, field), rel=1e-12
         )
-        third = 0.25 * power(0.31, 0, field) + 0.75 * power(
-            0.31, 1, field
-        )  # sin² 2α of 30 degrees
+        # sin² 2α of 30 degrees
+        third = 0.25 * power(0.31, 0, field) + 0.75 * power(0.31, 1, field)
         assert made.at(np.array(0.31), math.radians(-60))[field] == pytest.approx(
             third, rel=1e-12
         )
@@ -65,12 +64,10 @@ def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():
     azimuths = (np.arange(16) + 0.3) * math.pi / 8
     mean = made.at(np.full(16, 0.4), azimuths).mean()
     assert made.mean(np.array([0.4]))[0] == pytest.approx(mean, rel=1e-12)
-    assert made.at(np.array([0.9]), 0.7) == pytest.approx(
-        made.at(np.array([0.5]), 0.7)
-    )  # no row is steeper
-    flat = replace(
-        made, sine=np.array([0.5, 0.25, 0.3, 0.2])
-    )  # along the diagonal rows end before: what C differs by
+    # no row is steeper
+    assert made.at(np.array([0.9]), 0.7) == pytest.approx(made.at(np.array([0.5]), 0.7))
+    # along the diagonal rows end before: what C differs by
+    flat = replace(made, sine=np.array([0.5, 0.25, 0.3, 0.2]))
     held = (
         flat.at(np.array(0.45), 0.0)
         + flat.at(np.array(0.3), math.pi / 4)

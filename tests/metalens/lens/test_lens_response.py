@@ -16,9 +16,8 @@ from metalens.lens import DiameterMap, Lens, response
 from metalens.library import Proxy
 
 DRAW = np.random.default_rng(17)
-SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array(
-    [5.0, 3.0, 1.5, 0.7, 0.2]
-)  # angle, wavelength, diameter
+# angle, wavelength, diameter
+SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array([5.0, 3.0, 1.5, 0.7, 0.2])
 LEVEL = np.array([[[0.72, 0.1, -0.05]], [[-0.06, 0.03, 0.02]]])
 PROXY = Proxy(
     SERIES, LEVEL, (0.09, 0.31), (0.80, 0.93), 0.0, 0.0, power=3, max_angle_rad=0.4

@@ -24,10 +24,8 @@ def pairs():
 def test_every_pillar_has_its_entry_and_no_pillar_has_none(light):
     row = DRAW.integers(0, 5, (4, 6))
     column = DRAW.integers(0, 3, (4, 6))
-    x, y = (
-        X[row] + 0.04 * 0.02,
-        Y[column] - 0.04 * 0.05,
-    )  # a twentieth of a step is rounding
+    # a twentieth of a step is rounding
+    x, y = (X[row] + 0.04 * 0.02, Y[column] - 0.04 * 0.05)
     x[1, 2] = y[1, 2] = 0.0
     for w, wave in enumerate(WAVES):
         found = pairs().amplitude(x, y, wave + 5e-10, light)

@@ -49,9 +49,8 @@ def test_both_ends_are_as_far_out_of_focus(source_um):
         abs(np.hypot(500.0, z) - z - np.hypot(500.0, source_um) + source_um) / 0.85
         for z in (near, far)
     ]
-    assert waves == pytest.approx(
-        [1.75, 1.75], rel=0.02
-    )  # the next term: (R / 2z)² of it
+    # the next term: (R / 2z)² of it
+    assert waves == pytest.approx([1.75, 1.75], rel=0.02)
     assert near < source_um < far
 
 
@@ -99,9 +98,8 @@ def test_a_step_of_depth_moves_the_rim_by_an_eighth_of_a_wave(depth_um, radius_u
         reach.ApertureSummary(radius_um, 0.85, 2000.0, 20e3), depth_um
     )
     waves = [(np.hypot(radius_um, z) - z) / 0.85 for z in (depth_um, depth_um + step)]
-    assert waves[0] - waves[1] == pytest.approx(
-        0.115, rel=0.05
-    )  # 2 digits; and the step's second order, 1.3 %
+    # 2 digits; and the step's second order, 1.3 %
+    assert waves[0] - waves[1] == pytest.approx(0.115, rel=0.05)
 
 
 def test_samples_show_the_finest_detail_of_any_lens():
@@ -128,9 +126,8 @@ def test_a_stop_in_front_leaves_the_part_of_a_lens_that_it_lights():
     )
     assert reach.disc_um(made) == float(f"{5.3 * airy:.2g}")
     assert reach.pixel_um(made) == float(f"{0.88 * airy:.2g}")
-    assert (
-        reach.depth_step_um(made, 2e3) == 17.0
-    )  # 0.23 · 0.85 (2000 / 212.77)² = 17.27
+    # 0.23 · 0.85 (2000 / 212.77)² = 17.27
+    assert reach.depth_step_um(made, 2e3) == 17.0
     assert reach.depth_step_um(made, 9e3) == 180.0  # a fiftieth of the depth; 349.8
     near, far = reach.depth_range_um(made, digits=9)
     assert 1 / near - 1 / 20e3 == pytest.approx(2 * 1.75 * 0.85 / lit**2, rel=1e-7)
@@ -152,6 +149,5 @@ def test_a_window_holds_the_worst_blur_or_the_rings():
     assert reach.window_um(made, (19.9e3, 20.1e3), airy=9.0) == float(
         f"{9 * 0.85 * 6:.3g}"
     )
-    assert reach.diffraction_um(lens(sites=1)) == pytest.approx(
-        0.85 * 3000 / 0.4
-    )  # a pitch
+    # a pitch
+    assert reach.diffraction_um(lens(sites=1)) == pytest.approx(0.85 * 3000 / 0.4)

@@ -118,9 +118,8 @@ def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(
     assert found.error(w) == pytest.approx(
         np.maximum(apart.min(0), missed), rel=1e-3, abs=3e-15
     )
-    assert (
-        missed.max() < apart.min(0).max() / 30
-    )  # the series costs nothing beside them
+    # the series costs nothing beside them
+    assert missed.max() < apart.min(0).max() / 30
 
 
 def test_the_series_ends_before_a_ray_that_grazes_a_medium_of_no_thickness():

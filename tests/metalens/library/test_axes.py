@@ -17,9 +17,8 @@ from metalens.library import Sweep, axes
 
 RANGE = (0.1, 0.27)
 SQUARE = Cell(0.35, 0.4, Index(1.7), substrate=Index(1.45), shape=Rectangle())
-CELL = dataclasses.replace(
-    SQUARE, lattice=Lattice("rectangular", 1.0)
-)  # the same, and nothing is exchanged to save solves
+# the same, and nothing is exchanged to save solves
+CELL = dataclasses.replace(SQUARE, lattice=Lattice("rectangular", 1.0))
 SETTINGS = Sweep(
     (0.7,), diameters_um=RANGE, lengths_um=RANGE, samples=35, tolerance=0.1
 )
@@ -50,9 +49,8 @@ def test_a_surface_with_a_moving_pole_converges_and_knows_its_error(count, most)
     )
     error = np.abs(made.value - moving(places[:, None], places)).max(axis=-1)
     assert error.max() < most
-    assert (
-        np.count_nonzero(error > made.doubt) < 0.02 * error.size
-    )  # where neither order sees the pole yet
+    # where neither order sees the pole yet
+    assert np.count_nonzero(error > made.doubt) < 0.02 * error.size
 
 
 def test_a_surface_holds_its_nodes():
@@ -87,9 +85,8 @@ def test_bars_hold_against_a_finer_solver(library):
 
 def test_pairs_held_out_lie_within_their_bars(library):
     assert library.missed == 0
-    assert (
-        np.median(library.held_out[:, 4] / library.held_out[:, 3]) > 2
-    )  # the solver's part is not tried here
+    # the solver's part is not tried here
+    assert np.median(library.held_out[:, 4] / library.held_out[:, 3]) > 2
     assert library.held_out.shape == (24, 5)
     _, x, y, error, _ = library.held_out[7]
     i, j = (

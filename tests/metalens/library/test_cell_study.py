@@ -26,9 +26,8 @@ def test_known_coverages(verdicts):
     assert narrow.turns == pytest.approx(1.53, abs=0.03)
     assert wide.turns == pytest.approx(0.77, abs=0.03)
     assert narrow.max_angle_deg == 90
-    assert wide.max_angle_deg == pytest.approx(
-        42.3, abs=0.1
-    )  # sin = 0.85/0.40 - 1.4525
+    # sin = 0.85/0.40 - 1.4525
+    assert wide.max_angle_deg == pytest.approx(42.3, abs=0.1)
 
 
 def test_choice_takes_the_lowest_then_the_most(verdicts):

@@ -34,9 +34,8 @@ R = lambda a: np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, -2.0])
 def test_a_turned_wave_plate_is_that_of_the_textbook(angle):
     c, s = math.cos(2 * angle), math.sin(2 * angle)
-    assert np.allclose(
-        isolated(1.0, -1.0, angle), [[c, s], [s, -c]]
-    )  # half-wave plate, fast axis at the angle
+    # half-wave plate, fast axis at the angle
+    assert np.allclose(isolated(1.0, -1.0, angle), [[c, s], [s, -c]])
     t_x, t_y = 0.8 * np.exp(0.4j), 0.9 * np.exp(-1.3j)
     assert np.allclose(
         isolated(t_x, t_y, angle), R(angle) @ np.diag([t_x, t_y]) @ R(-angle)
@@ -52,9 +51,8 @@ def test_the_other_hand_leaves_with_twice_the_turn(hand):
     assert np.allclose(other, (t_x - t_y) / 2 * np.exp(2j * hand * angle))
     come = np.array([1, 1j * hand]) / math.sqrt(2)
     leave = isolated(t_x, t_y, 0.37) @ come
-    assert np.allclose(
-        leave, kept[1] * come + other[1] * come.conj()
-    )  # nothing else leaves
+    # nothing else leaves
+    assert np.allclose(leave, kept[1] * come + other[1] * come.conj())
 
 
 def test_solved_turns_have_the_symmetries_of_the_lattice():
@@ -74,9 +72,8 @@ def test_solved_turns_have_the_symmetries_of_the_lattice():
         np.abs(R(math.pi / 2) @ found.t[0] @ R(-math.pi / 2) - along.t).max()
         < along.t_error + found.t_error[0]
     )
-    assert (
-        found.model_error < 0.05
-    )  # low contrast: what the neighbours see of the turn is small
+    # low contrast: what the neighbours see of the turn is small
+    assert found.model_error < 0.05
     assert found.model_error > 1e-5  # but not nothing
 
 
@@ -84,9 +81,8 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     angle = np.array([0.0, 0.4, -0.4])
     t = isolated(0.9, -0.8, angle)
     t[1] = t[1] + 0.02 * np.array([[0, 1], [1, 0]])
-    before = np.stack(
-        [0.99 * t, 1.02 * t], axis=1
-    )  # coarser truncations: their shares are 0.9801 and 1.0404 of it
+    # coarser truncations: their shares are 0.9801 and 1.0404 of it
+    before = np.stack([0.99 * t, 1.02 * t], axis=1)
     found = GeometricPhase(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
     amplitude = [0.85, 0.85 + 0.02j * np.exp(-0.8j), 0.85]  # <R| (0 1; 1 0) |L> = i
     assert found.efficiency(1.0)[0] == pytest.approx(abs(np.mean(amplitude)) ** 2)

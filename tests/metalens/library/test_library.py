@@ -89,9 +89,8 @@ def test_an_interrupted_sweep_goes_on_to_the_same_bytes(made, tmp_path):
         )
     kept = journal.read_text().split("\n")
     assert len(kept) >= 2
-    journal.write_text(
-        "\n".join([*kept[:2], '["cut sho'])
-    )  # as after a kill in the middle of a line
+    # as after a kill in the middle of a line
+    journal.write_text("\n".join([*kept[:2], '["cut sho']))
     again = library.sweep(DEFAULT_CELL, COARSE, checkpoint=journal)
     assert not journal.exists()
     library.save(tmp_path / "a.h5", made)

@@ -30,9 +30,8 @@ def reference(diameter, power):
 def test_value_and_slope(power, shape):
     d = np.random.default_rng(0).uniform(LOW, HIGH, shape)
     p = polynomial.chebyshev_curve(COEFFICIENTS, (LOW, HIGH), power)
-    assert (
-        np.abs(polynomial.evaluate_curve(p, d) - reference(d, power)).max() < 1e-12
-    )  # monomials up to 40: 40 eps
+    # monomials up to 40: 40 eps
+    assert np.abs(polynomial.evaluate_curve(p, d) - reference(d, power)).max() < 1e-12
     step = np.imag(reference(d + 1e-30j, power)) / 1e-30
     assert (
         np.abs(polynomial.evaluate_slope(p, d) - step).max()
@@ -49,9 +48,8 @@ def test_bounds_hold_everywhere_and_are_tight(terms, rows):
     assert low <= sampled.min() + 1e-12
     assert high >= sampled.max() - 1e-12
     span = np.abs(c).sum()
-    assert (
-        low >= sampled.min() - 0.02 * span
-    )  # 301 samples of degree 23 miss up to (pi 23/301)²/8 of the range
+    # 301 samples of degree 23 miss up to (pi 23/301)²/8 of the range
+    assert low >= sampled.min() - 0.02 * span
     assert high <= sampled.max() + 0.02 * span
 
 

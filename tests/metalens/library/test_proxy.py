@@ -70,9 +70,8 @@ def test_gradients_in_torch_are_the_slopes():
         difference = (
             getattr(p, verb)(inner + h, 0.853) - getattr(p, verb)(inner - h, 0.853)
         ) / (2 * h)
-        assert (
-            np.abs(difference - getattr(p, slope)(inner, 0.853)).max() < 1e-6
-        )  # rounding 1e-15 / h
+        # rounding 1e-15 / h
+        assert np.abs(difference - getattr(p, slope)(inner, 0.853)).max() < 1e-6
 
 
 @settings(max_examples=60)

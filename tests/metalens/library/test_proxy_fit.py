@@ -90,9 +90,8 @@ def errors(made, waves, angles, count=500):
 def test_the_stated_error_holds_where_the_fit_never_looked():
     made = proxy.fit(synthetic())
     phase, level = errors(made, (0.85,), (0.0,))
-    assert (
-        phase <= 1.05 * made.max_phase_error_rad
-    )  # the polynomial turns between samples by 1/400 of a wave
+    # the polynomial turns between samples by 1/400 of a wave
+    assert phase <= 1.05 * made.max_phase_error_rad
     assert level <= 1.05 * made.max_transmission_error
     assert made.max_phase_error_rad <= 1e-3
     assert made.max_transmission_error <= 1e-3
@@ -108,9 +107,8 @@ def test_a_ripple_between_few_entries_is_left_and_said():
     )
     made = proxy_fit.fit(rippled)
     assert made.turns < 1 <= made.smooth_turns
-    assert (
-        0.02 < made.proxy.max_transmission_error < 0.035
-    )  # the ripple itself; 12 coefficients swing by 0.41
+    # the ripple itself; 12 coefficients swing by 0.41
+    assert 0.02 < made.proxy.max_transmission_error < 0.035
     assert (
         f"|T| within {made.proxy.max_transmission_error:.3g}, where 0.001 and 0.001 are wanted"
         in made.shortfall
@@ -191,16 +189,14 @@ def test_few_entries_beside_a_resonance_are_left_to_it_for_the_tolerances():
     assert any(
         "do not describe it within the tolerances" in note for note in found.notes
     )
-    assert (
-        found.turns > 0.9 * found.smooth_turns - 0.1
-    )  # a tenth of what 24 coefficients were tried on
+    # a tenth of what 24 coefficients were tried on
+    assert found.turns > 0.9 * found.smooth_turns - 0.1
     d = np.linspace(*found.proxy.domain_um, 301)
     exact = np.unwrap(np.angle(blaschke(centre, width)(d))) + phase_of(d, 0.85, 0.0)
     off = np.asarray(found.proxy.phase_rad(d, 0.85)) - exact
     off -= 2 * np.pi * np.round(off.mean() / (2 * np.pi))
-    assert (
-        np.abs(off).max() < 0.02
-    )  # 0.005 at the entries, twice the tolerance between them
+    # 0.005 at the entries, twice the tolerance between them
+    assert np.abs(off).max() < 0.02
 
 
 def test_the_longer_side_of_a_resonance_is_kept():
@@ -236,9 +232,8 @@ def test_openings_in_a_film_are_the_mirror_image_of_pillars():
     assert made.turns == pytest.approx(other.turns)
     d = np.linspace(0.1, 0.2, 7)
     turn = made.proxy.phase_rad(d, 0.85) + phase_of(d, 0.85, 0.0)
-    assert np.exp(1j * turn) == pytest.approx(
-        np.ones(7), abs=2e-3
-    )  # tolerances of the fit
+    # tolerances of the fit
+    assert np.exp(1j * turn) == pytest.approx(np.ones(7), abs=2e-3)
     wanted = np.array([-3.0, -0.4, 1.7])
     found = made.proxy.phase_rad(made.proxy.diameter_um(wanted, 0.85), 0.85)
     assert np.exp(1j * found) == pytest.approx(np.exp(1j * wanted))
@@ -340,9 +335,8 @@ def test_default_cell_meets_its_numbers():
     assert p.max_phase_error_rad <= 1e-3
     assert p.max_transmission_error <= 1e-3
     assert p.monotone(0.85)
-    assert (
-        p.coverage_rad(0.85, within_um=(0.08, p.domain_um[1])) >= TURN
-    )  # printable pillars cover a full turn
+    # printable pillars cover a full turn
+    assert p.coverage_rad(0.85, within_um=(0.08, p.domain_um[1])) >= TURN
 
 
 def test_a_candidate_that_turns_negative_between_entries_is_passed_over():
@@ -363,9 +357,8 @@ def test_a_dip_that_no_candidate_follows_is_refused():
     )
     with pytest.raises(DomainError, match="sweep with more samples") as refused:
         proxy_fit.fit(made, ProxyTolerances(least_transmission=0.001))
-    assert "fit it again" not in str(
-        refused.value
-    )  # what the proxy says of its coefficients is no advice to a user
+    # what the proxy says of its coefficients is no advice to a user
+    assert "fit it again" not in str(refused.value)
 
 
 def test_errors_of_phase_and_transmission_stand_each_in_its_place():
@@ -376,9 +369,8 @@ def test_errors_of_phase_and_transmission_stand_each_in_its_place():
         ),
     )
     phase, level = errors(made, (0.85,), (0.0,))
-    assert made.max_phase_error_rad == pytest.approx(
-        phase, rel=0.1
-    )  # between the samples
+    # between the samples
+    assert made.max_phase_error_rad == pytest.approx(phase, rel=0.1)
     assert made.max_transmission_error == pytest.approx(level, rel=0.1)
     assert abs(phase / level - 1) > 0.3
 

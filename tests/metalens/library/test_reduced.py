@@ -11,9 +11,8 @@ from metalens.cell.response import Response
 from metalens.core.errors import DomainError
 from metalens.library import curve as reduced
 
-HARD = Cell(
-    0.40, 0.7, Index(3.6)
-)  # 850 nm: a dip near 194 nm, a steep flank near 302, one of 10 pm near 282
+# 850 nm: a dip near 194 nm, a steep flank near 302, one of 10 pm near 282
+HARD = Cell(0.40, 0.7, Index(3.6))
 SPAN = (0.08, 0.32)
 
 
@@ -27,9 +26,8 @@ def exact(diameter_um: float) -> Response:
 
 def explored(tolerance: float) -> reduced.ResponseCurve:
     nodes = reduced.sample_adaptively(exact, *SPAN, tolerance=tolerance)
-    silent = np.zeros_like(
-        nodes.error
-    )  # so that the estimate of the interpolation stands alone
+    # so that the estimate of the interpolation stands alone
+    silent = np.zeros_like(nodes.error)
     nodes = reduced.SolvedNodes(
         nodes.diameter_um, nodes.response, silent, nodes.converged
     )

@@ -76,9 +76,8 @@ def test_plane_waves_converge_exponentially_with_the_degree():
 @pytest.mark.parametrize("height", [0.0, 1e-9, 0.01, 0.7, 5.0, 50.0])
 def test_pillar_of_air_is_a_film_of_air(height):
     got = modal.solve(cell(height, n=1.0), 0.2, WAVELENGTH)
-    assert (
-        abs(got.t - film(1.0, height)) < 1e-10 + 1e-10 * height
-    )  # q to 1e-11, times k0 h
+    # q to 1e-11, times k0 h
+    assert abs(got.t - film(1.0, height)) < 1e-10 + 1e-10 * height
     assert got.converged
 
 
@@ -161,9 +160,8 @@ def test_hard_guided_mode_of_a_thin_layer_of_low_contrast():
 def test_hard_substrate_order_at_cutoff(short):
     got = modal.solve(cell(), 0.2, 0.4 * 1.4525 / (1 - short))
     assert np.isfinite([got.t, got.r]).all()
-    assert (
-        abs(got.energy - 1) < 1e-9
-    )  # rounding times the admittance of an order at its cutoff, 1e8
+    # rounding times the admittance of an order at its cutoff, 1e8
+    assert abs(got.energy - 1) < 1e-9
 
 
 def test_hard_pitch_equals_wavelength():
@@ -209,9 +207,8 @@ def test_angle_and_azimuth_have_the_symmetry_of_the_square():
         polarization="y",
         tolerance=1e-2,
     ).t
-    assert (
-        max(abs(two - one), abs(three - one)) < 1e-12
-    )  # cos(π/2) is 6e-17; sums of 1e2 to 1e3 terms of order 1
+    # cos(π/2) is 6e-17; sums of 1e2 to 1e3 terms of order 1
+    assert max(abs(two - one), abs(three - one)) < 1e-12
 
 
 def test_hard_float32_numbers_are_taken_in_double_precision():

@@ -12,10 +12,8 @@ import torch
 from metalens.optics import paths
 
 getcontext().prec = 60
-X, Y = (
-    3.7e-4,
-    -217.3,
-)  # um: a pillar beside the axis, and one that is not; a mask's reach in between
+# um: a pillar beside the axis, and one that is not; a mask's reach in between
+X, Y = (3.7e-4, -217.3)
 PLACES = [(X, Y), (311.9, 5e-7), (-0.42, 0.17)]
 
 
@@ -71,9 +69,8 @@ def test_arrays_leave_as_they_came_and_in_the_same_numbers():
     want = paths.path_difference(r2, 1983.0)
     tensor = paths.path_difference(torch.from_numpy(r2), 1983.0)
     assert tensor.dtype == torch.float64
-    np.testing.assert_allclose(
-        tensor.numpy(), want, rtol=1e-15
-    )  # a square root, a sum and a quotient, each rounded
+    # a square root, a sum and a quotient, each rounded
+    np.testing.assert_allclose(tensor.numpy(), want, rtol=1e-15)
     assert paths.path_difference(r2.astype(np.float32), 1983.0).dtype == np.float32
     assert paths.path_difference(torch.ones(2), math.inf).tolist() == [0.0, 0.0]
 

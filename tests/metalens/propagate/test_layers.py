@@ -122,9 +122,8 @@ def test_the_exact_sum_of_few_pillars_close_to_the_sensor_is_that_of_all_plane_w
         want, rel=1e-9
     )
     stack = psf.psf_stack(phase, level, **about, angle_rad=(0.3, -0.2), integrate=False)
-    assert (
-        4e-12 <= stack.error < 1e-7
-    )  # steep rays through thin films are known to that
+    # steep rays through thin films are known to that
+    assert 4e-12 <= stack.error < 1e-7
 
 
 # cover, films, distance, angle, window beside the chief ray: what s and p make of a PSF

@@ -36,9 +36,8 @@ def test_one_pillar_is_a_spherical_wavelet():
         * (1 / r - 1j * K)
         * np.exp(1j * K * r)
     )
-    assert (
-        np.abs(field - want).max() < 1e-13 * np.abs(want).max()
-    )  # source phase is 0 at the lens centre
+    # source phase is 0 at the lens centre
+    assert np.abs(field - want).max() < 1e-13 * np.abs(want).max()
 
 
 def test_sum_agrees_with_a_plain_loop_off_axis():
@@ -68,9 +67,8 @@ def test_sum_agrees_with_a_plain_loop_off_axis():
                 * (1 / r - 1j * K)
                 * np.exp(1j * K * r)
             )
-    assert (
-        np.abs(got[0] - want).max() < 1e-12 * np.abs(want).max()
-    )  # rounding of paths of 1e4 rad: 1e-12
+    # rounding of paths of 1e4 rad: 1e-12
+    assert np.abs(got[0] - want).max() < 1e-12 * np.abs(want).max()
 
 
 def test_circular_aperture_has_the_closed_form_on_its_axis():
@@ -84,9 +82,8 @@ def test_circular_aperture_has_the_closed_form_on_its_axis():
     ]
     s = np.hypot(D, radius)
     want = np.exp(1j * K * D) - D / s * np.exp(1j * K * s)
-    assert (
-        abs(got - want) < 1e-2
-    )  # the staircase rim: its mean radius is off by a few nm, k·R/s·3 nm = 7e-3
+    # the staircase rim: its mean radius is off by a few nm, k·R/s·3 nm = 7e-3
+    assert abs(got - want) < 1e-2
 
 
 @pytest.mark.parametrize(

@@ -91,9 +91,8 @@ def test_the_windowed_method_meets_its_tolerance_there_too(dtype):
         * float(stack.energy_um2.detach()[0])
         / stack.step_um**2
     )
-    assert np.linalg.norm(light - want) < 1e-5 * np.linalg.norm(
-        want
-    )  # the tolerance; energies hold the area of a site
+    # the tolerance; energies hold the area of a site
+    assert np.linalg.norm(light - want) < 1e-5 * np.linalg.norm(want)
 
 
 def test_energy_of_a_hexagonal_lens_is_that_which_leaves_it():

@@ -130,9 +130,8 @@ def test_window_off_by_half_a_pixel():
     other = centred.numpy().intensity[..., 1:] / centred.numpy().intensity[..., 1:].sum(
         (-1, -2), keepdims=True
     )
-    assert np.linalg.norm(moved - other) > 0.1 * np.linalg.norm(
-        other
-    )  # half a sample of 0.8 um matters
+    # half a sample of 0.8 um matters
+    assert np.linalg.norm(moved - other) > 0.1 * np.linalg.norm(other)
 
 
 def test_40_degree_field():
@@ -245,9 +244,8 @@ def test_energy_is_kept_in_a_large_window():
         np.abs(propagate.exact(np.zeros((32, 32)), level, **geometry)) ** 2
     ).sum() * step**2
     assert got == pytest.approx(want, rel=1e-6)
-    assert got == pytest.approx(
-        (level**2).sum() * PITCH**2, rel=2e-3
-    )  # Parseval; the rest misses the window
+    # Parseval; the rest misses the window
+    assert got == pytest.approx((level**2).sum() * PITCH**2, rel=2e-3)
 
 
 def test_a_batch_of_lenses_equals_the_lenses():
@@ -265,9 +263,8 @@ def test_a_tilt_moves_the_light_to_plus_x_and_a_slip_down_to_plus_y():
     tilted = phase + K * 0.02 * x * PITCH + K * 0.01 * y * PITCH
     stack = psf.psf_stack(tilted, level, **GEOMETRY)
     light = stack.intensity[1]
-    assert (light.sum(0) * stack.x_um).sum() == pytest.approx(
-        120 * 0.02, abs=0.15
-    )  # rings are cut by the window
+    # rings are cut by the window
+    assert (light.sum(0) * stack.x_um).sum() == pytest.approx(120 * 0.02, abs=0.15)
     assert (light.sum(1) * stack.y_um).sum() == pytest.approx(120 * 0.01, abs=0.15)
 
 

@@ -75,9 +75,8 @@ def test_against_the_exact_sum_where_it_is_bright_and_in_the_corners(
     want = np.abs(propagate.field_at(phase, level, case, where)) ** 2
     got = light.reshape(3, -1)[:, at]
     share = np.linalg.norm(got - want, axis=1) / np.linalg.norm(want, axis=1)
-    assert (
-        share < tolerance
-    ).all()  # the brightest weigh most: the relative L2 error that is asked for
+    # the brightest weigh most: the relative L2 error that is asked for
+    assert (share < tolerance).all()
     plain = np.abs(got - want)[:, 20:40].max(1) / want[:, 20:40].mean(1)
     assert (plain < 30 * tolerance).all()  # anywhere; of the mean of what is dim
     assert (np.abs(got - want)[:, 40:] < corner * want[:, 20:].mean()).all()
@@ -95,9 +94,8 @@ def test_through_films_it_is_the_windowed_field_of_the_same_window():
     light = propagate.light_wide(
         (phase[None], level[None]), propagate.plan_wide(case, 1e-6, torch.float64)
     )[0]
-    small = dataclasses.replace(
-        case, samples=(21, 21)
-    )  # of the middle, both counts odd
+    # of the middle, both counts odd
+    small = dataclasses.replace(case, samples=(21, 21))
     field = propagate.field_windowed(
         phase, level, propagate.plan_window(small, 1e-6, torch.float64)
     )
@@ -124,9 +122,8 @@ def test_the_stack_takes_it_and_says_what_it_errs():
     # is stated in any case: 0.02 of the setting (5e-5) and the rounding of transforms,
     # 1e-6 each
     least = 1.5e-6
-    assert (
-        true / 1.1 < stack.error < max(12 * true, least)
-    )  # energies are compared too: they share float32's scatter
+    # energies are compared too: they share float32's scatter
+    assert true / 1.1 < stack.error < max(12 * true, least)
 
 
 def test_gradients_are_those_of_differences():
@@ -145,9 +142,8 @@ def test_gradients_are_those_of_differences():
     step = 1e-4
     with torch.no_grad():
         between = (merit(phase + step * way) - merit(phase - step * way)) / (2 * step)
-    assert float((slope * way).sum()) == pytest.approx(
-        float(between), rel=1e-6
-    )  # step² of the third derivative
+    # step² of the third derivative
+    assert float((slope * way).sum()) == pytest.approx(float(between), rel=1e-6)
 
 
 def test_dark_corners_of_the_lens_take_fewer_fields_and_change_no_light():

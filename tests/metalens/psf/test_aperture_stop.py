@@ -40,16 +40,14 @@ def _on_the_pillars(
     waves through glass.
     """
     fine, count = PITCH / 2, 1280
-    place = (
-        np.arange(count) - count // 2
-    ) * fine + PITCH / 2  # every second one is a pillar
+    # every second one is a pillar
+    place = (np.arange(count) - count // 2) * fine + PITCH / 2
     x, y = np.meshgrid(place, place)
     tx, ty = (math.tan(a) for a in angle)
     slope = math.hypot(tx, ty)
     sine = slope / math.hypot(1, slope)
-    even = np.ones_like(
-        x
-    )  # without the fall of 1 / r over the pillars, of which PSFs know nothing
+    # without the fall of 1 / r over the pillars, of which PSFs know nothing
+    even = np.ones_like(x)
     if math.isinf(depth_um):
         wave = np.exp(1j * K / math.hypot(1, slope) * (tx * x + ty * y))
     else:  # Snell: the ray to the middle of the lens, back through glass and air
@@ -157,9 +155,8 @@ def test_psf_behind_a_stop_is_that_of_waves_through_its_glass_within_the_error_i
     want = _summed(angle, depth_um, stop_um, thick_um, level)
     seen, said = _seen(angle, depth_um, layers, level)
     assert said / 8 < _apart(seen, want) < said + 1e-4  # of the sums
-    on_pillars = replace(
-        layers, stop=Stop(stop_um)
-    )  # the same hole there: other light where there is an angle
+    # the same hole there: other light where there is an angle
+    on_pillars = replace(layers, stop=Stop(stop_um))
     assert _apart(
         _seen(angle, depth_um, on_pillars, level)[0], want
     ) > 3 * said or angle == (0.0, 0.0)

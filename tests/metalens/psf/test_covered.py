@@ -15,13 +15,8 @@ from metalens.optics import Layers, Media
 from metalens.propagate import PropagationCase
 from metalens.psf import lens_psfs, vector
 
-EDGE, DISTANCE, FILM, GLASS, GEL = (
-    200.2,
-    700.0,
-    210.0,
-    1.52,
-    1.37,
-)  # a filter on the pillars, a gel to the sensor
+# a filter on the pillars, a gel to the sensor
+EDGE, DISTANCE, FILM, GLASS, GEL = (200.2, 700.0, 210.0, 1.52, 1.37)
 
 
 def lens():

@@ -19,9 +19,8 @@ from metalens.psf import far_field
 from tests.referees import plain_sum
 
 WAVE, PITCH = 0.633, 0.29
-PROXY = Proxy(
-    np.array([[1.3]]), np.array([[0.83]]), (0.1, 0.2), (WAVE, WAVE), 0.0, 0.0
-)  # every pillar alike, |t| 0.83
+# every pillar alike, |t| 0.83
+PROXY = Proxy(np.array([[1.3]]), np.array([[0.83]]), (0.1, 0.2), (WAVE, WAVE), 0.0, 0.0)
 RNG = np.random.default_rng(3)
 
 
@@ -111,9 +110,8 @@ def test_a_rectangle_shows_its_sinc():
         u = math.pi * PITCH / WAVE * p
         want = want * n * PITCH / WAVE * special.diric(2 * u, n) ** 2
     density = found.share / square**2
-    assert (
-        np.abs(density - want * (found.share > 0)).max() < 3e-3 * want.max()
-    )  # middle of a square for its mean
+    # middle of a square for its mean
+    assert np.abs(density - want * (found.share > 0)).max() < 3e-3 * want.max()
 
 
 def test_a_round_aperture_holds_airy_s_share_in_every_circle():
@@ -128,13 +126,11 @@ def test_a_round_aperture_holds_airy_s_share_in_every_circle():
         assert held[ring - 1] == pytest.approx(
             1 - special.j0(v) ** 2 - special.j1(v) ** 2, abs=8e-3
         )  # rim of sites
-    assert found.beams[0].share == pytest.approx(
-        found.beam_holds, abs=5e-3
-    )  # rim of sites
+    # rim of sites
+    assert found.beams[0].share == pytest.approx(found.beam_holds, abs=5e-3)
     v = 2 * math.pi / WAVE * radius * found.beam_sine
-    assert found.beam_holds == pytest.approx(
-        1 - 2 / (math.pi * v), abs=1e-3
-    )  # next term of the Bessel functions
+    # next term of the Bessel functions
+    assert found.beam_holds == pytest.approx(1 - 2 / (math.pi * v), abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])
@@ -185,9 +181,8 @@ def test_every_direction_is_that_of_the_plain_sum():
                 / cosine[i, j] ** 4
                 / (PITCH**2 * (np.abs(amplitude) ** 2).sum())
             )
-            assert density[i, j] == pytest.approx(
-                want, rel=5e-3
-            )  # mean over a square of 0.00125, spots of 0.2
+            # mean over a square of 0.00125, spots of 0.2
+            assert density[i, j] == pytest.approx(want, rel=5e-3)
 
 
 def test_an_axicon_makes_a_ring_of_its_angle():

@@ -83,9 +83,8 @@ def test_both_polarisations_are_those_of_plane_waves(distance):
     stack = psf.psf_stack(phase, level, **about, polarisation="vector", integrate=False)
     axis = (np.arange(150) - 74.5) * PITCH
     field = level * np.exp(1j * phase) * vectorial.turned(axis, axis[:, None], distance)
-    half = (
-        PITCH / 2
-    )  # an odd window on an even lattice: the referee's samples lie half a pitch beside
+    # an odd window on an even lattice: the referee's samples lie half a pitch beside
+    half = PITCH / 2
     image = vectorial.image(
         field, step=PITCH, wavelength=WAVELENGTH, distance=distance, count=720
     )
@@ -275,9 +274,8 @@ def test_light_of_a_diode_beyond_the_library_is_told():
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (12, 17))
     share, words = told[2:].split(" of the light lies beyond ")
-    assert float(share) == pytest.approx(
-        tails, rel=0.05
-    )  # two digits; silicon weighs the blue by 4 % more, the red less
+    # two digits; silicon weighs the blue by 4 % more, the red less
+    assert float(share) == pytest.approx(tails, rel=0.05)
     assert words.startswith("838 to 867 nm, where the pillars are not known")
     assert spectrum.outside_library_text(diode, (0.8, 0.9)) == ""
     assert spectrum.outside_library_text(diode, (0.85, 0.85)) == ""

@@ -83,9 +83,8 @@ def test_fits_images_have_axes_in_um_and_the_energies_beside_them(stack):
         "um",
         pytest.approx(12 / 10, rel=1e-12),
     )
-    assert (
-        float(about["CRPIX1"]) == 5.5
-    )  # pixels count from 1: the middle of ten lies between the fifth and the sixth
+    # pixels count from 1: the middle of ten lies between the fifth and the sixth
+    assert float(about["CRPIX1"]) == 5.5
     assert float(about["SENSDIST"]) == 120.0
     named = {cards["EXTNAME"]: values for cards, values in parts}
     assert np.array_equal(named["DEPTHS_UM"], [1000.0, 1600.0, 2500.0])

@@ -60,16 +60,14 @@ def test_a_1_mm_lens_meets_its_tolerance_in_float32(angle, tolerance):
         if angle == 0
         else dict(window_um=128.0, samples=96)
     )
-    about = dict(
-        angle_rad=angle, tolerance=tolerance, integrate=False
-    )  # samples, as the exact sum gives them
+    # samples, as the exact sum gives them
+    about = dict(angle_rad=angle, tolerance=tolerance, integrate=False)
     stack = psf.psf_stack(
         *maps, **GEOMETRY, **size, depths_um=np.linspace(16e3, 26e3, 21), **about
     )
     assert stack.converged
-    assert (
-        sampled_error(stack, maps, angle) <= 1.5 * tolerance
-    )  # sub-sampled, so not quite the norm that is bounded
+    # sub-sampled, so not quite the norm that is bounded
+    assert sampled_error(stack, maps, angle) <= 1.5 * tolerance
 
 
 class AnonymousPeak:
@@ -124,9 +122,8 @@ def test_memory_of_a_1_mm_lens_stays_bounded():
 def test_a_10_mm_lens_streams_its_rows(tmp_path):
     """625 million pillars from a file: memory stays far below the 2.5 GB of the map."""
     n = 25000
-    phase = np.memmap(
-        tmp_path / "phase.f4", "f4", "w+", shape=(n, n)
-    )  # sparse zeros: a plane plate
+    # sparse zeros: a plane plate
+    phase = np.memmap(tmp_path / "phase.f4", "f4", "w+", shape=(n, n))
     psf.psf_stack(
         np.zeros((9, 9), "f4"),
         np.ones((9, 9), "f4"),
@@ -147,6 +144,5 @@ def test_a_10_mm_lens_streams_its_rows(tmp_path):
             samples=12,
         )
     assert memory.megabytes < 300
-    assert stack.intensity == pytest.approx(
-        1 / 144, rel=0.1
-    )  # a plane wave through a large hole: ripples of the far rim
+    # a plane wave through a large hole: ripples of the far rim
+    assert stack.intensity == pytest.approx(1 / 144, rel=0.1)

@@ -108,13 +108,11 @@ def test_plane_waves_land_where_their_direction_points_in_a_rectangle_beside_the
     want = at_sensor(plane(*angle), grid(centre, samples, 0.6)).reshape(18, 30)
     assert stack.intensity.shape == (1, 18, 30)
     assert stack.centres_um[0] == pytest.approx(centre)
-    assert stack.energy_um2[0] == pytest.approx(
-        want.sum() * 0.36, rel=2e-4
-    )  # unit irradiance
+    # unit irradiance
+    assert stack.energy_um2[0] == pytest.approx(want.sum() * 0.36, rel=2e-4)
     want /= want.sum()
-    assert np.linalg.norm(stack.intensity[0] - want) < 1e-4 * np.linalg.norm(
-        want
-    )  # the tolerance
+    # the tolerance
+    assert np.linalg.norm(stack.intensity[0] - want) < 1e-4 * np.linalg.norm(want)
     far = psf.psf_stack(
         *lens(),
         **GEOMETRY,

@@ -65,9 +65,8 @@ def test_angles_make_an_axis_and_equal_single_angles():
     assert several.angles_rad == pytest.approx(np.array([[0.1, 0.0], [0.0, -0.2]]))
     assert several.centres_um[1] == pytest.approx([0, 120 * np.tan(-0.2)])
     one = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=(0.0, -0.2))
-    assert several.intensity[1] == pytest.approx(
-        one.intensity, abs=1e-12
-    )  # of sum 1: rounding of angles side by side
+    # of sum 1: rounding of angles side by side
+    assert several.intensity[1] == pytest.approx(one.intensity, abs=1e-12)
 
 
 def test_torch_in_torch_out_and_dtype_follows():
@@ -143,9 +142,8 @@ def test_blur_of_even_discs_is_their_radius():
     middle = near[80:121, 70:131].astype(float)  # lit all over, 20.5 by 30.5 um of it
     held = 20.5 * 30.5 / (np.pi * 37.0**2)
     assert psf_metrics.blur_um(middle, 0.5, held) == pytest.approx(37.0, rel=1e-12)
-    most = wide[20:, 60:].astype(
-        float
-    )  # a tenth of the light beside it, half on either side
+    # a tenth of the light beside it, half on either side
+    most = wide[20:, 60:].astype(float)
     ends = np.quantile(
         np.repeat(place[60:], most.sum(0).astype(int)),
         [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9],
@@ -224,9 +222,8 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     assert level == pytest.approx(
         np.where(sizes > 0, 3 * sizes - 0.05 * share, 0), abs=1e-12
     )
-    upright = Proxy(
-        angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
-    )  # a library of normal incidence alone
+    # a library of normal incidence alone
+    upright = Proxy(angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0)
     flat = dataclasses.replace(lens, proxy=upright)
     response.fill_response(
         flat, (0.94, library_incidence(flat, (0.17, -0.31))), phase, level

@@ -13,10 +13,8 @@ from metalens import psf
 
 PITCH, WAVE, DISTANCE, DEPTH = 0.41, 0.87, 21.0, 170.0
 TANGENTS = np.array([0.21, -0.33])
-SAMPLES, STEP = (
-    (4, 2),
-    2.3,
-)  # (x, y): 9 um of a window at 21 um, so that rays to its rim are of another slope
+# (x, y): 9 um of a window at 21 um, so that rays to its rim are of another slope
+SAMPLES, STEP = ((4, 2), 2.3)
 
 
 def maps(shape=(37, 44)):
@@ -105,9 +103,8 @@ def test_what_rays_to_the_middle_leave_out_is_in_the_budget(kind, method):
     assert made.reason.startswith(method)
     held = plain(phase, level, kind, middle=True)
     true = plain(phase, level, kind)
-    assert (
-        np.linalg.norm(made.intensity[0] - held) / np.linalg.norm(held) < 1e-6
-    )  # what was asked for
+    # what was asked for
+    assert np.linalg.norm(made.intensity[0] - held) / np.linalg.norm(held) < 1e-6
     left = np.linalg.norm(made.intensity[0] - true) / np.linalg.norm(true)
     assert left > 1e-4  # far above the tolerance
     # all eight points are looked at: 1.7 times the truth, to the numerical errors

@@ -17,9 +17,8 @@ from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
 
-PHASE = np.array(
-    [[0.0, 1.15 * math.pi], [-0.4, -1.9]]
-)  # of diameter and wavelength: delays of 0.9 to 4.3 um
+# of diameter and wavelength: delays of 0.9 to 4.3 um
+PHASE = np.array([[0.0, 1.15 * math.pi], [-0.4, -1.9]])
 PROXY = Proxy(PHASE, np.array([[0.85, 0.05]]), (0.08, 0.22), (0.80, 0.90), 0.0, 0.0)
 LINE = np.array([[826, 0.0], [843, 1.0], [851, 0.35], [868, 0.8], [877, 0.0]])
 
@@ -46,9 +45,8 @@ def source(tmp_path):
 
 
 def many():
-    nm = np.linspace(
-        826, 877, 103
-    )  # a step of 0.5 nm: paths of 40 um turn by a sixth of a turn
+    # a step of 0.5 nm: paths of 40 um turn by a sixth of a turn
+    nm = np.linspace(826, 877, 103)
     share = np.interp(nm, *LINE.T)
     return SpectralNodes(nm * 1e-3, share / share.sum(), 0.0)
 

@@ -46,12 +46,10 @@ def _airy(indices, heights, light, z):
         return e, np.cross(k, e)
 
     pairs = [(wave(n, q), wave(n, -q)) for n, q in zip(indices, kz, strict=True)]
-    feet = np.concatenate(
-        [[0.0], np.cumsum(heights)]
-    )  # every wave has its phase 0 at the lower end of its medium,
-    count = (
-        2 * (len(indices) - 1)
-    )  # that of the substrate at the top of it; unknowns: down in 0, both, ..., up in last
+    # every wave has its phase 0 at the lower end of its medium,
+    feet = np.concatenate([[0.0], np.cumsum(heights)])
+    # that of the substrate at the top of it; unknowns: down in 0, both, ..., up in last
+    count = 2 * (len(indices) - 1)
     system = np.zeros((2 * count, count), complex)
     right = np.zeros(2 * count, complex)
     for i in range(len(indices) - 1):
@@ -163,9 +161,8 @@ def test_fields_of_both_sides_give_the_derivative_of_t_that_the_modal_engine_has
     one, other = (
         near_field(cell, SIZE, Incidence(WAVELENGTH), **grid) for cell in (ROUND, back)
     )
-    mirrored = (
-        other.e[:, ::-1] * np.array([1, 1, -1])[:, None, None, None]
-    )  # z -> height - z
+    # z -> height - z
+    mirrored = other.e[:, ::-1] * np.array([1, 1, -1])[:, None, None, None]
     inside = one.index[0].real > 2
     mean = (one.e * mirrored).sum(axis=0)[:, inside].mean(axis=1) @ weights / 2 * 0.45
     share = math.pi / 4 * SIZE**2 / 0.36**2

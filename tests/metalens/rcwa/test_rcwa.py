@@ -196,9 +196,8 @@ def test_any_lossless_cell_conserves_power_and_is_reciprocal(
         amplitude(side, fill * pitch_um, harmonics=3, **light)
         for side in (cell, turned_over(cell))
     )
-    assert (
-        abs(there.energy - 1) < 1e-9
-    )  # some draws sit on a mode or an order at its cut-off
+    # some draws sit on a mode or an order at its cut-off
+    assert abs(there.energy - 1) < 1e-9
     assert abs(there.t - back.t) < 1e-9
 
 
@@ -261,9 +260,8 @@ def test_error_and_estimate_against_the_modal_method(cell, wavelength_um, values
     error = np.abs(
         [got.t - want for got, want in zip(results, values.values(), strict=True)]
     )
-    assert (
-        error.max() < 1.5e-2
-    )  # algebraic convergence; the flank at 302 nm needs more orders
+    # algebraic convergence; the flank at 302 nm needs more orders
+    assert error.max() < 1.5e-2
     assert (error < [got.t_error for got in results]).all()
 
 

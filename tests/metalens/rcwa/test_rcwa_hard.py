@@ -179,7 +179,6 @@ def test_hard_cell_on_which_public_codes_disagree():
 
 def test_hard_single_precision_input_is_computed_in_double():
     got = amplitude(CELL, np.float32(0.2), np.float32(WAVELENGTH))
-    assert (
-        abs(got.t - amplitude(CELL, 0.2).t) < 3e-5
-    )  # rounding of the input times the slopes, 130 / um and 70 / um
+    # rounding of the input times the slopes, 130 / um and 70 / um
+    assert abs(got.t - amplitude(CELL, 0.2).t) < 3e-5
     assert isinstance(got.t, complex)

@@ -39,9 +39,8 @@ def test_error_estimate_holds(entry):
     got = solve(entry, 8)
     error = abs(got.t - complex(*entry["t"]))
     assert error <= got.t_error + entry["uncertainty"]
-    assert (
-        abs(got.r - complex(*entry["r"])) <= 3 * got.t_error + entry["uncertainty"]
-    )  # the estimate is made for t
+    # the estimate is made for t
+    assert abs(got.r - complex(*entry["r"])) <= 3 * got.t_error + entry["uncertainty"]
     if entry["cell"]["pillar"][1] == 0:
         assert abs(got.energy - 1) < 1e-11
 

@@ -70,9 +70,8 @@ def test_many_sides_are_a_circle_of_equal_area():
     polygon = rcwa.jones(
         Cell(0.35, **ABOUT, shape=RegularPolygon(48)), 0.2 * swell, WAVE, harmonics=6
     )
-    assert (
-        np.abs(circle.t - polygon.t).max() < 1e-3
-    )  # of second order in the 1.3 % by which corners stand out
+    # of second order in the 1.3 % by which corners stand out
+    assert np.abs(circle.t - polygon.t).max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -148,9 +147,8 @@ def test_geometric_phase_turns_by_twice_the_angle():
         return np.array([1, 1j]) @ got.t @ np.array([1, 1j]) / 2
 
     turn = np.angle(flipped(0.3) / flipped(0.0))
-    assert (
-        abs(turn - 0.6) < 0.1
-    )  # truncation at 6 orders, and the square lattice does not turn along
+    # truncation at 6 orders, and the square lattice does not turn along
+    assert abs(turn - 0.6) < 0.1
 
 
 def test_hexagonal_lattice_has_no_preferred_direction_for_round_pillars():
@@ -181,9 +179,8 @@ def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
         shape=Rectangle(0.5),
         layers=(Layer(0.5, grow_um=-0.02, coat_um=0.01, coat=Index(2.6)),),
     )
-    assert (
-        np.abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
-    )  # normals of the inner wall differ
+    # normals of the inner wall differ
+    assert np.abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
 
 
 def test_a_hole_is_the_pillar_with_materials_exchanged():
@@ -198,9 +195,8 @@ def test_solve_gives_the_diagonal_and_refuses_what_touches():
     got = rcwa.jones(cell, 0.25, WAVE, harmonics=5)
     for polarization, place in (("x", 0), ("y", 1), ("p", 0), ("s", 1)):
         one = rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t
-        assert (
-            abs(one - got.t[place, place]) < 1e-12
-        )  # one light of the two: other sums, the same orders
+        # one light of the two: other sums, the same orders
+        assert abs(one - got.t[place, place]) < 1e-12
     with pytest.raises(CellError, match="touches its neighbour"):
         rcwa.solve(cell, 0.36, WAVE)
 

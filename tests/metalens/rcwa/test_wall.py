@@ -63,6 +63,5 @@ def test_layers_tilt_on_their_own_and_keep_power():
         for c in (cell, whole)
     )
     assert np.abs(cut.energy - 1).max() < 1e-9
-    assert (
-        np.abs(cut.t - one.t).max() < 2e-4
-    )  # the same pillar in one piece: what the staircases leave
+    # the same pillar in one piece: what the staircases leave
+    assert np.abs(cut.t - one.t).max() < 2e-4

@@ -124,14 +124,12 @@ def test_a_curve_with_gaps_is_drawn_but_for_these(tmp_path, gap):
         drawn = _canvas(
             tmp_path, [CurvePanel("line", x, "x", {"y": y}, "y")], ".uplot canvas"
         )
-        wide.append(
-            int((np.ptp(drawn, axis=-1) > 40).any(0).sum())
-        )  # columns with colour: axes and grid are grey
+        # columns with colour: axes and grid are grey
+        wide.append(int((np.ptp(drawn, axis=-1) > 40).any(0).sum()))
         (tmp_path / "page.html").unlink()
     assert wide[0] > 0.8 * drawn.shape[1]
-    assert 1 - wide[1] / wide[0] == pytest.approx(
-        0.03, abs=0.005
-    )  # ends of lines: 2 px of 1000 each
+    # ends of lines: 2 px of 1000 each
+    assert 1 - wide[1] / wide[0] == pytest.approx(0.03, abs=0.005)
 
 
 def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):

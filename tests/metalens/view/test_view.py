@@ -189,9 +189,8 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
         number = float(
             re.search(r"x 0.25 µm, y 0.25 µm: ([0-9.e-]+) of", shown).group(1)
         )
-        angle, depth, *_ = np.unravel_index(
-            int(stack.argmax()), stack.shape
-        )  # sliders begin at the highest peak
+        # sliders begin at the highest peak
+        angle, depth, *_ = np.unravel_index(int(stack.argmax()), stack.shape)
         assert number == pytest.approx(
             float(stack[angle, depth, 14, 14] / stack.max()), rel=1e-3
         )  # four digits

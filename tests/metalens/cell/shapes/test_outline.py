@@ -102,9 +102,8 @@ def test_an_outline_moved_out_grows_as_steiner_says(grow):
     assert edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0] == pytest.approx(
         np.zeros(3), abs=1e-12
     )
-    other = np.array(
-        sorted(outline.offset_corners(corners[::-1], grow))
-    )  # clockwise corners are turned round first
+    # clockwise corners are turned round first
+    other = np.array(sorted(outline.offset_corners(corners[::-1], grow)))
     assert other == pytest.approx(np.array(sorted(made.tolist())), rel=1e-9)
     with pytest.raises(CellError, match="loses an edge"):
         outline.offset_corners(corners, -0.5)

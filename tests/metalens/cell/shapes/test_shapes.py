@@ -40,9 +40,8 @@ def test_fourier_factors_and_area_against_a_sum_over_pixels(shape):
     axis = (np.arange(601) - 300) * step
     x, y = np.meshgrid(axis, axis)
     solid = outline.inside(x, y)
-    edge = (
-        4 * outline.radius_um * step * step**0.5
-    )  # pixels on the rim are right or wrong at random
+    # pixels on the rim are right or wrong at random
+    edge = 4 * outline.radius_um * step * step**0.5
     assert abs(solid.sum() * step**2 - outline.area_um2) < 10 * edge
     for gx, gy in ((7.0, -11.0), (0.0, 23.0), (-31.0, 4.0), (0.0, 0.0)):
         wave = (solid * np.exp(-1j * (gx * x + gy * y))).sum() * step**2

@@ -65,9 +65,8 @@ def test_depths_that_no_image_tells_apart_are_worth_the_least_logarithm():
     loss, _ = AxialObjective(SMALL, far).loss(
         torch.zeros(136, 136, dtype=torch.float64), 20e3, torch.Generator()
     )
-    assert float(loss) == pytest.approx(
-        -math.log(1e-4), abs=1e-3
-    )  # 1e-7 of information over the floor
+    # 1e-7 of information over the floor
+    assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)
 
 
 def test_the_same_seed_gives_the_same_phase():
@@ -156,9 +155,8 @@ def test_what_is_left_out_follows_the_lens():
     assert half.sample_um == pytest.approx(1.3 / 4, rel=0.03)
     own = FisherSettings(depths_mm=(7.0, 8.0)).about(Focus(0.85, 2000.0, 20e3), 500.0)
     assert 7.0 < own.focus_mm[0] < own.focus_mm[1] < 8.0
-    assert (
-        own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99
-    )  # holds the blur of a lens for 20 mm
+    # holds the blur of a lens for 20 mm
+    assert own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99
 
 
 def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
@@ -176,9 +174,8 @@ def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
         ).information.mean()
         for s in (asked, fine)
     )
-    assert float(got) == pytest.approx(
-        float(want), rel=0.02
-    )  # interpolation between samples when pixels are cut
+    # interpolation between samples when pixels are cut
+    assert float(got) == pytest.approx(float(want), rel=0.02)
 
 
 def test_pixels_wider_than_a_spot_are_refused():
