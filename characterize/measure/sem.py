@@ -1,38 +1,41 @@
-"""Electron micrographs to pillar diameters: radial edges to a fraction of a pixel,
-missing and collapsed pillars.
+"""Electron micrographs to pillar diameters: a blurred disc is fitted to the pixels of
+each lattice cell; missing, collapsed and oval pillars are named.
 """
 
-import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from scipy import integrate, ndimage, special
 
-from characterize.measure import radial
 from characterize.measure.lattice import ImageLattice, find_lattice
-from characterize.measure.radial import RAYS
 from characterize.model import KnownValue
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, CaptureError
 
-# least share of rays whose edges lie on one circle; half on a bar of aspect ratio 2
-_ROUND = 2 / 3
-# sites that test a candidate lattice, and discs that give the blur of a picture
-_TRIED = 25
-# radius over blur above which a disc's own blur replaces the median of the picture
-_TELLS = 3.0
-# share of sites that decides about a lattice or a picture
+# share of sites that decides about a picture
 MOST = 0.5
 # length over width above which a pillar counts as oval: a circle's radius is off by
 # 0.4 % there
 _OVAL = 1.15
-# standard errors of narrow discs (7 to 12 pixels, noise 0.1) over those of edges alone
-_LEVELS = 1.2
-# error of the blur's effect on a radius, as a share of it: clean discs (7 to 30 pixels,
-# blur 0.5 to 2.5)
-_UNSURE = 0.1
+# displacement from its site, over the pitch, from which a pillar counts as collapsed
+_DISPLACED = 0.2
+# area of a pillar over the median of the picture, up to which it counts as missing
+_SMALL = 0.04
+# least share of a round pillar's pixels within the ellipse of its area
+_ELLIPTIC = 0.8
+# level above the gap over that of the rim's crest, from which it belongs to the crest
+_CREST = 0.95
+# relative scatter of blur and height in one picture; error by the places of the pixels
+_COMMON, _PIXEL_ERROR = 0.05, 0.005
+# parameters of a disc: row, column, radius, r(t) terms of sin 2t and cos 2t, logarithm
+# of the blur, level of the gap, height above it
+_BLUR, _HEIGHT = 5, 7
+# Gauss-Newton: iterations, longest step and step that ends them, pixels
+_ITERATIONS, _LONGEST, _TOLERANCE = 30, 1.0, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +65,8 @@ class MeasuredDiameters:
 
     row, column: (p,) centres in pixels.
     diameter_nm: (p,) nan where the pillar is missing, collapsed or oval.
-    sigma_nm: (p,) standard error of each diameter: noise of edges, rim and gap, and a
-    tenth of the correction for blur. A bright rim adds a constant (edge_bias_nm).
+    sigma_nm: (p,) standard error of each diameter: noise of the pixels and a
+    hundredth of a pixel. A bright rim adds a constant (edge_bias_nm).
     missing: (p,) no pillar at the site. collapsed: (p,) off its site, or not round.
     oval: (p,) longer than wide by more than 15 %, beyond noise; not measured.
     site: (p, 2) lattice index j and i. lattice: places of the sites in pixels.
@@ -82,16 +85,6 @@ class MeasuredDiameters:
     @property
     def _good_nm(self) -> Array:
         return np.asarray(self.diameter_nm[np.isfinite(self.diameter_nm)])
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether most sites hold no round pillar, so that the lattice may be wrong."""
-        return bool(self.collapsed.mean() > MOST)
-
-    @property
-    def whole(self) -> float:
-        """Share of sites that hold a pillar, round or oval."""
-        return float(1 - (self.missing | self.collapsed).mean())
 
     @property
     def mean_nm(self) -> float:
@@ -128,8 +121,10 @@ class MeasuredDiameters:
 def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     """Diameters of all pillars on the lattice of a top-down micrograph.
 
-    Rims must be brighter than the gaps. Where most sites hold no round pillar, lattices
-    shifted by half a cell are tried too: pillars with dark tops.
+    A threshold (Otsu 1979) separates the pillars, and their Fourier transform gives the
+    lattice. A disc blurred by a Gaussian is fitted to the pixels of every cell, then
+    again with the median blur and height of all pillars as priors. Rims must be brighter
+    than the gaps.
 
     Args:
         image: (y, x) picture.
@@ -143,89 +138,55 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
         raise CaptureError(
             f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values"
         )
-    pitch = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
-    first_pass = _levelled(picture, pitch or min(picture.shape) / 4)
-    lattice = find_lattice(first_pass, pitch)
-    flat = _levelled(picture, lattice.pitch_px) if pitch is None else first_pass
-    measured = _measure_on_lattice(flat, lattice, about)
-    if not measured.doubtful:
-        return measured
-    candidates = [
-        candidate
-        for candidate in _shifted_lattices(lattice)
-        if len(candidate.sites(flat.shape)[0])
-    ]
-    whole_shares = [
-        _measure_on_lattice(flat, candidate, about, sample=_TRIED).whole
-        for candidate in candidates
-    ]
-    return (
-        _measure_on_lattice(flat, candidates[int(np.argmax(whole_shares))], about)
-        if max(whole_shares, default=0.0) > MOST
-        else measured
-    )
-
-
-def _shifted_lattices(lattice: ImageLattice) -> list[ImageLattice]:
-    """The lattice shifted by half of a + b, of a and of b."""
-    a, b = lattice.a / 2, lattice.b / 2
-    return [
-        dataclasses.replace(lattice, origin=lattice.origin + step)
-        for step in (a + b, a, b)
-    ]
-
-
-def _measure_on_lattice(
-    flat: Array, lattice: ImageLattice, about: SemMicrograph, *, sample: int = 0
-) -> MeasuredDiameters:
-    """Pillars at the sites of a lattice in a levelled picture.
-
-    Args:
-        flat: (y, x) levelled picture.
-        lattice: the sites.
-        about: pixel size and edge bias.
-        sample: number of sites to measure, evenly from all; 0 for all.
-    """
-    places, site = (
-        values[:: max(len(values) // sample, 1) if sample else 1]
-        for values in lattice.sites(flat.shape)
-    )
-    steps = [_edge_step(flat, row, column, lattice.pitch_px) for row, column in places]
-    median_step = float(np.median(steps)) if steps else 0.0
-    results = [
-        _pillar(
-            flat, row, column, lattice.pitch_px, is_present=step > 0.4 * median_step
-        )
-        for (row, column), step in zip(places, steps, strict=True)
-    ]
-    if not results:
+    stated_px = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
+    flat = _levelled(picture, stated_px or min(picture.shape) / 4)
+    lattice = find_lattice(_pillar_mask(flat), stated_px)
+    pitch = lattice.pitch_px
+    flat = _levelled(picture, pitch)
+    labels = ndimage.label(_pillar_mask(flat))[0]
+    places, site = lattice.sites(flat.shape)
+    if not len(places):
         raise CaptureError("no whole pillar in the picture; need a wider picture")
-    row, column, radius, sigma, missing, collapsed = (
-        np.array(values) for values in zip(*results, strict=True)
+    cells = [_cell(flat, labels, place, pitch / 2) for place in places]
+    area = np.array([cell.pillar.sum() for cell in cells])
+    missing = area <= _SMALL * np.median(area)
+    discs = np.array([_first_disc(cell, pitch) for cell in cells])
+    upright = ~missing & (np.hypot(*(discs[:, :2] - places).T) < _DISPLACED * pitch)
+    chosen = np.flatnonzero(upright).tolist()
+    rim_px = _rim_width([cells[k] for k in chosen], discs[chosen])
+    sigma = np.full(8, math.inf)
+    sigma[_BLUR] = 1.0
+    first = np.array([_fit_disc(cells[k], discs[k], sigma, rim_px)[0] for k in chosen])
+    errors = np.full(discs.shape, math.nan)
+    is_round = np.zeros(len(cells), bool)
+    if chosen:
+        blur, height = np.median(first[:, [_BLUR, _HEIGHT]], axis=0)
+        spread = 1.4826 * np.median(np.abs(first[:, _HEIGHT] - height))
+        discs[:, _BLUR], sigma[_BLUR] = blur, _COMMON
+        discs[:, _HEIGHT], sigma[_HEIGHT] = height, max(spread, _COMMON * height)
+    for k in chosen:
+        discs[k], errors[k] = _fit_disc(cells[k], discs[k], sigma, rim_px)
+        is_round[k] = _elliptic_share(cells[k], discs[k]) > _ELLIPTIC
+    radius = discs[:, 2]
+    second = np.hypot(discs[:, 3], discs[:, 4])
+    collapsed = ~missing & ~(
+        is_round
+        & (np.hypot(*(discs[:, :2] - places).T) < _DISPLACED * pitch)
+        & (second < radius)
     )
-    raw_radius = np.where(collapsed.astype(bool), np.nan, radius)
-    radius, sigma = _deblurred_radii(
-        flat, np.stack([row, column], 1), raw_radius, sigma, lattice.pitch_px
+    oval = (
+        ~missing
+        & ~collapsed
+        & (second > 4 * errors[:, 3])
+        & (radius + second > _OVAL * (radius - second))
     )
-    diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
-    missing = missing.astype(bool)
-    collapsed = collapsed.astype(bool)
-    on_site = ~missing & (
-        np.hypot(*(np.stack([row, column], 1) - places).T) < 0.2 * lattice.pitch_px
-    )
-    oval = np.array(
-        [
-            is_on_site and _is_oval(flat, y, x, lattice.pitch_px)
-            for is_on_site, y, x in zip(on_site, row, column, strict=True)
-        ]
-    )
-    collapsed = collapsed & ~oval
-    diameter = np.where(missing | collapsed | oval, np.nan, diameter)
+    good = ~(missing | collapsed | oval)
+    diameter = 2 * np.sqrt(radius**2 + second**2 / 2) * about.pixel_nm
     return MeasuredDiameters(
-        row,
-        column,
-        diameter,
-        2 * sigma * about.pixel_nm,
+        discs[:, 0],
+        discs[:, 1],
+        np.where(good, diameter - 2 * about.edge_bias_nm, math.nan),
+        2 * errors[:, 2] * about.pixel_nm,
         missing,
         collapsed,
         site,
@@ -235,14 +196,157 @@ def _measure_on_lattice(
 
 
 def _levelled(image: Array, pitch: float) -> Array:
-    """(y, x) picture less its slow background along rows and in 2D; its 10th and 90th
-    percentile become 0 and 1.
-    """
+    """(y, x) picture less its slow background along rows and in 2D."""
     row_level = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
     flat = image - row_level[:, None]
-    flat = flat - ndimage.gaussian_filter(flat, 1.5 * pitch)
-    low, high = np.percentile(flat, [10, 90])
-    return np.asarray((flat - low) / max(high - low, 1e-12))
+    return np.asarray(flat - ndimage.gaussian_filter(flat, 1.5 * pitch))
+
+
+def _pillar_mask(flat: Array) -> Array:
+    """(y, x) True in pillars: above Otsu's threshold, dark tops within rims filled."""
+    import cv2
+
+    smooth = ndimage.gaussian_filter(flat, 1.0)
+    low, high = smooth.min(), smooth.max()
+    grey = np.uint8(255 * (smooth - low) / max(high - low, 1e-300))
+    threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)
+    return np.asarray(ndimage.binary_fill_holes(grey > threshold))
+
+
+class _Cell(NamedTuple):
+    """Pixels about a lattice site: (2, n) row and column, (n,) level, (n,) whether they
+    belong to its pillar.
+    """
+
+    points: Array
+    level: Array
+    pillar: Array
+
+
+def _cell(flat: Array, labels: Array, place: Array, reach: float) -> _Cell:
+    """Pixels within ``reach`` of a place that belong to its largest pillar or to none.
+
+    Args:
+        flat: (y, x) levelled picture.
+        labels: (y, x) number of the pillar, 0 in the gaps.
+        place: (row, column) of the site.
+        reach: pixels.
+    """
+    low = np.maximum(np.floor(place - reach).astype(int), 0)
+    high = np.ceil(place + reach).astype(int) + 1
+    window = (slice(low[0], high[0]), slice(low[1], high[1]))
+    points = np.stack(np.nonzero(labels[window] >= 0)) + low[:, None]
+    label = labels[window].ravel()
+    count = np.bincount(label[label > 0], minlength=2)
+    inside = np.hypot(*(points - place[:, None])) <= reach
+    inside &= (label == 0) | (label == count.argmax())
+    return _Cell(points[:, inside], flat[window].ravel()[inside], label[inside] > 0)
+
+
+def _first_disc(cell: _Cell, pitch: float) -> Array:
+    """(8,) disc with the centroid and area of the cell's pillar."""
+    pillar = cell.pillar
+    if not pillar.any() or pillar.all():
+        return np.full(8, math.nan)
+    row, column = cell.points[:, pillar].mean(1)
+    gap = cell.level[~pillar].mean()
+    height = cell.level[pillar].mean() - gap
+    radius = math.sqrt(pillar.sum() / math.pi)
+    return np.array([row, column, radius, 0, 0, math.log(1.5), gap, height])
+
+
+def _rim_width(cells: Sequence[_Cell], discs: Array) -> float:
+    """Distance from the edge to the inner end of the rim's crest, pixels; the radius of
+    the widest pillar where tops are as bright as rims.
+
+    The profile is the mean over all pillars at equal distance inside their edges.
+
+    Args:
+        cells: pixels of the pillars.
+        discs: (k, 8) their first discs.
+    """
+    depth = [
+        disc[2] - np.hypot(*(cell.points - disc[:2, None]))
+        for cell, disc in zip(cells, discs, strict=True)
+    ]
+    bin_number = np.rint(np.concatenate([[0.0], *depth])).astype(int)
+    level = np.concatenate([[0.0], *(cell.level for cell in cells)])
+    bin_number, level = bin_number[bin_number >= 0], level[bin_number >= 0]
+    profile = np.bincount(bin_number, level) / np.maximum(np.bincount(bin_number), 1)
+    gap = np.median(discs[:, 6]) if cells else 0.0
+    crest = int(profile.argmax())
+    below = np.flatnonzero(profile[crest:] - gap < _CREST * (profile[crest] - gap))
+    return float(crest + below[0] - 1) if len(below) else math.inf
+
+
+def _fit_disc(
+    cell: _Cell, mean: Array, sigma: Array, rim_px: float
+) -> tuple[Array, Array]:
+    """Gauss-Newton fit of a blurred disc to the pixels from the crest of its rim
+    outwards, with white noise and Gaussian priors: (8,) parameters, standard errors.
+
+    Args:
+        cell: pixels of the pillar.
+        mean: (8,) start and mean of the prior.
+        sigma: (8,) standard deviations of the prior.
+        rim_px: distance from the edge to the inner end of the crest.
+    """
+    reach = np.hypot(*(cell.points - mean[:2, None]))
+    order = np.argsort(reach)[np.count_nonzero(reach < mean[2] - rim_px) :]
+    points, level = cell.points[:, order], cell.level[order]
+    disc = mean.copy()
+    for _ in range(_ITERATIONS):
+        expected, slopes = _disc_image(points, disc)
+        residual = level - expected
+        variance = residual @ residual / max(len(level) - 8, 1) + 1e-12 * mean[7] ** 2
+        covariance = np.linalg.pinv(slopes.T @ slopes / variance + np.diag(sigma**-2))
+        step = covariance @ (slopes.T @ residual / variance + (mean - disc) / sigma**2)
+        longest = np.abs(step[:5]).max()
+        disc += step * min(1, _LONGEST / longest)
+        if longest < _TOLERANCE:
+            break
+    return disc, np.sqrt(np.diag(covariance) + _PIXEL_ERROR**2)
+
+
+def _disc_image(points: Array, disc: Array) -> tuple[Array, Array]:
+    """Levels of a disc blurred by a Gaussian at (2, n) points, and their (n, 8)
+    derivatives.
+
+    A disc of radius R and blur s has the derivatives R / s² exp(-(R² + r²) / 2 s²)
+    times I0(R r / s²) by R and -I1(R r / s²) by the distance r from its middle, where
+    its level is 1 - exp(-R² / 2 s²). The level is the integral along r.
+
+    Args:
+        points: (2, n) row and column.
+        disc: (8,) row, column, radius R, terms of sin 2t and cos 2t that are taken off
+            r, log s, level of the gap, height.
+    """
+    row, column, radius, sine_term, cosine_term, log_blur, gap, height = disc
+    dy, dx = points[0] - row, points[1] - column
+    distance = np.maximum(np.hypot(dy, dx), 1e-9)
+    sine, cosine = dy / distance, dx / distance
+    sine2, cosine2 = 2 * sine * cosine, cosine**2 - sine**2
+    r = np.maximum(distance - sine_term * sine2 - cosine_term * cosine2, 0)
+    blur = math.exp(np.clip(log_blur, -2, 5))
+    grid = np.arange(0, r.max() + blur, blur / 10)
+    density = radius / blur**2 * np.exp(-0.5 * ((grid - radius) / blur) ** 2)
+    falls = density * special.i1e(radius * grid / blur**2)
+    middle = -math.expm1(-0.5 * (radius / blur) ** 2)
+    levels = middle - integrate.cumulative_trapezoid(falls, grid, initial=0)
+    by_r = -np.interp(r, grid, falls)
+    by_radius = np.interp(r, grid, density * special.i0e(radius * grid / blur**2))
+    level = np.interp(r, grid, levels)
+    by_disc = [-sine * by_r, -cosine * by_r, by_radius, -sine2 * by_r, -cosine2 * by_r]
+    by_disc.append(-radius * by_radius - r * by_r)
+    slopes = [*(height * slope for slope in by_disc), np.ones_like(r), level]
+    return gap + height * level, np.stack(slopes, 1)
+
+
+def _elliptic_share(cell: _Cell, disc: Array) -> float:
+    """Share of a pillar's pixels within the fitted ellipse of its area."""
+    levels = _disc_image(cell.points, disc)[0]
+    brightest = np.argsort(-levels, kind="stable")[: cell.pillar.sum()]
+    return float(cell.pillar[brightest].mean())
 
 
 def instrument_pixel_nm(path: Path) -> float | None:
@@ -308,238 +412,3 @@ def scale_from_bar(image: Array, bar_nm: float) -> float:
             f"no scale bar: longest bright run is {longest} pixels; give pixel_nm instead"
         )
     return bar_nm / longest
-
-
-def _rays(
-    flat: Array, row: float, column: float, pitch: float
-) -> tuple[Array, Array, Array]:
-    """Levels along rays from a point.
-
-    Returns:
-        (r,) distances in pixels, (rays,) angles in rad, (r, rays) levels, smoothed
-        along and across the rays.
-    """
-    angle = (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
-    step_px = min(0.25, pitch / 120)
-    distance = np.arange(0, 0.5 * pitch + 1, step_px)
-    indices = (
-        row + distance[:, None] * np.sin(angle),
-        column + distance[:, None] * np.cos(angle),
-    )
-    rays = ndimage.map_coordinates(flat, indices, order=1, mode="nearest")
-    sigma_px = radial.ray_smoothing(pitch) / step_px
-    return (
-        distance,
-        angle,
-        ndimage.gaussian_filter(rays, (sigma_px, 1.0), mode=("nearest", "wrap")),
-    )
-
-
-def _deblurred_radii(
-    flat: Array, place: Array, radius: Array, sigma: Array, pitch: float
-) -> tuple[Array, Array]:
-    """Radii and standard errors in pixels, with narrow discs corrected for blur.
-
-    The blur is the median variance of ``_TRIED`` or more discs. A disc wider than
-    ``_TELLS`` blurs takes its own, which cancels noise of its rim and gap levels.
-
-    Args:
-        flat: (y, x) levelled picture.
-        place: (p, 2) row and column of the pillars.
-        radius: (p,) radii; nan where not measured.
-        sigma: (p,) standard errors.
-        pitch: lattice constant, pixels.
-    """
-    radius = radius.copy()
-    sigma = sigma.copy()
-    smooth = radial.ray_smoothing(pitch)
-
-    def blur_at(k: int) -> float:
-        reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
-        return radial.blur_variance(reach, rays, smooth)
-
-    measured = np.flatnonzero(np.isfinite(radius)).tolist()
-    own_variance = {k: blur_at(k) for k in measured[:: max(len(measured) // _TRIED, 1)]}
-    variances = np.array(list(own_variance.values()))
-    if np.isfinite(variances).sum() <= MOST * len(variances):
-        return radius, sigma
-    median_variance = float(np.nanmedian(variances))
-    for k in measured:
-        variance_used = median_variance
-        if radial.is_wide_disc(radius[k], median_variance, smooth, times=_TELLS):
-            variance = own_variance[k] if k in own_variance else blur_at(k)
-            variance_used = variance if math.isfinite(variance) else median_variance
-        circle = _fit_circle(flat, place[k, 0], place[k, 1], pitch, variance_used)
-        if circle is not None and math.isfinite(circle[2]):
-            radius[k], sigma[k] = circle[2:4]
-    return radius, sigma
-
-
-def _edge_step(flat: Array, row: float, column: float, pitch: float) -> float:
-    """Level of a pillar's rim less that of the gap, from the mean over all rays."""
-    distance, _, rays = _rays(flat, row, column, pitch)
-    inner, outer, _ = radial.rim_and_gap_levels(distance, rays)
-    return inner - outer
-
-
-def _pillar(
-    flat: Array, row: float, column: float, pitch: float, *, is_present: bool
-) -> tuple[float, float, float, float, bool, bool]:
-    """(row, column, radius, standard error, missing, collapsed) of the pillar at a
-    lattice site, in pixels.
-
-    The circle is fitted up to four times about its new middle.
-
-    Args:
-        row: site. column: site.
-        pitch: lattice constant.
-        is_present: whether the site shows an edge; without, a bright patch in its cell
-            means a fallen pillar.
-    """
-    half = int(pitch / 2)
-    row_px = int(round(row))
-    column_px = int(round(column))
-    patch = flat[
-        max(row_px - half, 0) : row_px + half + 1,
-        max(column_px - half, 0) : column_px + half + 1,
-    ]
-    if not is_present:
-        is_fallen = bool(
-            (ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08
-        )  # it lies elsewhere in its cell
-        return row, column, math.nan, math.nan, not is_fallen, is_fallen
-    y = row
-    x = column
-    radius = math.nan
-    sigma = math.nan
-    scatter = math.inf
-    for _ in range(4):
-        circle = _fit_circle(flat, y, x, pitch)
-        if circle is None:
-            return y, x, math.nan, math.nan, False, True
-        dy, dx, radius, sigma, scatter = circle
-        y, x = y + dy, x + dx
-        if math.hypot(dy, dx) < 1e-3:
-            break
-    is_displaced = math.hypot(y - row, x - column) > 0.2 * pitch
-    return (
-        y,
-        x,
-        radius,
-        sigma,
-        False,
-        bool(is_displaced or scatter > max(0.15 * radius, 1.5)),
-    )
-
-
-def _fit_circle(
-    flat: Array, row: float, column: float, pitch: float, blur: float | None = None
-) -> tuple[float, float, float, float, float] | None:
-    """Circle fitted to the half-level crossings of all rays: (dy, dx, radius, standard
-    error, scatter) in pixels; None without edges.
-
-    Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t. The radius is that
-    of equal area, corrected for blur. The scatter is about the circle alone, infinite
-    where too many rays have their edges off it.
-
-    Args:
-        flat: (y, x) levelled picture.
-        row: middle to start from. column: likewise.
-        pitch: lattice constant, pixels.
-        blur: variance of the blur, square pixels, for a disc that is not wide; None
-            takes the steepness of the edges.
-    """
-    distance, angle, rays = _rays(flat, row, column, pitch)
-    inner, outer, rim = radial.rim_and_gap_levels(distance, rays)
-    edge_px = radial.edge_crossings(distance, rays, (inner + outer) / 2, rim)
-    valid = np.isfinite(edge_px)
-    if inner - outer < 0.2 or valid.sum() < RAYS // 2:
-        return None
-    middle = np.median(edge_px[valid])
-    valid &= np.abs(edge_px - middle) < max(0.2 * middle, 2.0)
-    terms = np.stack(
-        [
-            np.ones(RAYS),
-            *(function(k * angle) for k in (1, 2) for function in (np.sin, np.cos)),
-        ],
-        1,
-    )
-    design = terms[valid]
-    (mean, dy, dx, *oval), *_ = np.linalg.lstsq(design, edge_px[valid], rcond=None)
-    residual = edge_px[valid] - design @ np.array([mean, dy, dx, *oval])
-    oval_variance = 0.5 * float(
-        np.square(oval).sum()
-    )  # mean square of the second harmonic
-    independent = _independent_rays(mean)
-    edge_variance = residual.var() / max(
-        1 - len(terms[0]) / (independent * valid.mean()), 0.1
-    )  # of an edge; the terms took some
-    variance_factor = (
-        float(np.linalg.pinv(design.T @ design)[0, 0]) * RAYS / independent
-    )
-    # half of the rim's level and half of the gap's, as noisy as edges, are in every
-    # edge
-    level_factor = 0.25 / _independent_rays(
-        float(distance[rim])
-    ) + 0.25 / _independent_rays(0.5 * (mean + 0.5 * pitch))
-    fitted_px = terms @ np.array([mean, dy, dx, *oval])
-    radius = math.sqrt(mean**2 + oval_variance)
-    smooth = radial.ray_smoothing(pitch)
-    noise = math.sqrt(edge_variance * (variance_factor + level_factor))
-    blur_loss = radial.drawn_in(distance, rays, fitted_px, radius, smooth)
-    corrected = radius + blur_loss
-    systematic = _UNSURE * blur_loss
-    if blur is not None and not radial.is_wide_disc(radius, blur, smooth):
-        (corrected, gain), plain = (
-            radial.deblur_radius(distance, radius, blur, smooth),
-            blur / (2 * radius),
-        )
-        noise = noise * gain * _LEVELS
-        systematic = _UNSURE * (plain + abs(corrected - radius - plain))
-    error = math.hypot(noise, systematic)
-    scatter = (
-        math.sqrt(residual.var() + oval_variance) if valid.mean() > _ROUND else math.inf
-    )
-    return float(dy), float(dx), corrected, error, scatter
-
-
-def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
-    """Whether a pillar is longer than wide by more than ``_OVAL``, beyond four standard
-    errors.
-
-    An ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t, with a² / b² =
-    (A + D) / (A - D), D² = B² + C². The edge of a ray is its steepest fall.
-    """
-    distance, angle, rays = _rays(flat, row, column, pitch)
-    start = int(np.searchsorted(distance, 0.1 * pitch))
-    edge_px = distance[start + np.argmin(np.diff(rays[start:], axis=0), axis=0)]
-    design = np.stack(
-        [np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], 1
-    )
-    valid = np.ones(RAYS, bool)
-    for _ in range(4):
-        powers = np.linalg.lstsq(design[valid], edge_px[valid] ** -2, rcond=None)[0]
-        fitted = np.maximum(design @ powers, 1e-12) ** -0.5
-        residual = edge_px - fitted
-        valid = np.abs(residual) < max(0.2 * float(np.median(edge_px)), 2.0)
-        if valid.sum() < _ROUND * RAYS or powers[0] <= 0:
-            return False
-    level = float(powers[0])
-    second_harmonic = math.hypot(*powers[3:])
-    degrees = max(_independent_rays(level**-0.5) * valid.mean() - 5, 1.0)
-    noise = float((residual[valid] * 2 * fitted[valid] ** -3).std()) * math.sqrt(
-        2 / degrees
-    )
-    return second_harmonic > 4 * noise and level + second_harmonic > _OVAL**2 * (
-        level - second_harmonic
-    )
-
-
-def _independent_rays(radius: float) -> float:
-    """Number of statistically independent rays at a radius in pixels.
-
-    Noise of single pixels is smoothed over rays (a Gaussian of one ray) and by
-    interpolation between pixels (a variance of 1/6).
-    """
-    step = 2 * math.pi * max(radius, 0.5) / RAYS
-    return RAYS / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / (6 * step**2)))
