@@ -208,7 +208,7 @@ def _pillar_mask(flat: Array) -> Array:
 
     smooth = ndimage.gaussian_filter(flat, 1.0)
     low, high = smooth.min(), smooth.max()
-    grey = np.uint8(255 * (smooth - low) / max(high - low, 1e-300))
+    grey = (255 * (smooth - low) / max(high - low, 1e-300)).astype(np.uint8)
     threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)
     return np.asarray(ndimage.binary_fill_holes(grey > threshold))
 
