@@ -1,6 +1,4 @@
-"""Electron micrographs to pillar diameters: a blurred disc is fitted to the pixels of
-each lattice cell; missing, collapsed and oval pillars are named.
-"""
+"""Electron micrographs to pillar diameters, by blurred discs fitted to the pixels."""
 
 import math
 from collections.abc import Sequence
@@ -55,7 +53,8 @@ class SemMicrograph:
         known = self.pitch_nm >= 6 * self.pixel_nm or self.pitch_nm == 0
         if not (self.pixel_nm > 0 and known):
             raise CaptureError(
-                f"pixel_nm {self.pixel_nm}, pitch_nm {self.pitch_nm}: need 6 or more pixels in a pitch"
+                f"pixel_nm {self.pixel_nm}, pitch_nm {self.pitch_nm}: "
+                "need 6 or more pixels in a pitch"
             )
 
 
@@ -123,8 +122,8 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
 
     A threshold (Otsu 1979) separates the pillars, and their Fourier transform gives the
     lattice. A disc blurred by a Gaussian is fitted to the pixels of every cell, then
-    again with the median blur and height of all pillars as priors. Rims must be brighter
-    than the gaps.
+    again with the median blur and height of all pillars as priors. Rims must be
+    brighter than the gaps.
 
     Args:
         image: (y, x) picture.
@@ -136,14 +135,15 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     picture = np.asarray(image, float)
     if picture.ndim != 2 or not np.isfinite(picture).all():
         raise CaptureError(
-            f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values"
+            f"micrograph of shape {picture.shape}: need one grey "
+            "picture (y, x) of finite values"
         )
     stated_px = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
-    flat = _levelled(picture, stated_px or min(picture.shape) / 4)
-    lattice = find_lattice(_pillar_mask(flat), stated_px)
+    flat = subtract_background(picture, stated_px or min(picture.shape) / 4)
+    lattice = find_lattice(pillar_mask(flat), stated_px)
     pitch = lattice.pitch_px
-    flat = _levelled(picture, pitch)
-    labels = ndimage.label(_pillar_mask(flat))[0]
+    flat = subtract_background(picture, pitch)
+    labels = ndimage.label(pillar_mask(flat))[0]
     places, site = lattice.sites(flat.shape)
     if not len(places):
         raise CaptureError("no whole pillar in the picture; need a wider picture")
@@ -156,7 +156,9 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     rim_px = _rim_width([cells[k] for k in chosen], discs[chosen])
     sigma = np.full(8, math.inf)
     sigma[_BLUR] = 1.0
-    first = np.array([_fit_disc(cells[k], discs[k], sigma, rim_px)[0] for k in chosen])
+    first = np.array(
+        [fit_blurred_disc(cells[k], discs[k], sigma, rim_px)[0] for k in chosen]
+    )
     errors = np.full(discs.shape, math.nan)
     is_round = np.zeros(len(cells), bool)
     if chosen:
@@ -165,7 +167,7 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
         discs[:, _BLUR], sigma[_BLUR] = blur, _COMMON
         discs[:, _HEIGHT], sigma[_HEIGHT] = height, max(spread, _COMMON * height)
     for k in chosen:
-        discs[k], errors[k] = _fit_disc(cells[k], discs[k], sigma, rim_px)
+        discs[k], errors[k] = fit_blurred_disc(cells[k], discs[k], sigma, rim_px)
         is_round[k] = _elliptic_share(cells[k], discs[k]) > _ELLIPTIC
     radius = discs[:, 2]
     second = np.hypot(discs[:, 3], discs[:, 4])
@@ -195,15 +197,24 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     )
 
 
-def _levelled(image: Array, pitch: float) -> Array:
-    """(y, x) picture less its slow background along rows and in 2D."""
+def subtract_background(image: Array, pitch: float) -> Array:
+    """(y, x) picture less its slow background along rows and in 2D.
+
+    Args:
+        image: (y, x) picture.
+        pitch: distance of neighbours, pixels.
+    """
     row_level = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
     flat = image - row_level[:, None]
     return np.asarray(flat - ndimage.gaussian_filter(flat, 1.5 * pitch))
 
 
-def _pillar_mask(flat: Array) -> Array:
-    """(y, x) True in pillars: above Otsu's threshold, dark tops within rims filled."""
+def pillar_mask(flat: Array) -> Array:
+    """(y, x) True in pillars: above Otsu's threshold, dark tops within rims filled.
+
+    Args:
+        flat: (y, x) picture without background.
+    """
     import cv2
 
     smooth = ndimage.gaussian_filter(flat, 1.0)
@@ -279,7 +290,7 @@ def _rim_width(cells: Sequence[_Cell], discs: Array) -> float:
     return float(crest + below[0] - 1) if len(below) else math.inf
 
 
-def _fit_disc(
+def fit_blurred_disc(
     cell: _Cell, mean: Array, sigma: Array, rim_px: float
 ) -> tuple[Array, Array]:
     """Gauss-Newton fit of a blurred disc to the pixels from the crest of its rim
@@ -296,7 +307,7 @@ def _fit_disc(
     points, level = cell.points[:, order], cell.level[order]
     disc = mean.copy()
     for _ in range(_ITERATIONS):
-        expected, slopes = _disc_image(points, disc)
+        expected, slopes = blurred_disc_image(points, disc)
         residual = level - expected
         variance = residual @ residual / max(len(level) - 8, 1) + 1e-12 * mean[7] ** 2
         covariance = np.linalg.pinv(slopes.T @ slopes / variance + np.diag(sigma**-2))
@@ -308,7 +319,7 @@ def _fit_disc(
     return disc, np.sqrt(np.diag(covariance) + _PIXEL_ERROR**2)
 
 
-def _disc_image(points: Array, disc: Array) -> tuple[Array, Array]:
+def blurred_disc_image(points: Array, disc: Array) -> tuple[Array, Array]:
     """Levels of a disc blurred by a Gaussian at (2, n) points, and their (n, 8)
     derivatives.
 
@@ -344,7 +355,7 @@ def _disc_image(points: Array, disc: Array) -> tuple[Array, Array]:
 
 def _elliptic_share(cell: _Cell, disc: Array) -> float:
     """Share of a pillar's pixels within the fitted ellipse of its area."""
-    levels = _disc_image(cell.points, disc)[0]
+    levels = blurred_disc_image(cell.points, disc)[0]
     brightest = np.argsort(-levels, kind="stable")[: cell.pillar.sum()]
     return float(cell.pillar[brightest].mean())
 
@@ -409,6 +420,7 @@ def scale_from_bar(image: Array, bar_nm: float) -> float:
         longest = max(longest, int((edges[1::2] - edges[::2]).max(initial=0)))
     if longest < 20:
         raise CaptureError(
-            f"no scale bar: longest bright run is {longest} pixels; give pixel_nm instead"
+            f"no scale bar: longest bright run is {longest} pixels; "
+            "give pixel_nm instead"
         )
     return bar_nm / longest
