@@ -46,18 +46,6 @@ def test_what_is_not_listed_is_unknown_and_along_the_axis(tmp_path):
     assert rows.angle_rad == pytest.approx(np.array([[0.1, math.radians(2)]]))
 
 
-def test_what_an_editor_saved_with_a_byte_order_mark_is_read(tmp_path):
-    for name, text in {
-        "stage.json": json.dumps([{"file": "a.png", "depth_mm": 1.5}]),
-        "capture.toml": "pixel_um = 3.7\n",
-        "stack.json": json.dumps({"pixel_um": 2.9}),
-    }.items():
-        (tmp_path / name).write_text(text, encoding="utf-8-sig")
-    assert stage.read_stage(tmp_path).position_um.tolist() == [1500.0]
-    assert stage.read_about(tmp_path) == {"pixel_um": 3.7}
-    assert stage.read_beside(tmp_path / "stack.tif") == {"pixel_um": 2.9}
-
-
 def test_other_names_and_units_of_a_description_are_taken(tmp_path):
     (tmp_path / "capture.toml").write_text(
         "pixel_size_nm = 65\nz_step_um = -0.2\nemission_nm = 520\n"
@@ -95,15 +83,6 @@ def test_other_names_and_units_of_a_description_are_taken(tmp_path):
 def test_tables_that_could_be_read_in_two_ways_are_refused(tmp_path, table, words):
     (tmp_path / "stage.csv").write_text(table)
     with pytest.raises(CaptureError, match=words):
-        stage.read_stage(tmp_path)
-
-
-def test_rows_are_named_as_an_editor_counts_them(tmp_path):
-    (tmp_path / "stage.csv").write_text("file,depth_um\na.tif,1\nb.tif,x\n")
-    with pytest.raises(CaptureError, match="row 3: depth_um is 'x'"):
-        stage.read_stage(tmp_path)
-    (tmp_path / "stage.csv").write_text("file,depth_um\na.tif,1\n,2\n")
-    with pytest.raises(CaptureError, match="row 3: no 'file'"):
         stage.read_stage(tmp_path)
 
 

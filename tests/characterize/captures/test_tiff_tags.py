@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from characterize.captures import tiff_tags
-from metalens.core.errors import CaptureError
 
 tifffile = pytest.importorskip("tifffile")
 FRAMES = np.arange(4 * 6 * 5, dtype=np.uint16).reshape(4, 6, 5)
@@ -45,17 +44,6 @@ def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit,
     step = f"stage step of {2.5 * um:.4g} um from the ImageJ tags"
     pixel = f"pixel of {um / 8:.4g} um from the tags"
     assert found.notes == (step, f"{pixel} of the file")
-
-
-def test_two_channels_are_refused(tmp_path):
-    tifffile.imwrite(
-        tmp_path / "a.tif",
-        FRAMES.reshape(2, 2, 6, 5),
-        imagej=True,
-        metadata={"axes": "ZCYX"},
-    )
-    with pytest.raises(CaptureError, match="2 channels in one file"):
-        tiff_tags.read_tags(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize(

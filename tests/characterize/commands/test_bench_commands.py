@@ -38,7 +38,22 @@ value = 0.2
 [[parameter]]
 name = "background_e"
 value = 15.0
+[[parameter]]
+name = "coma_x_rad"
+value = 0.3
 """
+# all that the fit is not to look for, and a height that is known to 2 nm
+STATED = [
+    "bias_x_nm", "bias_y_nm", "bias_r_nm", "wavelength_nm", "stage_scale",
+    "astigmatism_rad", "oblique_astigmatism_rad", "coma_y_rad", "trefoil_x_rad",
+    "trefoil_y_rad", "spherical_rad", "background_x_e", "background_y_e",
+    "decentre_x_um", "decentre_y_um",
+]  # fmt: skip
+KNOWN = [("height_nm", 2.0), *((name, 0.0) for name in STATED)]
+METROLOGY = "scan_um = 60.0\n" + "".join(
+    f'[[known]]\nname = "{name}"\nvalue = 0.0\nsigma = {sigma}\n'
+    for name, sigma in KNOWN
+)
 
 
 @pytest.fixture
@@ -71,9 +86,7 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert shoot(bench) == 2  # exists
     assert shoot(bench, "--force", "--quiet") == 0
     assert store.sha256(bench / "shots" / "frame_000.tif") == first
-    (bench / "told.toml").write_text(
-        'scan_um = 60.0\n[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n'
-    )
+    (bench / "told.toml").write_text(METROLOGY)
     capsys.readouterr()
     words = [
         "fit",

@@ -19,11 +19,10 @@ from codesign.optics import image_formation
 from codesign.optics.as_built_lens import MadeLens
 from codesign.optics.stack import PixelPsfStack
 from codesign.settings import RetrainConfig
-from codesign.train import assess, place_on_device
+from codesign.train import assess
 from metalens.core.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
 from tests.codesign import made_lens as m
-from tests.elsewhere import AWAY, elsewhere
 
 SHORT = RetrainConfig(steps=2, draws=2, judge=1, test_batches=1)
 TRUTH = HiddenLens(
@@ -73,18 +72,6 @@ def test_bars_of_a_gap_and_of_an_accuracy():
     )  # 1000 draws: 3 %
     assert set(told.rows()) == {"designed", "nominal", "before", "after"}
     assert told.rows()["after"]["iou"] == 0.75
-
-
-@pytest.mark.parametrize(("gap", "counted"), [(0.019, False), (0.021, True)])
-def test_a_gap_within_two_of_its_errors_is_no_gap(gap, counted):
-    scatter = torch.tensor([0.1, -0.1]).repeat(50)[:, None].expand(100, 3) * math.sqrt(
-        99 / 100
-    )  # bar of 0.01
-    nominal = NetworkAccuracy(torch.ones(100, 3), torch.ones(100))
-    before = NetworkAccuracy(1 + gap + scatter, torch.ones(100))
-    told = RetrainingOutcome(nominal, nominal, before, nominal, None)
-    assert told.gap_sigma_mm == pytest.approx(0.01, rel=1e-5)
-    assert (told.recovered is not None) == counted
 
 
 def test_share_won_back_is_that_of_the_gap():
@@ -189,28 +176,6 @@ def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_
     before = source.run.trainer.model.net.state_dict()
     assert any(
         not torch.equal(before[n], v) for n, v in whole.model.net.state_dict().items()
-    )
-
-
-def test_a_job_trains_where_its_run_is_placed(folder, found):
-    """On the played device its losses are the processor's, and its frames are imaged
-    there.
-    """
-    plain = retraining.make_job(
-        finished.load_finished_run(folder), SHORT, found, "retrained"
-    )
-    want = next(plain.run(until=1))
-    source = finished.load_finished_run(folder)
-    with elsewhere() as done:
-        place_on_device(source.run.trainer, AWAY)
-        going = retraining.make_job(source, SHORT, found, "retrained")
-        told = next(going.run(until=1))
-        judged = retraining.judge_network(going, source, SHORT, found.judges)
-    assert {"convolution_backward", "_fft_r2c"} <= done
-    assert told.loss == pytest.approx(want.loss, rel=1e-5)
-    list(plain.run(until=1))
-    assert judged.slip_mm == pytest.approx(
-        retraining.judge_network(plain, source, SHORT, found.judges).slip_mm, rel=1e-3
     )
 
 

@@ -5,7 +5,6 @@ whose budget ends where the virtual experiment does.
 import functools
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ PROXY = Proxy(
     np.array([[0.145 * SLOPE, 0.065 * SLOPE]]), np.array([[0.9, -0.03]]), (0.08, 0.21),
     (0.85, 0.85), 0.0, 0.0,
 )  # fmt: skip
-FILMS = Layers((Film(Index(1.45), 200.0),), (Film(Index(1.52), 45.0),))
+FILMS = Layers((Film(Index(1.45), 200.0),), (Film(Index(1.52), 180.0),))
 FRAMES = ExperimentConfig(
     subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 1.5), lateral_mm=(1.5,),
     people=9,
@@ -42,14 +41,15 @@ FRAMES = ExperimentConfig(
 
 @functools.cache
 def small(films=False):
-    """A hyperbolic lens of 48 um at f/6, bare or between cover glass and filter."""
-    focus = Focus(0.85, 300.0, 3000.0)
-    focus = replace(focus, layers=FILMS) if films else focus
-    wanted = design.phase_of(None, focus, radius_um=24.0)
-    made, _ = design.make(
-        wanted, focus, aperture_um=48.0, cell=CELL, proxy=PROXY, profile="hyperbolic"
-    )
-    return made
+    """A hyperbolic lens of 48 um at f/6; or one of 120 um, between cover glass and
+    filter and so far from the sensor that its field is within 35 degrees.
+    """
+    focus, radius = Focus(0.85, 300.0, 3000.0), 24.0
+    if films:
+        focus, radius = Focus(0.85, 1200.0, 12e3, layers=FILMS), 60.0
+    wanted = design.phase_of(None, focus, radius_um=radius)
+    about = {"aperture_um": 2 * radius, "cell": CELL, "proxy": PROXY}
+    return design.make(wanted, focus, profile="hyperbolic", **about)[0]
 
 
 def scatter(made, states):
@@ -153,7 +153,7 @@ def test_the_command_writes_a_table_a_page_and_a_chart(tmp_path, capsys):
     assert [row["link"] for row in told["rows"]] == list(rows)
     assert told["gaze_error_deg"] is None
     assert told["psf_error"] == pytest.approx(rows[TOTAL].psf)
-    assert rows["glass"].psf > 0.01  # 45 um of glass move the focus by 15 um
+    assert rows["glass"].psf > 0.01  # 180 um of glass move the focus by 62 um
     assert math.isnan(rows["glass"].phase_rad)
     assert "no run was given" in rows["reader"].method
     parts = [row for link, row in rows.items() if link != TOTAL]

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codesign.gaze import axis as gaze
-from metalens.core.errors import SceneError
 from tests.referees.seen_pupil import pupil_of
 
 GEOMETRY = gaze.EyeGeometry(centre_mm=(1.0, -14.0, 27.0))
@@ -74,11 +73,6 @@ def test_angle_is_exact_and_differentiable_at_zero():
     assert float(gaze.angle_rad(a.detach(), b)) == pytest.approx(1e-9, rel=1e-6)
     gaze.angle_rad(a, a.detach()).sum().backward()
     assert torch.isfinite(a.grad).all()
-
-
-def test_impossible_geometry_is_refused():
-    with pytest.raises(SceneError, match="radius_mm"):
-        gaze.EyeGeometry((0, 0, 30), radius_mm=0)
 
 
 def test_pupil_on_the_sensor_by_similar_triangles():

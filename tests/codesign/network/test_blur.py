@@ -82,54 +82,6 @@ def test_the_count_is_that_of_a_counted_pass(size):
     assert features.shape == (1, blur.SLIP_FEATURES)
 
 
-def test_the_depth_of_a_window_is_read_from_it_and_two_more_around_it_a_block():
-    torch.manual_seed(2)
-    # ten of single precision at answers of 0.4; the least that a window is told moves
-    # it by 1e-5
-    rounding = 3e-7
-    branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
-    frames = _frames(2, 64)
-    changed = frames.clone()
-    changed[..., :5, -5:] += (
-        1.0  # with what steps of brightness reach: seen by the upper right window alone
-    )
-    with torch.no_grad():
-        assert bool(
-            (
-                (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > rounding
-            ).all()
-        )  # all tell all, and
-        for block in branch.together[1::2]:
-            block.give.weight.zero_()
-        moved = (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > rounding
-    wanted = torch.zeros(blur.GRID, blur.GRID, dtype=torch.bool)
-    reach = 1 + blur.BLOCKS * (blur.REACH // 2)
-    wanted[:reach, -reach:] = True
-    assert reach < blur.GRID
-    assert torch.equal(moved, wanted)
-
-
-def test_all_windows_tell_each_their_mean_and_their_spread():
-    """One window of 49 is 0.7: mean 0.7 / 49, variance 0.49 (1/49 - 1/49²), by layers
-    of one and two.
-    """
-    block = blur.GlobalContext(2)
-    with torch.no_grad():
-        block.take.weight.copy_(
-            torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]])
-        )
-        # beyond 3 hardswish is its argument
-        block.take.bias.copy_(torch.tensor([4.0, 5.0]))
-        block.give.weight.copy_(torch.tensor([[1.0, 0.0], [0.0, 3.0]]))
-        block.give.bias.copy_(torch.tensor([0.1, 0.2]))
-        x = torch.zeros(1, 2, blur.GRID, blur.GRID)
-        x[0, 0, 2, 3] = 0.7
-        got = (block(x) - x)[0]
-    spread = math.sqrt(0.49 * (1 / 49 - 1 / 49**2) + 1e-4)
-    assert got[0].numpy() == pytest.approx(4.1 + 0.7 / 49, rel=1e-6)
-    assert got[1].numpy() == pytest.approx(3 * (5 + 2 * spread) + 0.2, rel=1e-6)
-
-
 def test_windows_hold_the_vergence_under_them():
     depth = torch.full((1, 64, 96), 25e3)
     depth[:, :8] = (

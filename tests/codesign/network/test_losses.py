@@ -64,14 +64,6 @@ def test_budget_acts_only_beyond_it():
     assert float(losses.over_budget(torch.tensor(150.0), 100.0)) == pytest.approx(0.5)
 
 
-def test_overlap_of_half_a_mask():
-    mask = torch.zeros(1, 8, 8)
-    mask[:, :4] = 1
-    logits = torch.full((1, 8, 8), -1.0)
-    logits[:, :2] = 1
-    assert float(losses.mask_iou(logits, mask)[0]) == pytest.approx(0.5)
-
-
 def test_slip_is_counted_in_units_of_its_scale():
     """Off by 0.1 and 0.5 units: half the square over the knee below it, straight
     beyond; no scale is 1.

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from characterize import next_mask
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
 from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
 from codesign.train.trainer import compute_ahead
@@ -32,19 +31,6 @@ def test_no_two_streams_show_the_same_eye():
     for one, other in itertools.combinations(seen, 2):
         distance = torch.cdist(one, other)
         assert float(distance.min()) > 1e-6
-
-
-def test_a_mask_that_its_own_table_shows_to_be_worse_is_refused_in_words():
-    def state(name, strehl):
-        return next_mask.PredictedLens(name, None, None, strehl, 1.0)
-
-    made = state("as made", 0.555)
-    tabled = state("new bias table", 0.509)
-    words = next_mask.loss_reason(made, tabled)
-    assert "no correction" in words
-    assert "0.509 (new bias table)" in words
-    assert "0.555 (as made)" in words
-    assert next_mask.loss_reason(tabled, made) == ""
 
 
 def test_a_lens_is_trained_behind_a_network_and_a_loss_of_ones_own():

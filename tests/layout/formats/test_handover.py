@@ -136,20 +136,6 @@ def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
     )
 
 
-def test_the_sheet_names_files_doses_fields_and_leaves_currents_open(made):
-    plan, split = made
-    text = job_files.job_sheet(
-        plan, PROCESS, split, {"mask.oas": 1234567}, "FAILS: one thing"
-    )
-    lines = text.splitlines()
-    assert lines[1] == "FAILS: one thing"
-    assert "1,234,567" in text
-    assert f"Write fields: {split.used}" in text
-    assert text.count("beam current ____") == 2
-    assert all(f"{layer[0]:>4}/{layer[1]}" in text for layer in plan.doses)
-    assert "nan" not in text
-
-
 def test_a_dose_table_that_an_editor_saved_is_read(tmp_path):
     path = tmp_path / "doses.csv"
     path.write_text(

@@ -116,30 +116,6 @@ def test_an_empty_file_is_refused(tmp_path):
             read(tmp_path / "e")
 
 
-def test_a_bomb_of_copies_is_refused(tmp_path):
-    from layout.formats import oasis_records as oasis
-
-    matrix = (
-        b"\x01"
-        + oasis.unsigned_integer(2**40)
-        + oasis.unsigned_integer(2**40)
-        + b"\x01\x01"
-    )
-    body = (
-        bytes([oasis.CELL])
-        + oasis.oasis_string("T")
-        + bytes([oasis.PLACEMENT, 0xB8])
-        + oasis.oasis_string("U")
-        + b"\0\0"
-        + matrix
-    )
-    (tmp_path / "b.oas").write_bytes(
-        oasis.start_record(1.0) + body + oasis.end_record((0,) * 6, 0)
-    )
-    with pytest.raises(MaskFileError, match=r"copies, at most 16,777,216 more"):
-        layout.read_oasis(tmp_path / "b.oas")
-
-
 def test_a_bomb_of_zeros_is_refused(tmp_path):
     from layout.formats import oasis_records as oasis
 

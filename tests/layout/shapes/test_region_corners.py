@@ -7,13 +7,6 @@ from layout.shapes import polygon, region
 TRIANGLE = np.array([[10, -20], [70, -10], [30, 50]])
 
 
-def test_a_triangle_stays():
-    (found,) = region.union_contours([TRIANGLE])
-    assert len(found) == 3
-    # of the sides (60, 10) and (20, 70)
-    assert abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10
-
-
 def test_a_triangle_cut_off_a_square_is_left():
     square = np.array([[0, 0], [40, 0], [40, 40], [0, 40]])
     taken = np.array([[0, 0], [40, 0], [40, 30], [10, 40], [0, 40]])  # all but a corner
@@ -40,26 +33,3 @@ def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
     )
     (whole,) = [c for c in region.union_contours(pieces) if polygon.twice_area(c) > 0]
     assert len(whole) == 4
-
-
-def test_a_hole_whose_middle_meets_flats_is_cut_upright():
-    square = np.array([[-200, -200], [200, -200], [200, 200], [-200, 200]])
-    hole = np.array([[-50, -60], [50, -60], [80, 0], [50, 60], [-50, 60], [-80, 0]])
-    pieces = region.without_holes(region.subtract_contours([square], [hole]))
-    assert sorted(
-        tuple(p[:, 0][[p[:, 0].argmin(), p[:, 0].argmax()]].tolist()) for p in pieces
-    ) == [(-200, 0), (0, 200)]
-
-
-def test_triangles_fill_an_outline_but_for_its_hole():
-    outline = np.array(
-        [[0, 0], [90, 0], [90, 70], [60, 70], [60, 30], [30, 30], [30, 70], [0, 70]]
-    )
-    hole = np.array([[10, 10], [10, 20], [80, 20], [80, 10]])
-    points = np.concatenate([outline, hole])
-    areas = [
-        polygon.twice_area(points[three])
-        for three in region.triangulate_region([outline, hole])
-    ]
-    assert min(areas) > 0
-    assert sum(areas) == 2 * (90 * 70 - 30 * 40 - 70 * 10)

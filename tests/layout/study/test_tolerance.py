@@ -210,20 +210,6 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
     assert report.nominal.information[0, 0] == pytest.approx(want, rel=2e-3)
 
 
-def test_beyond_the_domain_the_phase_goes_on_straight():
-    d = np.array([0.3, 0.31, 0.32])
-    phase = np.unwrap(
-        np.angle(
-            perturbed_transmission(
-                PROXY, SENS, d, 0.85, np.zeros(len(names_of_kind(ResponseError)))
-            )
-        )
-    )
-    assert np.diff(phase) == pytest.approx(
-        0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9
-    )
-
-
 FILM = Layer(0.2, material=Index(1.0))  # has no part in what the pillar's index does
 
 
@@ -284,32 +270,6 @@ def test_a_turned_lens_has_its_study(monkeypatch):
     assert [section.title for section in made] == ["Stitching", "Tolerance"]
     assert "what keeps its hand has no focus" in made[1].text
     assert "walls" not in made[1].text
-
-
-def test_fields_of_a_turned_lens_add_up_to_its_light():
-    lens = turned(51)
-    process = Process(write_field=WriteField(size_um=10.0))
-    where = focus.FocusWindow(
-        np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
-    )
-    ready = focus.prepare_focus(lens, where)
-    held, moments = stitching.field_moments(
-        lens, fields.split_write_fields(lens.diameters, process), ready
-    )
-    d = lens.diameters.diameter_um
-    t = PROXY.transmission(np.where(d > 0, d, 0.2), 0.85) * np.exp(
-        1j
-        * (
-            PROXY.phase_rad(np.where(d > 0, d, 0.2), 0.85)
-            - 2 * lens.diameters.angle_rad
-        )
-    )
-    exact = plain_sum.field(lens, np.where(d > 0, t, 0), where)
-    assert held == 9
-    assert (
-        abs(ready.light(moments.sum(0)[None])[0] - exact).max()
-        < 1e-4 * abs(exact).max()
-    )  # float32 sums
 
 
 def test_sensitivities_agree_with_an_independent_solver():

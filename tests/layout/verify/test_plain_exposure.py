@@ -8,8 +8,6 @@ from matplotlib.path import Path as Outline
 
 import layout
 from layout.formats import job_files
-from layout.pec import polygon_edges
-from layout.pec.polygon_edges import ExposedPolygons
 from layout.process.process import DieSettings, ExposureSettings, Process
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
@@ -167,24 +165,3 @@ def outward(drawn, around, at):
             free.append(across)
     assert len(free) == 1
     return free[0]
-
-
-@pytest.mark.parametrize("alpha_um", [0.01, 0.043])
-def test_the_slope_across_an_edge_is_that_of_an_error_function(alpha_um):
-    """Outside a half-plane E is dose erfc(x / a) / 2: dose / (a sqrt(pi)), over 2 h
-    less by (h / a)² / 3, 1.3 %.
-    """
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    drawn = ExposedPolygons((square,), np.array([1.3]), np.array([4]))
-    middle = np.array([[1.0, 0.07], [-0.11, -1.0]])
-    points = polygon_edges.EdgeSamples(
-        middle, np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([4, 4])
-    )
-    outside, inside = (
-        polygon_edges.exposure_at_edges(at, drawn, [(alpha_um, 1.0)])
-        for at in polygon_edges.points_across(points)
-    )
-    want = 1.3 / (alpha_um * np.sqrt(np.pi))
-    assert (inside - outside) / polygon_edges.ACROSS_UM == pytest.approx(
-        [want] * 2, rel=0.016
-    )

@@ -17,19 +17,6 @@ def _verbs(files):
     return [stage.words[0] for stage in chain.chain_stages(files)]
 
 
-def test_the_shipped_chain_runs_from_cell_to_retrained_network():
-    assert _verbs(chain.shipped_settings()) == [
-        "library", "design", "psf", "layout", "codesign", "capture", "fit", "retrain",
-    ]  # fmt: skip
-    assert {w for s in chain.chain_stages(chain.shipped_settings()) for w in s.words if w.endswith("lens.h5")} == {
-        "lens.h5", "run/lens.h5",
-    }  # fmt: skip
-    names = [
-        demo._name(stage) for stage in chain.chain_stages(chain.shipped_settings())
-    ]
-    assert len(set(names)) == len(names)
-
-
 def test_a_stage_without_its_file_is_left_out(tmp_path):
     for name in ("c", "d", "p", "r"):
         (tmp_path / f"{name}.toml").write_text("")
@@ -148,28 +135,6 @@ def test_tables_and_maps_that_settings_name_are_laid_out_with_them(tmp_path):
     ]
     assert (target / "tables" / "si.csv").read_text() == "3,4\n"
     assert (target / "cell.toml").read_text() == cell
-
-
-def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
-    for name, content in (("c", b'n = "\xff"\n'), ("d", b""), ("p", b"")):
-        (tmp_path / f"{name}.toml").write_bytes(content)
-    with pytest.raises(ConfigError, match=r"c\.toml"):
-        chain.lay_out_inputs(
-            ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")),
-            tmp_path,
-            aperture_mm=None,
-        )
-
-
-def test_the_shipped_settings_are_laid_out(tmp_path):
-    chain.lay_out_inputs(chain.shipped_settings(), None, aperture_mm=0.25).write(
-        tmp_path
-    )
-    assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
-    assert config.load(tmp_path / "design.toml", DesignSettings).aperture_mm == 0.25
-    assert (
-        (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")
-    )
 
 
 def begun(tmp_path, monkeypatch, config=None):

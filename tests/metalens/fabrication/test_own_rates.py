@@ -69,8 +69,9 @@ def changed(name, x):
 
 @pytest.fixture
 def few_orders(monkeypatch):
-    """Three harmonics, where a solve takes milliseconds."""
+    """Three harmonics and walls of few steps, where a solve takes milliseconds."""
     monkeypatch.setattr(solved_rates, "_TRUNCATIONS", (2, 3))
+    monkeypatch.setattr(solved_rates, "_WALL_STEP_RAD", 5e-5)
 
 
 # of the Jones matrix: the mean of both polarisations, left-handed light that leaves

@@ -77,19 +77,6 @@ def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():
     assert flat.steepest == (0.5, 0.3)
 
 
-def test_without_diagonal_rows_all_azimuths_are_alike():
-    made = replace(
-        rows(),
-        **{
-            n: getattr(rows(), n)[..., :2]
-            for n in ("sine", "diagonal", "factor", "coarse", "scatter")
-        },
-    )
-    assert made.at(np.array([0.31]), math.pi / 4) == pytest.approx(
-        made.at(np.array([0.31]), 0.0)
-    )
-
-
 def test_the_share_left_in_the_focus_is_the_square_of_the_mean_amplitude():
     """A ring that turns by 0.31 and one, twice as large, by 0.44."""
     made = rows()
@@ -100,17 +87,6 @@ def test_the_share_left_in_the_focus_is_the_square_of_the_mean_amplitude():
     assert made.share(
         np.array([0.31, 0.44]), np.array([1 / 3, 2 / 3])
     ) == pytest.approx(want, rel=1e-12)
-
-
-def test_every_row_but_the_last_of_a_direction_may_be_left_out():
-    made = rows()
-    assert made.coarser.factor == pytest.approx(0.9 * made.factor)
-    assert len(made.others) == 4
-    single = made.without(1)  # one row along the lattice is left: it stays
-    assert [one.diagonal.tolist() for one in single.others] == [
-        [False, True],
-        [False, True],
-    ]
 
 
 def test_a_lens_file_carries_its_rows(tmp_path):

@@ -11,7 +11,6 @@ from numpy.polynomial import chebyshev
 
 from metalens.cell import Cell, Index
 from metalens.core.errors import DomainError
-from metalens.image import compiled
 from metalens.lens import DiameterMap, Lens, response
 from metalens.library import Proxy
 
@@ -83,55 +82,3 @@ def test_what_a_proxy_does_not_know_is_refused_by_name():
             (WAVE, TILT),
             *out,
         )
-
-
-def test_sites_without_a_pillar_ask_nothing_of_the_proxy_and_the_thickest_does():
-    sizes = np.zeros((3, 4))
-    whole = response.response_polynomials(PROXY, np.full((3, 4), 0.2), (WAVE, TILT))
-    for one, other in zip(
-        response.response_polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True
-    ):
-        assert np.array_equal(one, other)
-    sizes[2, 1] = 0.315
-    with pytest.raises(DomainError, match=r"0\.315"):
-        response.response_polynomials(PROXY, sizes, (WAVE, TILT))
-
-
-def test_a_transmission_that_rounding_takes_above_1_is_1():
-    bright = Proxy(
-        np.array([[1.0, 2.0]]),
-        np.array([[1 - 1e-9, 0.9e-9]]),
-        (0.09, 0.31),
-        (0.8, 0.93),
-        0.0,
-        0.0,
-    )
-    made = lens(proxy=bright)
-    phase, level = (
-        np.empty(made.diameters.diameter_um.shape, np.float32) for _ in range(2)
-    )
-    response.fill_response(made, (WAVE, 0.0), phase, level)
-    assert level.max() <= 1
-
-
-def test_cells_hold_the_mean_of_their_pillars_less_the_carrier():
-    """Cells of 3 x 3 that begin a row and two columns before the map, and end beyond
-    it: means over nine sites.
-    """
-    made, side, top, left = lens(10, 1200), 3, 1, 2
-    d = made.diameters.diameter_um
-    ideal = DRAW.uniform(0, 2 * np.pi, d.shape).astype(np.float32)
-    found = compiled.cells(
-        d,
-        ideal,
-        response.response_polynomials(PROXY, d, (WAVE, TILT)),
-        (side, top, left),
-    )
-    t = np.where(d > 0, series(LEVEL, d) * np.exp(1j * (series(SERIES, d) - ideal)), 0)
-    want = np.zeros((3, 4, 401))
-    for i, j in np.ndindex(d.shape):
-        want[:, (i + top) // side, (j + left) // side] += (
-            np.array([t[i, j].real, t[i, j].imag, d[i, j] > 0]) / side**2
-        )
-    assert found.shape == want.shape
-    assert np.abs(found - want).max() < 5e-7  # sines and cosines in single precision

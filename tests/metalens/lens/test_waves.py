@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from metalens.optics import Media, media, saddle_correction
-from metalens.optics.media import WAVES, plane_wave_correction
 from tests.referees import films
 
 # media from pillars to sensor, wavelength, n sin θ of the ray in units of the rarest
@@ -94,39 +93,6 @@ RANGES = [
     ((1.31, 1.15, 1.97), (15.1, 11.4, 18.4), 0.63, 60.0),
     ((1.31, 2.1, 1.52), (2.0, 0.3, 1.0), 0.85, 3.0),
 ]
-
-
-@pytest.mark.parametrize(("order", "thickness", "wavelength", "reach"), RANGES)
-def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(
-    order, thickness, wavelength, reach
-):
-    """By the definition, from the mean over so many waves each: of two successive
-    counts those that differ least.
-    """
-    behind, k = Media(order, thickness), 2 * math.pi / wavelength
-    found = saddle_correction(behind, k, reach)
-    w = found.rarest**2 - found.normal**2
-    every = np.stack([plane_wave_correction(behind, k, w, count) for count in WAVES])
-    apart = np.abs(np.diff(every, axis=0))
-    settled = every[apart.argmin(0) + 1, np.arange(len(w))]
-    ahead, aside = found.at(w)
-    missed = np.abs(
-        1
-        + 1j * (ahead + 1j * aside) / (k * media.whole_path(behind.layers, w))
-        - settled
-    )
-    assert found.error(w) == pytest.approx(
-        np.maximum(apart.min(0), missed), rel=1e-3, abs=3e-15
-    )
-    # the series costs nothing beside them
-    assert missed.max() < apart.min(0).max() / 30
-
-
-def test_the_series_ends_before_a_ray_that_grazes_a_medium_of_no_thickness():
-    grazing = saddle_correction(Media((1.1, 1.8), (0.0, 5.0)), 2 * math.pi / 0.85, 20.0)
-    assert 1.8**2 - (grazing.middle - grazing.half) ** 2 == pytest.approx(
-        (0.9999 * 1.1) ** 2, rel=1e-9
-    )
 
 
 def test_beyond_a_critical_angle_power_is_cut_for_rays_and_continued_for_waves():

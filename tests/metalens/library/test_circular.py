@@ -11,13 +11,11 @@ import pytest
 from metalens import library, rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Square
-from metalens.core import store
 from metalens.core.errors import CellError, ConfigError
 from metalens.library import ProxyTolerances, Sweep, fit
 from metalens.library.geometric_phase import (
     GeometricPhase,
     check_geometric_phase,
-    mirror_jones,
     solve_rotations,
     to_circular_basis,
 )
@@ -29,17 +27,6 @@ WEAK = Cell(
     0.3, 0.4, Index(1.6), Index(1.33), Index(1.1), Index(1.1), shape=Rectangle(0.45)
 )
 R = lambda a: np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])  # noqa: E731
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, -2.0])
-def test_a_turned_wave_plate_is_that_of_the_textbook(angle):
-    c, s = math.cos(2 * angle), math.sin(2 * angle)
-    # half-wave plate, fast axis at the angle
-    assert np.allclose(isolated(1.0, -1.0, angle), [[c, s], [s, -c]])
-    t_x, t_y = 0.8 * np.exp(0.4j), 0.9 * np.exp(-1.3j)
-    assert np.allclose(
-        isolated(t_x, t_y, angle), R(angle) @ np.diag([t_x, t_y]) @ R(-angle)
-    )
 
 
 @pytest.mark.parametrize("hand", [1.0, -1.0])
@@ -77,27 +64,6 @@ def test_solved_turns_have_the_symmetries_of_the_lattice():
     assert found.model_error > 1e-5  # but not nothing
 
 
-def test_shares_and_bars_are_those_worked_out_by_hand():
-    angle = np.array([0.0, 0.4, -0.4])
-    t = isolated(0.9, -0.8, angle)
-    t[1] = t[1] + 0.02 * np.array([[0, 1], [1, 0]])
-    # coarser truncations: their shares are 0.9801 and 1.0404 of it
-    before = np.stack([0.99 * t, 1.02 * t], axis=1)
-    found = GeometricPhase(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
-    amplitude = [0.85, 0.85 + 0.02j * np.exp(-0.8j), 0.85]  # <R| (0 1; 1 0) |L> = i
-    assert found.efficiency(1.0)[0] == pytest.approx(abs(np.mean(amplitude)) ** 2)
-    assert found.efficiency(1.0)[1] == pytest.approx(
-        rcwa.SAFETY * 0.0404 * abs(np.mean(amplitude)) ** 2
-    )
-    assert found.unconverted(-1.0)[0] == pytest.approx(0.05**2)
-    assert found.model_error == pytest.approx(0.02)
-    again = store.build_record(
-        GeometricPhase, *store.flatten_record(found), where="a file"
-    )
-    assert (again.size_um, again.model_error) == (found.size_um, found.model_error)
-    assert again.efficiency(1.0) == found.efficiency(1.0)
-
-
 @pytest.mark.parametrize(
     "shape",
     [Circle(), Square(), Cross(0.4), Rectangle(1.0), Rectangle(0.5, angle_rad=0.2)],
@@ -113,12 +79,6 @@ def test_ellipses_and_own_polygons_are_taken():
         check_geometric_phase(
             dataclasses.replace(WEAK, shape=shape, lattice=Lattice("hexagonal")), 0.25
         )
-
-
-def test_the_mirror_image_of_a_jones_matrix_is_that_of_the_other_turn():
-    assert np.allclose(
-        mirror_jones(isolated(0.3j, 0.7, 0.5)), isolated(0.3j, 0.7, -0.5)
-    )
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from metalens import psf
-from metalens.core.errors import PropagationError
 from metalens.lens import NeighbourRows
 from metalens.psf import neighbour_coupling
 from tests.referees import vectorial
@@ -139,44 +138,6 @@ def test_both_polarisations_with_neighbours_are_those_of_plane_waves(kind):
     )
     assert error < 0.3 * without
     assert error < 0.7 * mean
-
-
-def test_the_flux_of_a_psf_is_poyntings_of_plane_waves():
-    """E and H summed wave by wave; |E|² is 7e-2 away, the flux 3e-3 (rays to the
-    window's middle).
-    """
-    count, distance = 96, 30.0
-    axis = (np.arange(count) - (count - 1) / 2) * PITCH
-    x, y = axis, axis[:, None]
-    path = np.sqrt(x**2 + y**2 + distance**2)
-    level = (np.hypot(x + 0.7, y) < 18.0) * 1.0
-    phase = -2 * np.pi / WAVE * (path - distance) + 1.5 * x * y**2 / 18**3
-    light = level * np.exp(1j * phase) * vectorial.turned(x, y, distance)
-    want = vectorial.flux(
-        light, step=PITCH, wavelength=WAVE, distance=distance, count=480
-    )[38:59, 38:59]
-    half = PITCH / 2
-    seen = about(
-        window_um=21 * PITCH, samples=21, depths_um=[np.inf], offset_um=(half, half)
-    )
-    flux, energy = (
-        psf.psf_stack(phase, level, **seen, polarisation=of)
-        for of in ("flux", "vector")
-    )
-    error, other = (np.linalg.norm(one.intensity[0] - want / want.sum()) / np.linalg.norm(want / want.sum())
-                    for one in (flux, energy))  # fmt: skip
-    assert error < 5e-3
-    assert other > 5 * error
-    assert float(flux.energy_um2[0]) == pytest.approx(want.sum() * PITCH**2, rel=5e-3)
-    assert flux.error <= 1e-5
-
-
-def test_a_polarisation_that_maps_cannot_tell_is_refused():
-    phase, level, _ = lens(distance=14.0, count=40)
-    with pytest.raises(
-        PropagationError, match="'auto': need one of scalar, flux, vector"
-    ):
-        psf.psf_stack(phase, level, **about(polarisation="auto"))
 
 
 @pytest.mark.parametrize("polarisation", ["scalar", "flux"])

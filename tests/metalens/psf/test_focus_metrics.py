@@ -251,18 +251,6 @@ def test_design_psf_and_the_definition_agree_on_the_efficiency():
     assert found.efficiency == pytest.approx(power / area, rel=0.015)
 
 
-def test_depths_that_are_left_out_hold_the_focus(saved, capsys):
-    """A lens for 1.1 mm: its sharpest PSF is that of a perfect lens, at 1.1 mm."""
-    folder = saved(source_um=1100.0)
-    assert run(folder, "--json", "--angles-deg", "0") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert len(said["depths_um"]) == 21
-    focus = said["focus"][0]
-    assert focus["depth_um"] == pytest.approx(1100.0)
-    assert focus["strehl"] == pytest.approx(1, abs=5e-3)
-    assert "z_scan" not in said
-
-
 def test_a_lens_of_a_tenth_of_a_fresnel_zone_has_its_figures_too():
     """20 um for 2 mm, R²/(wavelength d) = 0.06: its spot, 1.029 wavelength d / 2R, is
     four times as wide as the lens.
