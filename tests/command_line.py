@@ -14,9 +14,20 @@ from metalens import cli
 DONE = subprocess.CompletedProcess[str]
 
 
-def run(*words: object, cwd: Path | None = None) -> DONE:
-    """Exit status and texts of ``metalens WORDS`` in the folder ``cwd``."""
-    told = [str(word) for word in words]
+def split_words(parts: tuple[object, ...]) -> list[str]:
+    """Words of some parts: text is split at blanks, as a shell does; paths are not."""
+    lists = [p.split(" ") if isinstance(p, str) else [str(p)] for p in parts]
+    return [word for words in lists for word in words]
+
+
+def call(*parts: object) -> int:
+    """Exit status of ``metalens PARTS``."""
+    return cli.main(split_words(parts))
+
+
+def run(*parts: object, cwd: Path | None = None) -> DONE:
+    """Exit status and texts of ``metalens PARTS`` in the folder ``cwd``."""
+    told = split_words(parts)
     with _streams() as (shown, said), contextlib.chdir(cwd or Path()):
         try:
             status = cli.main(told)
@@ -34,7 +45,7 @@ def _streams() -> Iterator[tuple[io.StringIO, io.StringIO]]:
         yield shown, said
 
 
-def process(*words: object, cwd: Path | None = None) -> DONE:
+def process(*parts: object, cwd: Path | None = None) -> DONE:
     """The same by ``python -m metalens``."""
-    command = [sys.executable, "-m", "metalens", *map(str, words)]
+    command = [sys.executable, "-m", "metalens", *split_words(parts)]
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)

@@ -30,7 +30,7 @@ def test_help_lists_every_verb():
     ],
 )
 def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
-    done = run("field", "cell.toml", *words)
+    done = run("field cell.toml", *words)
     assert done.returncode == cli.BAD_INPUT
     assert done.stderr.splitlines()[-1].startswith(
         f"metalens: error: {words[-1]}: part the numbers of a list by blanks"
@@ -54,17 +54,17 @@ def test_every_verb_has_help_and_names_its_options(verb):
 
 
 def test_verb_with_verbs_of_its_own_lists_them():
-    done = run("evaluate", "--help")
+    done = run("evaluate --help")
     assert done.returncode == cli.SUCCESS
     assert "  optics" in done.stdout
     assert run("evaluate").returncode == cli.BAD_INPUT
-    assert "did you mean 'optics'?" in run("evaluate", "opticz").stderr
+    assert "did you mean 'optics'?" in run("evaluate opticz").stderr
 
 
 def test_evaluate_takes_lens_files_and_run_folders_as_they_are(tmp_path):
-    lens = run("evaluate", str(tmp_path / "absent.h5"))
+    lens = run(f"evaluate {tmp_path}/absent.h5")
     assert (lens.returncode, "no such file" in lens.stderr) == (cli.BAD_INPUT, True)
-    folder = run("evaluate", str(tmp_path), "-o", str(tmp_path / "out"))
+    folder = run(f"evaluate {tmp_path} -o {tmp_path}/out")
     assert folder.returncode == cli.BAD_INPUT
     assert str(tmp_path) in folder.stderr
 
@@ -75,7 +75,7 @@ def test_version():
 
 def test_misspelt_key_names_the_nearest_and_writes_nothing(tmp_path):
     (tmp_path / "d.toml").write_text('profil = "cubic"\n')
-    done = process("design", "d.toml", "-o", "lens.h5", cwd=tmp_path)
+    done = process("design d.toml -o lens.h5", cwd=tmp_path)
     assert done.returncode == cli.BAD_INPUT
     assert "unknown key 'profil'; did you mean 'profile'?" in done.stderr
     assert "Traceback" not in done.stderr
@@ -97,7 +97,7 @@ def test_missing_files_are_bad_input(tmp_path):
 def test_an_existing_file_is_kept_without_force(tmp_path):
     (tmp_path / "d.toml").write_text("aperture_mm = 0.02\n")
     (tmp_path / "lens.h5").write_text("precious")
-    done = run("design", "d.toml", "-o", "lens.h5", cwd=tmp_path)
+    done = run("design d.toml -o lens.h5", cwd=tmp_path)
     assert done.returncode == cli.BAD_INPUT
     assert "--force" in done.stderr
     assert (tmp_path / "lens.h5").read_text() == "precious"
@@ -116,10 +116,10 @@ def test_info_shows_kind_and_provenance(tmp_path):
         attributes={"pitch_um": 0.4},
         provenance=made,
     )
-    text = run("info", tmp_path / "f.h5").stdout
+    text = run(f"info {tmp_path}/f.h5").stdout
     assert "psf version 1" in text
     assert "config: x = 1" in text
-    values = json.loads(run("info", tmp_path / "f.h5", "--json").stdout)
+    values = json.loads(run(f"info {tmp_path}/f.h5 --json").stdout)
     assert values["kind"] == "psf"
     assert values["arrays"]["image"] == "float64 (20, 20)"
 
@@ -159,13 +159,7 @@ def demo(tmp_path_factory):
     for name, text in CHAIN.items():
         (folder / name).write_text(textwrap.dedent(text))
     done = process(
-        "demo",
-        folder / "out",
-        "--config",
-        folder / "chain.toml",
-        "--aperture-mm",
-        0.02,
-        "--json",
+        f"demo {folder}/out --config {folder}/chain.toml --aperture-mm 0.02 --json"
     )
     return folder / "out", done
 
@@ -201,21 +195,21 @@ def test_every_artefact_of_the_chain_tells_where_it_comes_from(demo):
         ("lens.h5", "lens"),
         ("psf.h5", "psf"),
     ):
-        assert run("info", folder / name).stdout.startswith(f"{kind} version")
-    assert "library.h5 (SHA-256" in run("info", folder / "lens.h5").stdout
+        assert run(f"info {folder}/{name}").stdout.startswith(f"{kind} version")
+    assert "library.h5 (SHA-256" in run(f"info {folder}/lens.h5").stdout
 
 
 def test_a_run_with_the_same_input_gives_the_same_bytes(demo, tmp_path):
     folder, _ = demo
     for name in ("design.toml", "library.h5"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
-    assert run("design", "design.toml", "-o", "lens.h5", cwd=tmp_path).returncode == 0
+    assert run("design design.toml -o lens.h5", cwd=tmp_path).returncode == 0
     assert (tmp_path / "lens.h5").read_bytes() == (folder / "lens.h5").read_bytes()
 
 
 def test_a_filled_folder_is_not_written_into_without_force(demo):
     folder, _ = demo
-    done = run("demo", folder)
+    done = run(f"demo {folder}")
     assert done.returncode == cli.BAD_INPUT
     assert "exists; give --force" in done.stderr
 
@@ -238,7 +232,7 @@ def test_a_filled_folder_is_not_written_into_without_force(demo):
 )
 def test_impossible_cells_are_refused_by_name(tmp_path, text, message):
     (tmp_path / "cell.toml").write_text(text)
-    done = run("library", "cell.toml", "-o", "library.h5", cwd=tmp_path)
+    done = run("library cell.toml -o library.h5", cwd=tmp_path)
     assert done.returncode == cli.BAD_INPUT, done.stdout
     assert message in done.stderr
     assert "Traceback" not in done.stderr
@@ -260,5 +254,5 @@ def test_a_truncated_lens_is_refused_by_every_stage(demo, tmp_path):
     (tmp_path / "lens.h5").write_bytes((folder / "library.h5").read_bytes())
     assert (
         "holds 'library' version 1, need 'lens'"
-        in run("psf", "lens.h5", "-o", "psf.h5", cwd=tmp_path).stderr
+        in run("psf lens.h5 -o psf.h5", cwd=tmp_path).stderr
     )

@@ -13,12 +13,13 @@ import pytest
 
 from characterize.captures.stage import read_about
 from characterize.model import PARAMETERS
-from metalens.cli import VERBS, main
+from metalens.cli import VERBS
 from metalens.commands.chain import ChainFiles
 from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile
 from metalens.commands.psf import PsfSettings
 from metalens.core import config
+from tests.command_line import call
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -125,7 +126,7 @@ def test_the_page_of_commands_has_every_option_as_its_help_does(capsys):
             for flag in re.findall(r"`(-[\w-]+)`", row)
         }
         with pytest.raises(SystemExit):
-            main([*verb.split(), "--help"])
+            call(*verb.split(), "--help")
         text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
         heads = [
             line for line in text.splitlines() if re.match(r"^[│ ] ?-{1,2}[a-z]", line)

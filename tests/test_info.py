@@ -13,8 +13,9 @@ import torch
 
 from codesign.train import checkpoint
 from codesign.train.trainer import InnerConfig
-from metalens.cli import BAD_INPUT, SUCCESS, main
+from metalens.cli import BAD_INPUT, SUCCESS
 from metalens.core import store
+from tests.command_line import call
 from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
@@ -62,13 +63,13 @@ def _write(kind, path):
 def test_every_kind_of_file_says_what_it_is_and_what_made_it(kind, tmp_path, capsys):
     path = tmp_path / "f.h5"
     _write(kind, path)
-    assert main(["info", str(path), "--json"]) == SUCCESS
+    assert call(f"info {path} --json") == SUCCESS
     told = json.loads(capsys.readouterr().out)
     assert (told["kind"], told["version"]) == (kind, 1)
     assert told["arrays"]
     assert "metalens-toolchain" in told["provenance"]["versions"]
     path.write_bytes(path.read_bytes()[:-9])
-    assert main(["info", str(path)]) == BAD_INPUT
+    assert call(f"info {path}") == BAD_INPUT
     assert str(path) in capsys.readouterr().err
 
 
@@ -79,7 +80,7 @@ def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
         {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0]},
         settings=InnerConfig(steps=7),
     )
-    assert main(["info", str(path)]) == SUCCESS
+    assert call(f"info {path}") == SUCCESS
     text = capsys.readouterr().out
     assert text.startswith(f"checkpoint version {checkpoint.VERSION}")
     assert "F32 (3, 2)" in text
@@ -94,6 +95,6 @@ def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
         (2).to_bytes(8, "little") + b"[]",
     ):
         path.write_bytes(damaged)
-        assert main(["info", str(path)]) == BAD_INPUT
+        assert call(f"info {path}") == BAD_INPUT
         assert "make it again" in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "absent.safetensors")]) == BAD_INPUT
+    assert call(f"info {tmp_path}/absent.safetensors") == BAD_INPUT

@@ -14,7 +14,7 @@ from metalens.cell.record import Cell, Index
 from metalens.core import store
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
-from tests.command_line import run
+from tests.command_line import call, run
 
 # verb: words after it, and the target that already exists; %s is the folder of inputs
 CASES = {
@@ -70,7 +70,7 @@ def folder(tmp_path):
 
 
 def _run(folder, verb, words):
-    done = run(verb, *words.split(), cwd=folder)
+    done = run(f"{verb}", *words.split(), cwd=folder)
     assert "not foreseen" not in done.stderr, done.stderr
     return done
 
@@ -121,10 +121,10 @@ def test_force_knows_every_format_that_a_command_writes(
     assert cli.main(command) in (0, 1)
     made = (folder / name).read_bytes()
     assert cli.main(command) == cli.BAD_INPUT
-    assert cli.main([*command, "--force"]) in (0, 1)
+    assert call(*command, "--force") in (0, 1)
     theirs = made.replace(b"metalens", b"elsewhere").replace(b" \t\n", b"\n")
     (folder / name).write_bytes(theirs)
-    assert cli.main([*command, "--force"]) == cli.BAD_INPUT
+    assert call(*command, "--force") == cli.BAD_INPUT
     assert (folder / name).read_bytes() == theirs
 
 

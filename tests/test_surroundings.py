@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from metalens.cli import BAD_INPUT, SUCCESS, main
+from metalens.cli import BAD_INPUT, SUCCESS
 from metalens.core import transaction
+from tests.command_line import call
 
 ROOT = Path(__file__).parents[1]
 
@@ -134,13 +135,13 @@ def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
 def test_info_shows_what_a_folder_holds_and_refuses_a_changed_one(tmp_path, capsys):
     with transaction.claim_folder(tmp_path / "out") as draft:
         (draft.path / "a.txt").write_text("first")
-    assert main(["info", str(tmp_path / "out"), "--json"]) == SUCCESS
+    assert call(f"info {tmp_path}/out --json") == SUCCESS
     told = json.loads(capsys.readouterr().out)
     assert told["files"]["a.txt"]["bytes"] == 5
-    assert main(["info", str(tmp_path / "out")]) == SUCCESS
+    assert call(f"info {tmp_path}/out") == SUCCESS
     assert "1 files, each as it was written" in capsys.readouterr().out
     (tmp_path / "out" / "a.txt").write_text("other")
-    assert main(["info", str(tmp_path / "out")]) == BAD_INPUT
+    assert call(f"info {tmp_path}/out") == BAD_INPUT
     assert "SHA-256 differs" in capsys.readouterr().err
 
 
@@ -169,6 +170,6 @@ def test_a_pipe_in_place_of_an_artefact_is_refused_not_waited_for(
         if words == "info"
         else ["-o", {"export": "a.mat", "view": "a.html"}.get(words, "a.h5")]
     )
-    assert main([*words.split(), "pipe.h5", *output]) == BAD_INPUT
+    assert call(*words.split(), "pipe.h5", *output) == BAD_INPUT
     assert "pipe.h5: no plain file (a pipe or a device)" in capsys.readouterr().err
     assert os.listdir() == ["pipe.h5"]

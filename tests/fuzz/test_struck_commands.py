@@ -12,6 +12,7 @@ import time
 import pytest
 
 from metalens import cli, lens, psf
+from tests.command_line import call
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "fork"), reason="processes are forked here"
@@ -54,7 +55,7 @@ def begin(*words, limit_bytes=None):
         if limit_bytes is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
-        status = cli.main([*map(str, words), "--quiet"])
+        status = call(*map(str, words), "--quiet")
     finally:
         sys.stdout.flush()
         os._exit(status)

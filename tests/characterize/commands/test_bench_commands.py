@@ -17,8 +17,8 @@ import characterize
 from characterize.inference import asbuilt
 from metalens import lens as lenses
 from metalens import psf
-from metalens.cli import main
 from metalens.core import store
+from tests.command_line import call
 
 TRUTH = """
 depths_um = [400.0, 600.0, 1000.0]
@@ -64,16 +64,8 @@ def bench(tmp_path):
 
 
 def shoot(bench, *more):
-    return main(
-        [
-            "capture",
-            str(bench / "lens.h5"),
-            "--truth",
-            str(bench / "truth.toml"),
-            "-o",
-            str(bench / "shots"),
-            *more,
-        ]
+    return call(
+        f"capture {bench}/lens.h5 --truth {bench}/truth.toml -o {bench}/shots", *more
     )
 
 
@@ -88,17 +80,10 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert store.sha256(bench / "shots" / "frame_000.tif") == first
     (bench / "told.toml").write_text(METROLOGY)
     capsys.readouterr()
-    words = [
-        "fit",
-        str(bench / "shots"),
-        "--design",
-        str(bench / "lens.h5"),
-        "--metrology",
-        str(bench / "told.toml"),
-    ]
-    words += ["--truth", str(bench / "truth.toml")]
-    words += ["-o", str(bench / "as.h5"), "--next-mask", "--json"]
-    assert main(words) == 1  # three depths leave the height and the side wall open
+    words = f"fit {bench}/shots --design {bench}/lens.h5 --metrology {bench}/told.toml"
+    words += f" --truth {bench}/truth.toml"
+    words += f" -o {bench}/as.h5 --next-mask --json"
+    assert call(words) == 1  # three depths leave the height and the side wall open
     found = json.loads(capsys.readouterr().out)
     assert "posterior leaves the bias table open" in found["failures"][0]
     assert not (bench / "as_bias.toml").exists()
@@ -111,19 +96,7 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert "the hidden truth" in page
     the_psfs_are_those_of_the_made_lens(bench)
     for shown, title in (("shots", "Frames"), ("as.h5", "Captured less fitted")):
-        assert (
-            main(
-                [
-                    "view",
-                    str(bench / shown),
-                    "-o",
-                    str(bench / "page.html"),
-                    "--force",
-                    "--quiet",
-                ]
-            )
-            == 0
-        )
+        assert call(f"view {bench}/{shown} -o {bench}/page.html --force --quiet") == 0
         assert f'"title": "{title}"' in (bench / "page.html").read_text(
             encoding="utf-8"
         )
@@ -137,14 +110,8 @@ def the_psfs_are_those_of_the_made_lens(bench):
         "depths_mm = [0.5, 0.7, 0.2]\nangles_deg = [0.0]\nwindow_um = 24.0\nsamples = 32\ntolerance = 1e-3\n"
     )
     for source in ("as", "lens"):
-        words = [
-            "psf",
-            str(bench / f"{source}.h5"),
-            "--config",
-            str(bench / "psf.toml"),
-            "--quiet",
-        ]
-        assert main([*words, "-o", str(bench / f"{source}_psf.h5")]) == 0
+        words = f"psf {bench}/{source}.h5 --config {bench}/psf.toml --quiet"
+        assert call(f"{words} -o {bench}/{source}_psf.h5") == 0
     built, design = (
         psf.load(bench / f"{name}_psf.h5").intensity for name in ("as", "lens")
     )
@@ -158,20 +125,8 @@ def the_psfs_are_those_of_the_made_lens(bench):
 
 
 def test_bad_words_end_with_2_and_leave_nothing(bench):
-    assert (
-        main(
-            [
-                "fit",
-                str(bench / "none"),
-                "--design",
-                str(bench / "lens.h5"),
-                "-o",
-                str(bench / "a.h5"),
-            ]
-        )
-        == 2
-    )
-    assert main(["fit", str(bench / "none"), "-o", str(bench / "a.h5")]) == 2
+    assert call(f"fit {bench}/none --design {bench}/lens.h5 -o {bench}/a.h5") == 2
+    assert call(f"fit {bench}/none -o {bench}/a.h5") == 2
     (bench / "truth.toml").write_text(TRUTH.replace("bias_nm", "bais_nm"))
     assert shoot(bench) == 2
     assert sorted(p.name for p in bench.iterdir()) == ["lens.h5", "truth.toml"]

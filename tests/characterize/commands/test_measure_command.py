@@ -19,9 +19,9 @@ import test_sem
 from metalens import lens as lenses
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Square
-from metalens.cli import main
 from metalens.lens import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from tests.command_line import call
 
 
 def spots(folder, sigma_um, pixel_um=0.9):
@@ -50,12 +50,7 @@ def spots(folder, sigma_um, pixel_um=0.9):
 def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
     sigmas = (4.1, 3.2, 2.7, 3.0, 3.9)
     spots(tmp_path / "shots", sigmas)
-    assert (
-        main(
-            ["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out"), "--quiet"]
-        )
-        == 0
-    )
+    assert call(f"measure {tmp_path}/shots -o {tmp_path}/out --quiet") == 0
     with open(tmp_path / "out" / "frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     for row, sigma in zip(rows, sigmas, strict=True):
@@ -82,7 +77,7 @@ def test_a_sharpest_depth_that_is_the_first_or_last_is_told(
     tmp_path, capsys, sigmas, end
 ):
     spots(tmp_path / "shots", sigmas)
-    assert main(["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out")]) == 0
+    assert call(f"measure {tmp_path}/shots -o {tmp_path}/out") == 0
     said = capsys.readouterr().out
     words = f"note: sharpest at 0, 0 deg at an end of the captured depths, {end} um: focus may lie beyond it"
     assert (words in said) == (end is not None)
@@ -95,8 +90,8 @@ def test_light_beside_that_of_an_empty_aperture_is_the_efficiency(tmp_path):
     """
     spots(tmp_path / "shots", (3.0, 2.5, 2.8))
     light = 9000 * 2 * math.pi * (2.5 / 0.9) ** 2
-    words = ["--reference-e", str(1.25 * light), "-o", str(tmp_path / "out"), "--quiet"]
-    assert main(["measure", str(tmp_path / "shots"), *words]) == 0
+    words = f"--reference-e {1.25 * light} -o {tmp_path}/out --quiet"
+    assert call(f"measure {tmp_path}/shots {words}") == 0
     row = json.loads((tmp_path / "out" / "measure.json").read_text())["frames"][1]
     # pixels cut by the circle, the border's median
     assert row["efficiency"] == pytest.approx(0.998 / 1.25, rel=0.02)
@@ -111,20 +106,7 @@ def test_an_edge_gives_the_modulation_across_it(tmp_path):
     light = 200 + 3000 * special.ndtr(across / math.hypot(1.7, 1 / math.sqrt(12)))
     tifffile.imwrite(tmp_path / "edge.tif", np.rint(light).astype(np.uint16))
     out = tmp_path / "out"
-    assert (
-        main(
-            [
-                "measure",
-                str(tmp_path / "edge.tif"),
-                "--edge-um",
-                "2.4",
-                "-o",
-                str(out),
-                "--quiet",
-            ]
-        )
-        == 0
-    )
+    assert call(f"measure {tmp_path}/edge.tif --edge-um 2.4 -o {out} --quiet") == 0
     rows = np.loadtxt(out / "edge.csv", delimiter=",", skiprows=1)
     f = rows[:, 0] * 2.4
     want = np.sinc(f) * np.exp(-2 * (math.pi * f * 1.7) ** 2)
@@ -136,18 +118,8 @@ def test_an_edge_gives_the_modulation_across_it(tmp_path):
         "mtf50_per_um"
     ] == pytest.approx(half, rel=0.02)
     assert (out / "measure.html").is_file()
-    both = [
-        "measure",
-        str(tmp_path / "edge.tif"),
-        "--edge-um",
-        "2.4",
-        "--pixel-nm",
-        "4",
-        "-o",
-        str(out),
-        "--quiet",
-    ]
-    assert main(both) == 2
+    both = f"measure {tmp_path}/edge.tif --edge-um 2.4 --pixel-nm 4 -o {out} --quiet"
+    assert call(both) == 2
 
 
 def test_a_micrograph_gives_every_pillar(tmp_path):
@@ -155,16 +127,8 @@ def test_a_micrograph_gives_every_pillar(tmp_path):
     image = test_sem.render(truth, missing={(1, 2)})
     counts = np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16)
     tifffile.imwrite(tmp_path / "sem.tif", counts)
-    arguments = [
-        "measure",
-        str(tmp_path / "sem.tif"),
-        "-o",
-        str(tmp_path / "out"),
-        "--pixel-nm",
-        "4.0",
-        "--quiet",
-    ]
-    assert main(arguments) == 0
+    arguments = f"measure {tmp_path}/sem.tif -o {tmp_path}/out --pixel-nm 4.0 --quiet"
+    assert call(arguments) == 0
     with open(tmp_path / "out" / "pillars.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows].count("missing") == 1
@@ -175,7 +139,7 @@ def test_a_micrograph_gives_every_pillar(tmp_path):
     ]
     assert len(error) == 15
     assert np.abs(np.mean(error)) < 1.2
-    assert main(arguments) == 2  # exists
+    assert call(arguments) == 2  # exists
 
 
 @pytest.mark.parametrize("repeats", [False, True])
@@ -201,15 +165,8 @@ def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats)
     tifffile.imwrite(
         tmp_path / "sem.tif", np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16)
     )
-    arguments = [
-        "measure",
-        str(tmp_path / "sem.tif"),
-        "--pixel-nm",
-        "4.0",
-        "--design",
-        str(tmp_path / "lens.h5"),
-    ]
-    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    arguments = f"measure {tmp_path}/sem.tif --pixel-nm 4.0 --design {tmp_path}/lens.h5"
+    assert call(f"{arguments} -o {tmp_path}/out --quiet") == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["place_is_clear"] != repeats
     assert bool(told["bias_nm"]) != repeats
@@ -231,14 +188,8 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
         np.uint16
     )  # pixels of 4 nm
     tifffile.imwrite(tmp_path / "sem.tif", image)
-    arguments = [
-        "measure",
-        str(tmp_path / "sem.tif"),
-        "--design",
-        str(tmp_path / "lens.h5"),
-        "--pixel-nm",
-    ]
-    assert main([*arguments, "4.068", "-o", str(tmp_path / "out")]) == 0
+    arguments = f"measure {tmp_path}/sem.tif --design {tmp_path}/lens.h5 --pixel-nm"
+    assert call(f"{arguments} 4.068 -o {tmp_path}/out") == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["place_is_clear"]
     # 0.1 pixels at either end of 4 x 100
@@ -246,14 +197,9 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
     assert told["bias_nm"] == []
     assert not (tmp_path / "out" / "bias.toml").exists()
     better = capsys.readouterr().out.split("--pixel-nm ")[1].split()[0]
-    assert main([*arguments, better, "-o", str(tmp_path / "again")]) == 0
+    assert call(arguments, better, f"-o {tmp_path}/again") == 0
     assert "what the microscope adds" in capsys.readouterr().out
-    assert (
-        main(
-            [*arguments, better, "--edge-bias-nm", "0.3", "-o", str(tmp_path / "told")]
-        )
-        == 0
-    )
+    assert call(arguments, better, f"--edge-bias-nm 0.3 -o {tmp_path}/told") == 0
     assert "what the microscope adds" not in capsys.readouterr().out
     told = json.loads((tmp_path / "again" / "measure.json").read_text())
     assert max(abs(bias) for _, bias, *_ in told["bias_nm"]) < 1.5
@@ -282,15 +228,8 @@ def test_pillars_whose_diameter_is_not_what_is_drawn_are_refused(
     )
     image = np.clip(test_sem.render(np.full((4, 4), 220.0)) * 2e4, 0, 65535)
     tifffile.imwrite(tmp_path / "sem.tif", image.astype(np.uint16))
-    arguments = [
-        "measure",
-        str(tmp_path / "sem.tif"),
-        "--pixel-nm",
-        "4.0",
-        "--design",
-        str(tmp_path / "lens.h5"),
-    ]
-    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 2
+    arguments = f"measure {tmp_path}/sem.tif --pixel-nm 4.0 --design {tmp_path}/lens.h5"
+    assert call(f"{arguments} -o {tmp_path}/out --quiet") == 2
     assert "--design takes round pillars" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -305,19 +244,7 @@ def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(
     bar = (np.abs(x) < 30) & (np.abs(y) < 14)
     picture = 40 + 120 * bar + 3 * np.random.default_rng(3).standard_normal(bar.shape)
     tifffile.imwrite(tmp_path / "a.tif", picture.astype(np.uint8))
-    assert (
-        main(
-            [
-                "measure",
-                str(tmp_path / "a.tif"),
-                "--pixel-nm",
-                "4",
-                "-o",
-                str(tmp_path / "out"),
-            ]
-        )
-        == 1
-    )
+    assert call(f"measure {tmp_path}/a.tif --pixel-nm 4 -o {tmp_path}/out") == 1
     told = capsys.readouterr().out
     assert "  FAILED: most sites hold no round pillar: is the lattice of" in told
     assert "--pitch-nm states it" in told
@@ -336,16 +263,7 @@ def test_writing_below_a_micrograph_changes_no_pillar(tmp_path, capsys):
         tifffile.imwrite(tmp_path / f"{name}.tif", image)
         scale = ["--pixel-nm", "4"] if name == "bare" else ["--bar-nm", "500"]
         assert (
-            main(
-                [
-                    "measure",
-                    str(tmp_path / f"{name}.tif"),
-                    *scale,
-                    "-o",
-                    str(tmp_path / name),
-                ]
-            )
-            == 0
+            call(f"measure {tmp_path}/{name}.tif", *scale, f"-o {tmp_path}/{name}") == 0
         )
         assert ("120 rows of writing below" in capsys.readouterr().out) == (
             name == "written"

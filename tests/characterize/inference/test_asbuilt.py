@@ -32,10 +32,10 @@ from characterize.model.pillars import PillarResponse
 from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
-from metalens.cli import main
 from metalens.core.errors import CaptureError, ConfigError, FitError
 from metalens.fabrication import SolvedResponse, proxy_sensitivity
 from metalens.psf.lens_psfs import View
+from tests.command_line import call
 
 SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
 USUAL = FitOptions(scan_um=60.0)
@@ -474,9 +474,9 @@ def test_psfs_of_a_fitted_lens_hold_its_posterior_in_their_error(
         bench=bench,
     )
     known.save(tmp_path / "asbuilt.h5")
-    words = ["psf", str(tmp_path / "asbuilt.h5"), "-o", str(tmp_path / "psf.h5")]
-    more = ["--sources-mm", "2", "--window-um", "24", "--samples", "48", "--json"]
-    assert main([*words, *more]) == 0
+    words = f"psf {tmp_path}/asbuilt.h5 -o {tmp_path}/psf.h5"
+    more = "--sources-mm 2 --window-um 24 --samples 48 --json"
+    assert call(f"{words} {more}") == 0
     said = json.loads(capsys.readouterr().out)
     assert said["angles_rad"] == pytest.approx(np.unique(fitted.angle_rad, axis=0))
     view = View((2e3,), ((0.0, 0.0),), window_um=24.0, samples=48)

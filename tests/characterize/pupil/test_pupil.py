@@ -16,6 +16,7 @@ from characterize.captures import capture
 from characterize.pupil import fit as pupilfit
 from characterize.pupil.model import PupilModel, PupilSpec
 from metalens.core.errors import CaptureError, FitError
+from tests.command_line import call
 
 SPEC = PupilSpec(
     0.3,
@@ -215,7 +216,6 @@ def test_real_beads_predict_the_planes_left_out():
 
 
 def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
-    from metalens.cli import main
     from metalens.core import store
 
     model = make()
@@ -224,22 +224,14 @@ def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
         "numerical_aperture = 0.3\nwavelength_um = 0.5\npixel_um = 0.4\nstep_um = 4.0\nwindow = 16\nphase_order = 4\n"
         "amplitude_order = 1\ndrift_order = 1\n"
     )
-    words = [
-        "fit",
-        str(tmp_path / "stack.tif"),
-        "--pupil",
-        str(tmp_path / "pupil.toml"),
-        "-o",
-        str(tmp_path / "p.h5"),
-    ]
-    assert main([*words, "--quiet"]) == 0
+    words = f"fit {tmp_path}/stack.tif --pupil {tmp_path}/pupil.toml -o {tmp_path}/p.h5"
+    assert call(f"{words} --quiet") == 0
     assert store.load(tmp_path / "p.h5", "pupil").attributes["agreement_ncc"] > 0.99
     assert (tmp_path / "p.html").stat().st_size > 10000
-    assert main(words) == 2  # exists, no --force
+    assert call(words) == 2  # exists, no --force
 
 
 def test_command_ends_with_1_where_a_fit_is_refused(tmp_path, capsys):
-    from metalens.cli import main
 
     random = np.random.default_rng(0)
     frames = random.poisson(200, (9, 32, 32)).astype(np.uint16)  # no bead anywhere
@@ -248,18 +240,11 @@ def test_command_ends_with_1_where_a_fit_is_refused(tmp_path, capsys):
         "numerical_aperture = 0.3\nwavelength_um = 0.5\npixel_um = 0.4\nstep_um = 4.0\nwindow = 16\nphase_order = 4\n"
         "amplitude_order = 1\ndrift_order = 1\n"
     )
-    words = [
-        "fit",
-        str(tmp_path / "stack.tif"),
-        "--pupil",
-        str(tmp_path / "pupil.toml"),
-        "-o",
-        str(tmp_path / "p.h5"),
-    ]
-    assert main([*words, "--quiet"]) == 1
+    words = f"fit {tmp_path}/stack.tif --pupil {tmp_path}/pupil.toml -o {tmp_path}/p.h5"
+    assert call(f"{words} --quiet") == 1
     assert not (tmp_path / "p.h5").exists()
     capsys.readouterr()
-    assert main([*words, "--json", "--insist"]) == 1
+    assert call(f"{words} --json --insist") == 1
     told = json.loads(capsys.readouterr().out)
     assert told["failures"] == told["problems"] != []
     assert (tmp_path / "p.h5").exists()

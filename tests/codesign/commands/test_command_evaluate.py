@@ -8,10 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from metalens import cli, design, lens
+from metalens import design, lens
 from metalens.cell.record import Cell, Index
 from metalens.design.profiles import Focus
 from metalens.library.proxy import Proxy
+from tests.command_line import call
 
 IDEAL = Proxy(
     np.array([[0.0, 3 * math.pi]]),
@@ -58,14 +59,8 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 20000.0)
     (tmp_path / "o.toml").write_text(TOML)
-    words = [
-        str(tmp_path / "a.h5"),
-        str(tmp_path / "b.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-        "--reader",
-    ]
-    assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 0
+    words = f"{tmp_path}/a.h5 {tmp_path}/b.h5 --config {tmp_path}/o.toml --reader"
+    assert call(f"evaluate optics {words} -o {tmp_path}/out") == 0
     shown = capsys.readouterr().out
     assert "Read by the reference reader: 64 frames of 32 pixels of 12 µm" in shown
     assert "image error" in shown
@@ -110,14 +105,8 @@ def test_an_error_above_what_is_aimed_at_ends_1_and_is_told_in_both_outputs(
     small = TOML.replace("[axial]", "[axial]\ntolerance = 1e-17")
     small = small.replace("count = 2\npixels = 32", "count = 1\npixels = 24")
     (tmp_path / "o.toml").write_text(small.replace("count = 3", "count = 1"))
-    words = [
-        str(tmp_path / "a.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-        "-o",
-        str(tmp_path / "out"),
-    ]
-    assert cli.main(["evaluate", "optics", *words]) == 1
+    words = f"{tmp_path}/a.h5 --config {tmp_path}/o.toml -o {tmp_path}/out"
+    assert call(f"evaluate optics {words}") == 1
     assert "\n  FAILED: a: the PSFs' error " in (shown := capsys.readouterr().out)
     (told,) = json.loads((tmp_path / "out" / "optics.json").read_text())["failures"]
     assert told.endswith("is above axial.tolerance = 1e-17")
@@ -128,13 +117,8 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 2000.0, distance_um=700.0)
     (tmp_path / "o.toml").write_text(TOML)
-    words = [
-        str(tmp_path / "a.h5"),
-        str(tmp_path / "b.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-    ]
-    assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 2
+    words = f"{tmp_path}/a.h5 {tmp_path}/b.h5 --config {tmp_path}/o.toml"
+    assert call(f"evaluate optics {words} -o {tmp_path}/out") == 2
     assert "sensor distance" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -152,14 +136,8 @@ def test_a_deflector_is_told_to_have_no_focus(tmp_path, capsys):
     few = TOML.replace("count = 3", "count = 1").replace("angles_deg = [0.0, 5.0]", "")
     few = few.replace("[-6.0, 0.0, 11.0]", "[0.0]")
     (tmp_path / "o.toml").write_text(few)
-    words = [
-        str(tmp_path / "prism.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-        "--scenes",
-        "1",
-    ]
-    cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")])
+    words = f"{tmp_path}/prism.h5 --config {tmp_path}/o.toml --scenes 1"
+    call(f"evaluate optics {words} -o {tmp_path}/out")
     shown = capsys.readouterr()
     assert "prism brings no light together in one bright spot" in shown.out + shown.err
 
@@ -171,15 +149,8 @@ def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(
     (tmp_path / "o.toml").write_text(
         TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0")
     )
-    words = [
-        str(tmp_path / "a.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-        "--reader",
-        "-o",
-        str(tmp_path / "out"),
-    ]
-    assert cli.main(["evaluate", "optics", *words]) == 2
+    words = f"{tmp_path}/a.h5 --config {tmp_path}/o.toml --reader -o {tmp_path}/out"
+    assert call(f"evaluate optics {words}") == 2
     assert (
         "the pillars are known at 850 nm alone, and 1 of it lies beyond: sweep a library over it"
         in capsys.readouterr().err
@@ -198,12 +169,6 @@ def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(
 def test_bad_settings_are_refused(tmp_path, capsys, bad):
     made(tmp_path / "a.h5", 2000.0)
     (tmp_path / "o.toml").write_text(bad)
-    words = [
-        str(tmp_path / "a.h5"),
-        "--config",
-        str(tmp_path / "o.toml"),
-        "-o",
-        str(tmp_path / "out"),
-    ]
-    assert cli.main(["evaluate", "optics", *words]) == 2
+    words = f"{tmp_path}/a.h5 --config {tmp_path}/o.toml -o {tmp_path}/out"
+    assert call(f"evaluate optics {words}") == 2
     assert "need" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from metalens import lens
 from metalens.cli import main
 from metalens.core import config
 from tests.codesign import made_lens as m
-from tests.command_line import run
+from tests.command_line import call, run
 
 DIES = """
 import os, signal, sys
@@ -145,7 +145,7 @@ def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the
     assert [path.name[:20] for path in Path("out.unfinished").glob(".*.part")] == [
         ".nominal.safetensors"
     ]
-    assert main([*words, "--resume"]) == 0
+    assert call(*words, "--resume") == 0
     whole, resumed = (
         {
             path.name: path.read_bytes()
@@ -218,17 +218,8 @@ LOOK += ["--axial-mm", "2.5", "--lateral-mm", "1.5"]
 
 def _shown(folder, *runs, out):
     places = [str(folder / run) for run in runs]
-    return main(
-        [
-            "evaluate",
-            "experiment",
-            *places,
-            "-o",
-            str(folder / out),
-            *LOOK,
-            "--json",
-            "--force",
-        ]
+    return call(
+        "evaluate experiment", *places, f"-o {folder}/{out}", *LOOK, "--json --force"
     )
 
 

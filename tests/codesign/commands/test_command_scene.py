@@ -2,8 +2,8 @@
 
 import cv2
 
-from metalens import cli
 from metalens.core import store
+from tests.command_line import call
 
 TOML = "frames = 6\npixels = 64\npitch_um = 22.5\nseed = 4\nscale = 0.1\n"
 
@@ -11,7 +11,7 @@ TOML = "frames = 6\npixels = 64\npitch_um = 22.5\nseed = 4\nscale = 0.1\n"
 def test_scene_writes_sheet_and_labels(tmp_path):
     source = tmp_path / "scene.toml"
     source.write_text(TOML)
-    assert cli.main(["scene", str(source), "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    assert call(f"scene {source} -o {tmp_path}/out --quiet") == 0
     sheet = cv2.imread(str(tmp_path / "out" / "sheet.png"), cv2.IMREAD_GRAYSCALE)
     assert sheet.shape == (3 * 64, 6 * 64)
     assert sheet[:64].std() > 20
@@ -25,18 +25,7 @@ def test_variety_changes_the_frames_and_is_reproducible(tmp_path):
     sheets = []
     for name, variety in (("bare", 1.0), ("worn", 2.5), ("again", 2.5)):
         (tmp_path / "scene.toml").write_text(TOML + f"variety = {variety}\n")
-        assert (
-            cli.main(
-                [
-                    "scene",
-                    str(tmp_path / "scene.toml"),
-                    "-o",
-                    str(tmp_path / name),
-                    "--quiet",
-                ]
-            )
-            == 0
-        )
+        assert call(f"scene {tmp_path}/scene.toml -o {tmp_path}/{name} --quiet") == 0
         sheets.append((tmp_path / name / "sheet.png").read_bytes())
     assert sheets[0] != sheets[1] == sheets[2]
 
@@ -44,9 +33,9 @@ def test_variety_changes_the_frames_and_is_reproducible(tmp_path):
 def test_bad_scene_is_refused_with_the_key(tmp_path, capsys):
     source = tmp_path / "scene.toml"
     source.write_text("distance_mm = 0.0\n")
-    assert cli.main(["scene", str(source), "-o", str(tmp_path / "out")]) == 2
+    assert call(f"scene {source} -o {tmp_path}/out") == 2
     assert "distance_mm" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     source.write_text("variety = 5.0\n")
-    assert cli.main(["scene", str(source), "-o", str(tmp_path / "out")]) == 2
+    assert call(f"scene {source} -o {tmp_path}/out") == 2
     assert "variety = 5.0: need 0 to 4" in capsys.readouterr().err

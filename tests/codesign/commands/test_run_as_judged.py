@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from codesign.adapt import source as finished
-from metalens.cli import main
 from tests.codesign import made_lens as m
+from tests.command_line import call
 
 SHORT = m.TINY.replace("steps = 1", "steps = 4").replace(
     'preset = "smoke"', 'preset = "smoke"\ncheckpoint_every = 2'
@@ -21,7 +21,7 @@ def _run(folder, text, *words):
     folder.mkdir()
     (folder / "run.toml").write_text(text)
     out = folder / "out"
-    assert main(["codesign", str(folder / "run.toml"), "-o", str(out), *words]) == 0
+    assert call(f"codesign {folder}/run.toml -o {out}", *words) == 0
     return out
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from codesign.commands import view
-from metalens import cli
 from metalens.core.errors import StoreError
+from tests.command_line import call
 
 
 def line(step, loss):
@@ -35,10 +35,7 @@ def test_a_run_that_goes_on_shows_what_its_log_holds_so_far(tmp_path):
     ]
     assert panels[1].x.tolist() == [1, 3, 4]
     assert np.allclose(panels[1].lines["depth error / mm"], [1.4, 1.0, 0.6], rtol=1e-15)
-    assert (
-        cli.main(["view", str(tmp_path), "-o", str(tmp_path / "page.html"), "--quiet"])
-        == 0
-    )
+    assert call(f"view {tmp_path} -o {tmp_path}/page.html --quiet") == 0
 
 
 def test_networks_are_a_row_each(tmp_path):

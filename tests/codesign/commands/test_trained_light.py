@@ -7,8 +7,8 @@ import torch
 
 from codesign.optics.stack import OpticsConfig, trained_lens
 from metalens import lens
-from metalens.cli import main
 from metalens.core.store import Provenance
+from tests.command_line import call
 
 OPTICS = OpticsConfig(
     aperture_mm=0.02,
@@ -36,7 +36,7 @@ def test_a_run_s_lens_is_looked_at_in_the_light_it_was_trained_in(tmp_path, ligh
     assert lens.load(path).proxy.wavelengths_um == pytest.approx(
         (0.94 - half, 0.94 + half)
     )
-    words = ["psf", str(path), "-o", str(tmp_path / "psf.h5"), "--led-fwhm-nm", "19.2"]
-    window = ["--window-um", "30", "--samples", "40", "--tolerance", "1e-3"]
-    code = main([*words, *window, "--sources-mm", "2", "--angles-deg", "0"])
+    words = f"psf {path} -o {tmp_path}/psf.h5 --led-fwhm-nm 19.2"
+    window = "--window-um 30 --samples 40 --tolerance 1e-3"
+    code = call(f"{words} {window} --sources-mm 2 --angles-deg 0")
     assert code == (0 if light_nm else 2)

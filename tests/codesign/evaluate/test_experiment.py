@@ -21,6 +21,7 @@ from codesign.settings import ExperimentConfig
 from metalens.cli import main
 from metalens.core.errors import ConfigError
 from tests.codesign import made_lens as m
+from tests.command_line import call
 from tests.referees.seen_pupil import pupil_of
 
 SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, people=9)
@@ -159,7 +160,7 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
         "--people",
         "3",
     ]
-    assert main([*words, "--json"]) == 0
+    assert call(*words, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in told["runs"]] == ["run 1", "run 2"]
     # the same run twice, the same noise
@@ -180,11 +181,9 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
-    assert main([*words[:4], "-o", str(folder / "twins"), "--names", "a", "a"]) == 2
+    assert call(*words[:4], f"-o {folder}/twins --names a a") == 2
     assert "names a, a: two are alike" in capsys.readouterr().err
-    assert (
-        main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
-    )
+    assert call(f"evaluate experiment {folder} -o {folder}/other") == 2
     assert "is no run folder" in capsys.readouterr().err
 
 

@@ -13,13 +13,14 @@ import torch
 from codesign.commands import view
 from codesign.evaluate import scene_image
 from codesign.eye import CameraRig, PinholeCamera, dataset, render
-from metalens import cli, design, lens
+from metalens import design, lens
 from metalens.cell import Film, Index
 from metalens.core.errors import SceneError
 from metalens.core.store import Provenance
 from metalens.design import Focus
 from metalens.optics import Layers
 from tests.codesign import made_lens as m
+from tests.command_line import call
 
 CAMERA = PinholeCamera(24, 3.0)
 RIG = replace(CameraRig(), elevation_rad=0.6)
@@ -97,10 +98,10 @@ def test_what_is_written_is_what_is_shown(found, tmp_path):
 def test_the_command_images_through_a_lens_file(tmp_path, capsys):
     lens.save(tmp_path / "lens.h5", LENS)
     (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 4.0\n")
-    words = ["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]
-    assert cli.main([*words, "--fwhm-nm", "20"]) == 2
+    words = f"scene {tmp_path}/scene.toml -o {tmp_path}/out"
+    assert call(f"{words} --fwhm-nm 20") == 2
     assert "need 0 or more, and --lens" in capsys.readouterr().err
-    assert cli.main([*words, "--lens", str(tmp_path / "lens.h5"), "--quiet"]) == 0
+    assert call(f"{words} --lens {tmp_path}/lens.h5 --quiet") == 0
     assert {"image.h5", "image.png", "scene.h5"} <= {
         path.name for path in (tmp_path / "out").iterdir()
     }
@@ -136,8 +137,8 @@ def test_an_image_above_its_aim_ends_1_and_says_what_does_it(tmp_path, capsys):
     tiny, _ = design.make(phase, focus, aperture_um=4.0, cell=m.CELL, proxy=m.PROXY)
     lens.save(tmp_path / "lens.h5", tiny)
     (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 9.0\n")
-    words = ["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]
-    assert cli.main([*words, "--lens", str(tmp_path / "lens.h5")]) == 1
+    words = f"scene {tmp_path}/scene.toml -o {tmp_path}/out"
+    assert call(f"{words} --lens {tmp_path}/lens.h5") == 1
     told = capsys.readouterr().out
     assert "is above the 0.03 asked for (" in told
     assert (tmp_path / "out" / "image.h5").is_file()

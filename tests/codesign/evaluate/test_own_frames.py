@@ -18,6 +18,7 @@ from codesign.settings import ExperimentConfig
 from codesign.train import assess
 from metalens.cli import main
 from tests.codesign import made_lens as m
+from tests.command_line import call
 
 CONFIG = ExperimentConfig(
     subjects=1, grid=(3, 2), share=0.5, people=2, axial_mm=(1.5,), lateral_mm=()
@@ -120,7 +121,7 @@ def test_what_cannot_be_read_is_refused_with_the_cure(
     cv2.imwrite(str(tmp_path / "small.png"), np.full((48, 31), 9, np.uint8))
     if head:
         _write(tmp_path, [row], head)
-    command = ["evaluate", "experiment", str(folder / "run"), "-o", str(tmp_path / "o")]
-    assert main([*command, "--frames", str(tmp_path)]) == 2
+    command = f"evaluate experiment {folder}/run -o {tmp_path}/o"
+    assert call(f"{command} --frames {tmp_path}") == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "o").exists()

@@ -10,9 +10,9 @@ import pytest
 from codesign.commands import paper as command_paper
 from codesign.evaluate import paper
 from codesign.evaluate.paper import MeasuredNumber
-from metalens.cli import main
 from metalens.core.errors import StoreError
 from tests.codesign import made_lens as m
+from tests.command_line import call
 
 RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
 
@@ -175,15 +175,15 @@ def test_files_of_other_versions_are_named(tmp_path):
 
 
 def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys):
-    words = ["evaluate", "paper", "-o", str(tmp_path / "out")]
-    assert main([*words, "--json"]) == 0
+    words = f"evaluate paper -o {tmp_path}/out"
+    assert call(f"{words} --json") == 0
     told = json.loads(capsys.readouterr().out)
     assert len(told["lines"]) == len(paper.load_claims())
     assert all(line["ours"] is None for line in told["lines"])
     assert "not measured" in (tmp_path / "out" / "report.html").read_text()
-    assert main(words) == 2
+    assert call(words) == 2
     assert "give --force" in capsys.readouterr().err
-    assert main([*words, str(tmp_path), "--force", "--no-measure"]) == 2
+    assert call(f"{words} {tmp_path} --force --no-measure") == 2
     assert "no finished run" in capsys.readouterr().err
 
 
@@ -193,16 +193,8 @@ def test_one_command_measures_and_compares(tmp_path, capsys):
     text = m.TINY.replace("[optics]", "[optics]\nimage_tolerance = 0.5")
     for name in ("a", "b"):
         m.finished_run(tmp_path / name, text)
-    words = [
-        "evaluate",
-        "paper",
-        str(tmp_path / "a"),
-        str(tmp_path / "b"),
-        "-o",
-        str(tmp_path / "out"),
-        "--json",
-    ]
-    assert main([*words, "--subjects", "2", "--scenes", "2"]) == 0
+    words = f"evaluate paper {tmp_path}/a {tmp_path}/b -o {tmp_path}/out --json"
+    assert call(f"{words} --subjects 2 --scenes 2") == 0
     told = {line["key"]: line for line in json.loads(capsys.readouterr().out)["lines"]}
     assert told["gaze_axial/ratio"]["ours"]["value"] == 1.0  # the same run twice
     assert told["scenes/slip/proposed"]["ours"]["value"] == pytest.approx(1.0)

@@ -14,8 +14,8 @@ from codesign.network.architecture import smallest_architecture
 from codesign.train import run as runs
 from codesign.train import search
 from metalens import lens
-from metalens.cli import main
 from tests.codesign import made_lens as m
+from tests.command_line import call
 
 MOVING = (
     m.TINY.replace("polynomials = 0", "polynomials = 4")
@@ -63,7 +63,7 @@ def test_own_pitch_keeps_the_budget(tmp_path):
 def test_a_run_keeps_a_lens_for_every_budget_and_reads_it_back(tmp_path):
     (tmp_path / "run.toml").write_text(MOVING)
     out = tmp_path / "out"
-    assert main(["codesign", str(tmp_path / "run.toml"), "-o", str(out)]) == 0
+    assert call(f"codesign {tmp_path}/run.toml -o {out}") == 0
     source = finished.load_finished_run(out)
     model = source.run.trainer.model
     assert source.row["pitch_um"] == pytest.approx(float(model.pitch_um.detach()))

@@ -21,8 +21,8 @@ from codesign.network import windows
 from codesign.network.architecture import smallest_architecture
 from codesign.train import run, search
 from codesign.train.results import finished_budgets
-from metalens import cli
 from metalens.core.errors import ConfigError, TrainingError
+from tests.command_line import call
 
 TINY = """
 preset = "smoke"
@@ -221,10 +221,7 @@ def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys):
         "budgets_mmacs = [2.0]", "budgets_mmacs = [2.0]\npitch_um = 17.0"
     )
     (tmp_path / "run.toml").write_text(text)
-    assert (
-        cli.main(["codesign", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")])
-        == 0
-    )
+    assert call(f"codesign {tmp_path}/run.toml -o {tmp_path}/out") == 0
     words = "run.pitch_um = 17 is finer than the samples of the image, optics.sample_um = 18"
     assert words in capsys.readouterr().out
 

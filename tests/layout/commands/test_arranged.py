@@ -12,10 +12,11 @@ import layout
 from layout.commands import make
 from layout.formats import gdsii_write, job_files
 from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
-from metalens import cli, lens
+from metalens import lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from tests.command_line import call
 
 SIDES = {"a": 15, "b": 10}
 
@@ -72,7 +73,7 @@ def run(folder, text, target, *words):
         "--force",
         *words,
     ]
-    return cli.main(["layout", str(folder / "arrangement.toml"), *options])
+    return call(f"layout {folder}/arrangement.toml", *options)
 
 
 WAFER = """
@@ -261,14 +262,10 @@ def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(
     (folder / "negative.toml").write_text(
         'tone = "negative"\n[die]\nmargin_um = 330\nverniers = false\n'
     )
-    words = [
-        "layout",
-        str(folder / "arrangement.toml"),
-        "--process",
-        str(folder / "negative.toml"),
-        "--oasis",
-        "--quiet",
-    ]
+    words = (
+        f"layout {folder}/arrangement.toml --process {folder}/negative.toml --oasis"
+        " --quiet"
+    )
     one = '[[lens]]\nfile = "b.h5"\nname = "B"\n'
     for text in (
         one + "furnished = false\n",
@@ -276,7 +273,7 @@ def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(
         one + "furnished = true\n[die]\nsize_um = [900, 800]\n",
     ):
         (folder / "arrangement.toml").write_text(text)
-        assert cli.main([*words, "-o", str(tmp_path / "n")]) == 2
+        assert call(f"{words} -o {tmp_path}/n") == 2
         assert "need lenses that are furnished" in capsys.readouterr().err
 
 

@@ -11,10 +11,11 @@ import pytest
 
 from layout.formats import gdsii_write
 from layout.formats.library import MaskCell, MaskLibrary
-from metalens import cli, lens
+from metalens import lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from tests.command_line import call
 
 PROXY = Proxy(
     np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01
@@ -78,8 +79,8 @@ def folder(tmp_path_factory):
 def run(folder, text, target, process):
     path = folder / "arrangement.toml"
     path.write_text(text)
-    words = ["--process", str(folder / process), "-o", str(target), "--force", "--gds"]
-    return cli.main(["layout", str(path), *words])
+    words = f"--process {folder}/{process} -o {target} --force --gds"
+    return call(f"layout {path} {words}")
 
 
 CELL = """

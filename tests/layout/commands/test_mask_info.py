@@ -8,7 +8,8 @@ import pytest
 
 from layout.formats import gdsii_write, oasis_write
 from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
-from metalens.cli import BAD_INPUT, SUCCESS, main
+from metalens.cli import BAD_INPUT, SUCCESS
+from tests.command_line import call
 
 klayout = pytest.importorskip("klayout.db")
 
@@ -44,7 +45,7 @@ def test_shapes_of_every_layer_are_those_that_klayout_counts(
     (oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii)(
         make_plan(seed=7), path
     )
-    assert main(["info", str(path), "--json"]) == SUCCESS
+    assert call(f"info {path} --json") == SUCCESS
     told = json.loads(capsys.readouterr().out)
     shapes, tops = counted(path)
     assert {
@@ -55,7 +56,7 @@ def test_shapes_of_every_layer_are_those_that_klayout_counts(
         tops,
         sum(shapes.values()),
     )
-    assert main(["info", str(path)]) == SUCCESS
+    assert call(f"info {path}") == SUCCESS
     assert f"{sum(shapes.values()):,} shapes" in capsys.readouterr().out
 
 
@@ -63,9 +64,9 @@ def test_a_mask_cut_short_is_refused_by_name(make_plan, tmp_path, capsys):
     path = tmp_path / "m.gds"
     gdsii_write.write_gdsii(make_plan(seed=7), path)
     path.write_bytes(path.read_bytes()[:-40])
-    assert main(["info", str(path)]) == BAD_INPUT
+    assert call(f"info {path}") == BAD_INPUT
     assert str(path) in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "none.oas")]) == BAD_INPUT
+    assert call(f"info {tmp_path}/none.oas") == BAD_INPUT
     assert "none.oas: no such file" in capsys.readouterr().err
 
 
@@ -98,7 +99,7 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
     cells |= {name: MaskCell(name, references=r) for name, r in copies.items()}
     write = oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii
     write(MaskLibrary("WAFER", cells), tmp_path / f"w.{ending}")
-    assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
+    assert call(f"info {tmp_path}/w.{ending} --json") == SUCCESS
     told = json.loads(capsys.readouterr().out)
     lenses = 210 * 330 * 40 * 50 + 1
     found = {number: entry["shapes"] for number, entry in told["layers"].items()}
@@ -123,7 +124,7 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
     gdsii_write.write_gdsii(
         MaskLibrary("L", {cell.name: cell for cell in cells}), tmp_path / "w.gds"
     )
-    assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS
+    assert call(f"info {tmp_path}/w.gds --json") == SUCCESS
     told = json.loads(capsys.readouterr().out)
     assert told["layers"] == {"7/0": {"name": "", "shapes": 4}}
     assert sorted(told["tops"]) == ["ONE", "TWO"]
@@ -136,7 +137,7 @@ def test_a_compressed_mask_is_told_from_a_damaged_one(tmp_path, capsys, command)
     """
     path = tmp_path / "chip.gds.gz"
     path.write_bytes(gzip.compress(bytes(range(256)) * 9))
-    assert main([command, str(path)]) == BAD_INPUT
+    assert call(command, f"{path}") == BAD_INPUT
     assert (
         "chip.gds.gz: a compressed file (gzip: unpack it), need"
         in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 from layout.drc.library import check_library
 from layout.formats.reading import read_mask
 from layout.process.process import DesignRules
-from metalens import cli
+from tests.command_line import call
 
 db = pytest.importorskip("klayout.db")
 
@@ -34,7 +34,7 @@ def write(path, layers, *, build=None):
 
 def run(capsys, *arguments):
     """Exit code and values of the command."""
-    code = cli.main(["check", *map(str, arguments), "--json"])
+    code = call("check", *map(str, arguments), "--json")
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -82,9 +82,9 @@ def test_layers_not_chosen_are_listed_and_nothing_checked_is_no_pass(tmp_path, c
         "nothing is drawn on layer 11",
         "no shape was checked",
     ]
-    assert cli.main(["check", str(path), "--layers", "2"]) == 0
+    assert call(f"check {path} --layers 2") == 0
     assert "layer 10/0: 2 shapes, NOT CHECKED" in capsys.readouterr().out
-    assert cli.main(["check", str(path), "--layers", "two"]) == 2
+    assert call(f"check {path} --layers two") == 2
     assert "need LAYER or LAYER/DATATYPE" in capsys.readouterr().err
 
 
@@ -116,9 +116,9 @@ def test_one_top_cell_of_several_is_chosen(tmp_path, capsys):
     assert (code, values["violations"]["space"], values["shapes"]) == (1, 1, 2)
     code, values = run(capsys, path, "--top", "INNER")
     assert (code, values["shapes"]) == (0, 1)
-    assert cli.main(["check", str(path), "--top", "NONE"]) == 2
+    assert call(f"check {path} --top NONE") == 2
     assert "no cell 'NONE' in the mask; top cells: " in capsys.readouterr().err
-    assert cli.main(["info", str(path), "--top", "INNER", "--json"]) == 0
+    assert call(f"info {path} --top INNER --json") == 0
     info = json.loads(capsys.readouterr().out)
     assert (info["tops"], info["layers"]["1/0"]["shapes"]) == (["INNER"], 1)
 
@@ -155,7 +155,7 @@ def test_the_context_cell_of_klayout_is_no_drawing(tmp_path, capsys):
 @pytest.mark.parametrize("command", ["check", "info"])
 def test_files_of_other_formats_are_named(tmp_path, capsys, name, data, words, command):
     (tmp_path / name).write_bytes(data)
-    assert cli.main([command, str(tmp_path / name)]) == 2
+    assert call(command, f"{tmp_path}/{name}") == 2
     said = capsys.readouterr().err
     assert words in said
     assert "GDSII or OASIS" in said

@@ -13,8 +13,8 @@ from layout.formats.library import MaskCell, MaskLibrary
 from layout.formats.reading import read_mask
 from layout.process import process as processes
 from layout.process.process import DesignRules
-from metalens import cli
 from metalens.lens import DiameterMap
+from tests.command_line import call
 
 db = pytest.importorskip("klayout.db")
 
@@ -127,17 +127,7 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
     process = tmp_path / "p.toml"
     process.write_text("[rules]\nminimum_feature_nm = 80\nminimum_gap_nm = 70\n")
     assert (
-        cli.main(
-            [
-                "check",
-                str(path),
-                "--process",
-                str(process),
-                "--json",
-                "--output",
-                str(tmp_path / "m.lyrdb"),
-            ]
-        )
+        call(f"check {path} --process {process} --json --output {tmp_path}/m.lyrdb")
         == 1
     )
     values = json.loads(capsys.readouterr().out)
@@ -163,9 +153,9 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
 
 def test_sound_marks_pass_and_a_missing_file_is_refused(tmp_path, capsys):
     marks(tmp_path / "m.oas", arm=90, notch=80)
-    assert cli.main(["check", str(tmp_path / "m.oas")]) == 0
+    assert call(f"check {tmp_path}/m.oas") == 0
     assert "keeps the design rules" in capsys.readouterr().out
-    assert cli.main(["check", str(tmp_path / "none.oas")]) == 2
+    assert call(f"check {tmp_path}/none.oas") == 2
     assert "no such file" in capsys.readouterr().err
 
 
@@ -173,10 +163,10 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     made = db.Layout()
     made.create_cell("TOP").shapes(made.layer(1, 0)).insert(db.Box(0, 0, 310, 170))
     made.write(str(tmp_path / "one.gds"))
-    assert cli.main(["check", str(tmp_path / "one.gds")]) == 0
+    assert call(f"check {tmp_path}/one.gds") == 0
     told = capsys.readouterr().out
     assert "no space below 70 nm, minimum width 170.0 nm" in told
-    assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
+    assert call(f"check {tmp_path}/one.gds --json") == 0
     # no Infinity, which JSON does not know
     values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert (values["minimum_space_nm"], values["minimum_width_nm"]) == (None, 170.0)
@@ -277,12 +267,7 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
     plan = layout.plan(DiameterMap(size, 0.3), rules, furnished=False)
     layout.write_oasis(plan, tmp_path / "m.oas")
     planned = check_plan(plan, rules.rules)
-    assert (
-        cli.main(
-            ["check", str(tmp_path / "m.oas"), "--process", str(process), "--json"]
-        )
-        == 1
-    )
+    assert call(f"check {tmp_path}/m.oas --process {process} --json") == 1
     found = json.loads(capsys.readouterr().out)
     assert found["violations"]["width"] == planned.counts["width"] > 20
     assert found["violations"]["space"] == planned.counts["space"] == 0

@@ -8,7 +8,7 @@ import pytest
 import layout
 from layout.formats.library import flatten_stacks
 from layout.formats.reading import read_mask
-from metalens import cli
+from tests.command_line import call
 
 SQUARE = [(0, 0), (500, 0), (500, 300), (0, 300), (0, 0)]
 
@@ -174,9 +174,9 @@ def test_elements_that_draw_nothing_are_skipped_and_counted(tmp_path, capsys, ki
     assert own.count() == 1
     if "MBMS" not in kind:  # KLayout refuses it
         assert klayout_region(db, file)[0].count() == 1
-    assert cli.main(["check", str(file)]) == 0
+    assert call(f"check {file}") == 0
     assert f"draw nothing: 2 {kind}" in capsys.readouterr().out
-    assert cli.main(["info", str(file)]) == 0
+    assert call(f"info {file}") == 0
     assert f"draw nothing: 2 {kind}" in capsys.readouterr().out
 
 
@@ -195,7 +195,7 @@ def test_dots_and_lines_draw_nothing(tmp_path, element, kind):
     file.write_bytes(library(structure(b"AA", element)))
     content = layout.read_gdsii(file)
     assert (dict(content.skipped), content.cells["AA"].polygons) == ({kind: 1}, {})
-    assert cli.main(["check", str(file)]) == 1
+    assert call(f"check {file}") == 1
 
 
 def test_a_path_of_a_moving_stage_is_read_with_its_width(tmp_path):
@@ -208,7 +208,7 @@ def test_a_path_of_a_moving_stage_is_read_with_its_width(tmp_path):
     file.write_bytes(library(structure(b"AA", element)))
     (outline,) = read_mask(file).cells["AA"].polygons[1, 2]
     assert np.ptp(outline, axis=0).tolist() == [300, 60]
-    assert cli.main(["check", str(file)]) == 1  # 60 nm wide, the default needs 80
+    assert call(f"check {file}") == 1  # 60 nm wide, the default needs 80
 
 
 def test_an_outline_of_several_records_is_one(tmp_path):

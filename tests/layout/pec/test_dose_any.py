@@ -12,8 +12,8 @@ from layout.formats import gdsii_write
 from layout.formats.library import MaskCell, MaskLibrary
 from layout.process.process import ExposureSettings
 from layout.shapes import polygon
-from metalens import cli
 from metalens.core.errors import ProcessError
+from tests.command_line import call
 
 ALPHA_UM, BETA_UM, ETA = 0.017, 5.3, 0.7
 EXPOSURE = ExposureSettings(alpha_um=ALPHA_UM, beta_um=BETA_UM, eta=ETA)
@@ -73,8 +73,8 @@ def test_a_file_of_any_polygons_is_written_with_its_doses(tmp_path, capsys, word
         f"[exposure]\nalpha_um = {ALPHA_UM}\nbeta_um = {BETA_UM}\neta = {ETA}\n"
     )
     out = tmp_path / "out"
-    about = ["--process", str(tmp_path / "p.toml"), "-o", str(out), "--json"]
-    assert cli.main(["dose", str(tmp_path / "a.gds"), *about, *words]) == 0
+    about = f"--process {tmp_path}/p.toml -o {out} --json"
+    assert call(f"dose {tmp_path}/a.gds {about}", *words) == 0
     assert json.loads(capsys.readouterr().out)["ok"]
     regions = []
     for path in (tmp_path / "a.gds", out / "mask.gds"):

@@ -12,10 +12,10 @@ import pytest
 
 from metalens import library, rcwa
 from metalens.cell.orders import check_subwavelength
-from metalens.cli import main
 from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.library import axes
+from tests.command_line import call
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -72,24 +72,10 @@ def chained(folder, name, library, capsys, **sweep):
     lens = (FOLDER.parent / "lenses" / f"{name}.toml").read_text()
     (folder / "lens.toml").write_text(lens)
     words = ["--accept-partial-turn", "--quiet"]
-    assert (
-        main(
-            ["library", str(folder / "cell.toml"), "-o", str(folder / library), *words]
-        )
-        == 0
-    )
+    assert call(f"library {folder}/cell.toml -o {folder}/{library}", *words) == 0
     capsys.readouterr()
     assert (
-        main(
-            [
-                "design",
-                str(folder / "lens.toml"),
-                "-o",
-                str(folder / "lens.h5"),
-                *words[:1],
-                "--json",
-            ]
-        )
+        call(f"design {folder}/lens.toml -o {folder}/lens.h5", *words[:1], "--json")
         == 0
     )
     found = json.loads(capsys.readouterr().out)
@@ -98,20 +84,7 @@ def chained(folder, name, library, capsys, **sweep):
         if "fine_process" in lens
         else []
     )
-    assert (
-        main(
-            [
-                "layout",
-                str(folder / "lens.h5"),
-                "-o",
-                str(folder / "mask"),
-                "--gds",
-                "--quiet",
-                *fine,
-            ]
-        )
-        == 0
-    )
+    assert call(f"layout {folder}/lens.h5 -o {folder}/mask --gds --quiet", *fine) == 0
     assert (folder / "mask" / "mask.gds").stat().st_size > 10_000
     return found
 
@@ -146,16 +119,9 @@ def test_rectangles_with_geometric_phase_from_toml_to_mask(tmp_path, capsys):
     assert light["converted"] > 0.95
     # the rest is reflected
     assert light["converted"] + light["unconverted"] <= 1 + light["converted_error"]
-    shown = main(
-        [
-            "psf",
-            str(tmp_path / "lens.h5"),
-            "--config",
-            str(FOLDER.parent / "lenses" / "psf.toml"),
-            "--quiet",
-            "-o",
-            str(tmp_path / "psf.h5"),
-        ]
+    shown = call(
+        f"psf {tmp_path}/lens.h5 --config {FOLDER.parent}/lenses/psf.toml --quiet -o"
+        f" {tmp_path}/psf.h5"
     )
     assert shown == 0
 
@@ -183,18 +149,12 @@ def test_two_phases_by_width_and_length_from_toml_to_mask(tmp_path, capsys):
         assert 0.6 < own["wavefront_efficiency"] <= own["transmission"] <= 1
         assert own["leaked"] < 1e-20  # mirrors
     view = "depths_mm = [1e3, 1e3, 1.0]\nangles_deg = [0.0]\nsamples = 40\nwindow_um = 16.0\ntolerance = 1e-3\n"
-    words = [
-        "psf",
-        str(tmp_path / "lens.h5"),
-        "--config",
-        str(tmp_path / "psf.toml"),
-        "--quiet",
-    ]
+    words = f"psf {tmp_path}/lens.h5 --config {tmp_path}/psf.toml --quiet"
     (tmp_path / "psf.toml").write_text(view)
-    assert main([*words, "-o", str(tmp_path / "both.h5")]) == 2
+    assert call(f"{words} -o {tmp_path}/both.h5") == 2
     assert "give light" in capsys.readouterr().err
     (tmp_path / "psf.toml").write_text(view + 'light = "y"\n')
-    assert main([*words, "-o", str(tmp_path / "y.h5")]) == 0
+    assert call(f"{words} -o {tmp_path}/y.h5") == 0
 
 
 @pytest.mark.slow

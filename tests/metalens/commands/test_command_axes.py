@@ -10,10 +10,10 @@ import pytest
 
 from metalens import rcwa
 from metalens.cell import Cell
-from metalens.cli import main
 from metalens.commands import library as library_command
 from metalens.library import Sweep, axes
 from metalens.view import artefacts
+from tests.command_line import call
 
 CELL = """
 [cell]
@@ -34,9 +34,7 @@ tolerance = 0.1
 
 def made(folder, capsys, *, ratio=""):
     (folder / "cell.toml").write_text(CELL.format(ratio=ratio))
-    status = main(
-        ["library", str(folder / "cell.toml"), "-o", str(folder / "axes.h5"), "--json"]
-    )
+    status = call(f"library {folder}/cell.toml -o {folder}/axes.h5 --json")
     told = capsys.readouterr()
     return status, json.loads(told.out) if status < 2 else told.err
 
@@ -62,7 +60,7 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
     panels = artefacts.axes_panels(tmp_path / "axes.h5")
     # rows of the image: along y
     assert panels[1].values[1, 0, j, i] == pytest.approx(abs(library.t[0, i, j, 1, 1]))
-    assert main(["view", str(tmp_path / "axes.h5"), "--quiet"]) == 0
+    assert call(f"view {tmp_path}/axes.h5 --quiet") == 0
 
 
 def test_bars_above_the_tolerance_fail_and_a_ratio_is_refused(tmp_path, capsys):

@@ -12,9 +12,9 @@ from metalens import lens as lenses
 from metalens import library
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
-from metalens.cli import main
 from metalens.core.errors import PropagationError, SceneError
 from metalens.library import GeometricPhase, Proxy
+from tests.command_line import call
 from tests.referees.turned_pillar import isolated
 
 T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)
@@ -70,18 +70,7 @@ def folder(tmp_path_factory):
     (where / "psf.toml").write_text(PSF)
     for hand in ("right", "left"):
         (where / f"{hand}.toml").write_text(DESIGN.replace("HAND", hand))
-    assert (
-        main(
-            [
-                "design",
-                str(where / "right.toml"),
-                "-o",
-                str(where / "right.h5"),
-                "--quiet",
-            ]
-        )
-        == 0
-    )
+    assert call(f"design {where}/right.toml -o {where}/right.h5 --quiet") == 0
     return where
 
 
@@ -90,15 +79,7 @@ def test_a_design_without_a_wavelength_takes_the_one_of_its_library(folder, caps
         DESIGN.replace("HAND", "right").replace("wavelength_nm = 940.0\n", "")
     )
     assert (
-        main(
-            [
-                "design",
-                str(folder / "silent.toml"),
-                "-o",
-                str(folder / "silent.h5"),
-                "--skip-focus-check",
-            ]
-        )
+        call(f"design {folder}/silent.toml -o {folder}/silent.h5 --skip-focus-check")
         == 0
     )
     assert "0.021 mm, 940 nm" in capsys.readouterr().out
@@ -111,17 +92,7 @@ def test_a_design_without_a_wavelength_takes_the_one_of_its_library(folder, caps
 def test_design_and_psf_of_either_hand(folder, capsys, hand):
     target = folder / f"{hand}_own.h5"
     assert (
-        main(
-            [
-                "design",
-                str(folder / f"{hand}.toml"),
-                "-o",
-                str(target),
-                "--json",
-                "--skip-focus-check",
-            ]
-        )
-        == 0
+        call(f"design {folder}/{hand}.toml -o {target} --json --skip-focus-check") == 0
     )
     found = json.loads(capsys.readouterr().out)
     assert found["circular"]["hand"] == hand
@@ -129,20 +100,7 @@ def test_design_and_psf_of_either_hand(folder, capsys, hand):
     assert found["circular"]["isolated_error"] == pytest.approx(0, abs=1e-9)
     assert lenses.load(target).hand == hand
     out = folder / f"psf_{hand}.h5"
-    assert (
-        main(
-            [
-                "psf",
-                str(target),
-                "--config",
-                str(folder / "psf.toml"),
-                "-o",
-                str(out),
-                "--json",
-            ]
-        )
-        == 0
-    )
+    assert call(f"psf {target} --config {folder}/psf.toml -o {out} --json") == 0
     assert json.loads(capsys.readouterr().out)["converged"]
 
 
@@ -174,5 +132,5 @@ def test_vectors_and_the_image_of_the_field_are_refused_by_name(folder):
 
 
 def test_what_knows_only_fixed_pillars_refuses_the_lens(folder, capsys):
-    assert main(["budget", str(folder / "right.h5"), "-o", str(folder / "b.h5")]) == 2
+    assert call(f"budget {folder}/right.h5 -o {folder}/b.h5") == 2
     assert "turned one by one" in capsys.readouterr().err

@@ -10,6 +10,7 @@ from metalens.cell import Incidence
 from metalens.cli import main
 from metalens.commands import field
 from metalens.core import store
+from tests.command_line import call
 
 CELL = """[cell]
 pitch_um = 0.34
@@ -42,10 +43,7 @@ WORDS = [
 
 
 def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
-    assert (
-        main([*WORDS, "--heights-um", "0.1", "0.3", "--around-um", "0.2", "--quiet"])
-        == 0
-    )
+    assert call(*WORDS, "--heights-um 0.1 0.3 --around-um 0.2 --quiet") == 0
     stored = store.load(here / "field.h5", "near-field")
     held, step = stored.arrays, 0.34 / 12
     assert held["x_um"] == pytest.approx((np.arange(12) - 5.5) * step)
@@ -70,8 +68,8 @@ def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
 
 
 def test_info_shows_it(here, capsys):
-    assert main([*WORDS, "--quiet"]) == 0
-    assert main(["info", "field.h5"]) == 0
+    assert call(*WORDS, "--quiet") == 0
+    assert call("info field.h5") == 0
     assert "near-field version 1" in capsys.readouterr().out
 
 
@@ -90,14 +88,14 @@ def within(*errors):
 
 def test_a_bar_above_the_tolerance_is_a_failure(here, monkeypatch, capsys):
     monkeypatch.setattr(field, "near_fields", within(0.2, 0.49, 0.3))
-    assert main([*WORDS[:-1], "1e-6"]) == 1
+    assert call(*WORDS[:-1], "1e-6") == 1
     told = capsys.readouterr().out
     assert (
         "FAILED: xz, yz, xy above the tolerance 1e-06 at 13 orders: allow a larger one; fields"
         in told
     )
     # none is stated: what is reached is told
-    assert main([*WORDS[:-2], "--force"]) == 0
+    assert call(*WORDS[:-2], "--force") == 0
     told = capsys.readouterr().out
     assert (
         "  xz, yz, xy above the tolerance 0.1 at 13 orders: allow a larger one" in told
@@ -129,6 +127,6 @@ def test_a_field_that_is_not_known_within_half_is_a_failure_though_none_is_state
     ],
 )
 def test_what_makes_no_field_is_refused(here, capsys, words, told):
-    assert main([*FIRST, *words.split()]) == 2
+    assert call(*FIRST, *words.split()) == 2
     assert told in capsys.readouterr().err
     assert not (here / "field.h5").exists()

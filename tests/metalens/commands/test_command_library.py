@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from metalens import library
-from metalens.cli import main
 from metalens.commands import library as command
 from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.library import ProxyTolerances
 from metalens.library.record import DEFAULT_CELL
+from tests.command_line import call
 
 QUICK = """
 [cell]
@@ -33,7 +33,7 @@ def cell(tmp_path):
     def run(text, *words):
         path = tmp_path / "cell.toml"
         path.write_text(text)
-        return main(["library", str(path), "-o", str(tmp_path / "library.h5"), *words])
+        return call(f"library {path} -o {tmp_path}/library.h5", *words)
 
     return run
 
@@ -176,20 +176,10 @@ def test_bad_input_ends_with_2_and_writes_nothing(
 
 
 def test_missing_config_and_folder(tmp_path, capsys):
-    assert main(["library", str(tmp_path / "none.toml")]) == 2
+    assert call(f"library {tmp_path}/none.toml") == 2
     assert "none.toml: no such file" in capsys.readouterr().err
     (tmp_path / "cell.toml").write_text(QUICK)
-    assert (
-        main(
-            [
-                "library",
-                str(tmp_path / "cell.toml"),
-                "-o",
-                str(tmp_path / "no" / "l.h5"),
-            ]
-        )
-        == 2
-    )
+    assert call(f"library {tmp_path}/cell.toml -o {tmp_path}/no/l.h5") == 2
     assert "does not exist" in capsys.readouterr().err
 
 
@@ -216,19 +206,19 @@ def test_study(tmp_path, capsys):
     path = tmp_path / "study.toml"
     path.write_text(STUDY)
     out = tmp_path / "study"
-    assert main(["study", str(path), "-o", str(out), "--json"]) == 0
+    assert call(f"study {path} -o {out} --json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["pitch_um"], told["cells"]) == (0.3, 1)  # no other material is tried
     assert files(out) == ["cell_study.json", "cell_study.png", "manifest.json"]
-    assert main(["study", str(path), "-o", str(out)]) == 2
+    assert call(f"study {path} -o {out}") == 2
     assert "give --force" in capsys.readouterr().err
     path.write_text(STUDY.replace("0.7", "0.2"))
-    assert main(["study", str(path), "-o", str(out), "--force"]) == 1
+    assert call(f"study {path} -o {out} --force") == 1
     path.write_text(STUDY.replace("pitches", "pitchs"))
-    assert main(["study", str(path), "-o", str(out), "--force"]) == 2
+    assert call(f"study {path} -o {out} --force") == 2
     assert "did you mean 'pitches_um'" in capsys.readouterr().err
     path.write_text(STUDY)
-    assert main(["study", str(path), "-o", str(tmp_path / "no" / "study")]) == 2
+    assert call(f"study {path} -o {tmp_path}/no/study") == 2
     assert "does not exist" in capsys.readouterr().err
 
 
@@ -255,8 +245,7 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
         "[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n"
     )
     assert (
-        main(["study", str(path), "--process", str(process), "-o", str(out), "--json"])
-        == 1
+        call(f"study {path} --process {process} -o {out} --json") == 1
     )  # a stretch this short
     found = json.loads((out / "cell_study.json").read_text())
     assert found["study"]["min_diameter_um"] >= 0.31
@@ -268,7 +257,7 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
     assert verdict["max_angle_deg"] == pytest.approx(48.9, abs=0.4)
     capsys.readouterr()
     path.write_text(ANY_CELL.replace("[cell]", 'pillar = "Si"\n[cell]'))
-    assert main(["study", str(path), "-o", str(out), "--force"]) == 2
+    assert call(f"study {path} -o {out} --force") == 2
     assert "give pillar inside cell" in capsys.readouterr().err
 
 
@@ -303,20 +292,14 @@ def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_a
     (tmp_path / "design.toml").write_text(
         config + "[limits]\nmin_diameter_nm = 80\nmin_gap_nm = 80\n"
     )
-    words = [
-        "design",
-        str(tmp_path / "design.toml"),
-        "-o",
-        str(tmp_path / "lens.h5"),
-        "--accept-partial-turn",
-    ]
-    assert main([*words, "--skip-focus-check"]) == 1
+    words = f"design {tmp_path}/design.toml -o {tmp_path}/lens.h5 --accept-partial-turn"
+    assert call(f"{words} --skip-focus-check") == 1
     assert (
         "FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out
     )
     monkeypatch.setattr(library, "sweep", known_within(d, 0.05 + 0 * d))
     assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 0
-    assert main([*words, "--skip-focus-check", "--force"]) == 0
+    assert call(f"{words} --skip-focus-check --force") == 0
     assert "FAILED" not in capsys.readouterr().out
 
 

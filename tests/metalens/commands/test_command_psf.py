@@ -11,12 +11,12 @@ from scipy import integrate, special
 
 from metalens import lens, propagate, psf
 from metalens.cell.record import Cell
-from metalens.cli import main
 from metalens.commands.psf import Options, PsfSettings
 from metalens.core.errors import ConfigError
 from metalens.lens import NeighbourRows
 from metalens.library.proxy import Proxy
 from metalens.psf import lens_psfs
+from tests.command_line import call
 
 SETTINGS = """
 depths_mm = [0.8, 2.0, 0.4]
@@ -65,16 +65,8 @@ def folder(tmp_path):
 
 
 def command(folder, *more):
-    return main(
-        [
-            "psf",
-            str(folder / "lens.h5"),
-            "-o",
-            str(folder / "psf.h5"),
-            "--config",
-            str(folder / "psf.toml"),
-            *more,
-        ]
+    return call(
+        f"psf {folder}/lens.h5 -o {folder}/psf.h5 --config {folder}/psf.toml", *more
     )
 
 
@@ -228,13 +220,8 @@ def test_plane_waves_windows_and_lines_from_the_command_line(folder, capsys):
     )  # fmt: skip
     want = power**2 / (power**2).sum((1, 2), keepdims=True)
     assert np.linalg.norm(stack.intensity[0] - want) < 1e-4 * np.linalg.norm(want)
-    assert main(["info", str(folder / "psf.h5")]) == 0
-    assert (
-        main(
-            ["view", str(folder / "psf.h5"), "-o", str(folder / "page.html"), "--quiet"]
-        )
-        == 0
-    )
+    assert call(f"info {folder}/psf.h5") == 0
+    assert call(f"view {folder}/psf.h5 -o {folder}/page.html --quiet") == 0
 
 
 def test_a_finite_source_from_the_command_line(folder):

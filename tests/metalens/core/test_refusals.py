@@ -17,6 +17,7 @@ from metalens.commands import design
 from metalens.core import config, store
 from metalens.core.errors import ConfigError, LensError, StoreError
 from metalens.core.foreign_arrays import read_matlab
+from tests.command_line import call
 
 
 @dataclass(frozen=True)
@@ -138,13 +139,13 @@ def test_what_nobody_foresaw_is_one_line_and_a_report(monkeypatch, capsys):
         raise ZeroDivisionError("of the program")
 
     monkeypatch.setattr(design, "run", fail)
-    assert cli.main(["design", "d.toml"]) == cli.BAD_INPUT
+    assert call("design d.toml") == cli.BAD_INPUT
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     report = Path(told.split("please report ")[1].split()[0])
     assert "Traceback" in report.read_text()
     report.unlink()
-    assert cli.main(["design", "d.toml", "--debug"]) == cli.BAD_INPUT
+    assert call("design d.toml --debug") == cli.BAD_INPUT
     told = capsys.readouterr().err
     assert "Traceback" in told
     Path(told.split("please report ")[1].split()[0]).unlink()

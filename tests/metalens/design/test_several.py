@@ -13,6 +13,7 @@ from metalens.cell import Cell, Index
 from metalens.core.errors import DomainError, LensError
 from metalens.design import Focus, Limits, WavelengthTarget
 from metalens.library import Proxy
+from tests.command_line import call
 
 CELL = Cell(0.35, 0.9, Index(2.4), Index(1.45))
 LIMITS = Limits(90, 60)
@@ -214,7 +215,7 @@ weight = 1.5
 def test_the_command_tells_what_every_wavelength_gets(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "d.toml").write_text(DESIGN)
-    code = cli.main(["design", "d.toml", "-o", "lens.h5", "--json"])
+    code = call("design d.toml -o lens.h5 --json")
     told = json.loads(capsys.readouterr().out)
     (other,) = told["wavelengths"]
     assert (other["wavelength_nm"], other["weight"]) == (910.0, 1.5)
@@ -223,5 +224,5 @@ def test_the_command_tells_what_every_wavelength_gets(tmp_path, monkeypatch, cap
         assert one["psf_strehl"] == pytest.approx(one["strehl"], abs=0.03)
     for profile, words in (("fisher", "'fisher' is of one"), ("map", "needs a table")):
         (tmp_path / "d.toml").write_text(f'profile = "{profile}"\n{DESIGN}')
-        assert cli.main(["design", "d.toml", "-o", "other.h5"]) == cli.BAD_INPUT
+        assert call("design d.toml -o other.h5") == cli.BAD_INPUT
         assert words in capsys.readouterr().err

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from metalens import cli, lens
+from metalens import lens
 from metalens.cell import Cell
 from metalens.core.errors import LensError
 from metalens.design import PhaseMap, phase_map
 from metalens.lens import DiameterMap, Lens, export
 from metalens.proxy import Proxy
+from tests.command_line import call
 
 # phase 3.5 + 3.5 (d - 0.2) / 0.1: a little above a turn over the domain
 PROXY = Proxy(
@@ -86,10 +87,7 @@ def test_arrays_hold_every_pillar_with_its_place(tmp_path, ending):
     source = made(smooth(X, X[:, None]))
     lens.save(tmp_path / "lens.h5", source)
     target = tmp_path / f"out.{ending}"
-    assert (
-        cli.main(["export", str(tmp_path / "lens.h5"), "-o", str(target), "--quiet"])
-        == 0
-    )
+    assert call(f"export {tmp_path}/lens.h5 -o {target} --quiet") == 0
     read = np.load(target) if ending == "npz" else loadmat(target)
     row, column = 31, 67
     assert np.ravel(read["x_um"])[column] == pytest.approx(17 * 0.4)
@@ -104,28 +102,11 @@ def test_arrays_hold_every_pillar_with_its_place(tmp_path, ending):
 
 def test_bad_words_are_refused_by_name(tmp_path, capsys):
     lens.save(tmp_path / "lens.h5", made(smooth(X, X[:, None])))
-    assert (
-        cli.main(
-            ["export", str(tmp_path / "lens.h5"), "-o", str(tmp_path / "lens.xyz")]
-        )
-        == 2
-    )
+    assert call(f"export {tmp_path}/lens.h5 -o {tmp_path}/lens.xyz") == 2
     assert (
         "cannot write this format; name it .npz, .mat, .dat" in capsys.readouterr().err
     )
-    assert (
-        cli.main(
-            [
-                "export",
-                str(tmp_path / "lens.h5"),
-                "-o",
-                str(tmp_path / "a.dat"),
-                "--samples",
-                "3",
-            ]
-        )
-        == 2
-    )
+    assert call(f"export {tmp_path}/lens.h5 -o {tmp_path}/a.dat --samples 3") == 2
     assert "3 samples across the aperture: need 5 or more" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens.h5"]
 

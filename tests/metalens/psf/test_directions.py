@@ -16,6 +16,7 @@ from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.optics import Layers, Stop
 from metalens.psf import far_field
+from tests.command_line import call
 from tests.referees import plain_sum
 
 WAVE, PITCH = 0.633, 0.29
@@ -207,7 +208,6 @@ def test_what_cannot_be_computed_is_refused():
 def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys):
     import json
 
-    from metalens import cli
     from metalens.core import store
 
     x, _ = axes(64, 96)
@@ -215,17 +215,8 @@ def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys)
         tmp_path / "lens.h5",
         lens(np.broadcast_to(2 * math.pi / 2.1 * x, (64, 96)).copy()),
     )
-    words = [
-        "psf",
-        str(tmp_path / "lens.h5"),
-        "--far-field",
-        "--report",
-        "-o",
-        str(tmp_path / "far.h5"),
-    ]
-    assert (
-        cli.main([*words, "--angles-deg", "0", "5", "--samples", "101", "--json"]) == 0
-    )
+    words = f"psf {tmp_path}/lens.h5 --far-field --report -o {tmp_path}/far.h5"
+    assert call(f"{words} --angles-deg 0 5 --samples 101 --json") == 0
     told = json.loads(capsys.readouterr().out)
     sines = [field["beams"][0]["sine_x"] for field in told["fields"]]
     assert sines == pytest.approx(
@@ -235,5 +226,5 @@ def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys)
     assert kept.arrays["share"].shape == (2, 101, 101)
     assert (tmp_path / "far_far.png").exists()
     assert "azimuth" in (tmp_path / "far.html").read_text()
-    assert cli.main([*words, "--force", "--depths-mm", "3", "4", "1"]) == 2
+    assert call(f"{words} --force --depths-mm 3 4 1") == 2
     assert "depths_mm: not for a far field" in capsys.readouterr().err

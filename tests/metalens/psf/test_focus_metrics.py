@@ -11,8 +11,8 @@ from scipy import special
 
 from metalens import design, lens, psf
 from metalens.cell.record import Cell
-from metalens.cli import main
 from metalens.library.proxy import Proxy
+from tests.command_line import call
 
 WAVE, PITCH, FOCAL, LEVEL = 0.78, 0.37, 210.0, 0.86
 PROXY = Proxy(
@@ -165,7 +165,7 @@ def saved(tmp_path):
 
 
 def run(folder, *more):
-    return main(["psf", str(folder / "lens.h5"), "-o", str(folder / "p.h5"), *more])
+    return call(f"psf {folder}/lens.h5 -o {folder}/p.h5", *more)
 
 
 def test_a_lens_for_collimated_light_is_looked_at_from_infinity(saved, capsys):
