@@ -33,7 +33,7 @@ from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import CaptureError, ConfigError, FitError
-from metalens.fabrication import SolvedResponse, proxy_sensitivity
+from metalens.fabrication import SolvedResponse
 from metalens.psf.lens_psfs import View
 from tests.command_line import call
 
@@ -436,20 +436,6 @@ def test_what_is_stated_is_not_reckoned_with():
     assert found.causes
     for word in ("glass", "source of finite", "write field", "pixel", "side wall"):
         assert not any(word in cause for cause in found.causes), word
-
-
-def test_effective_index_slopes_scale_as_a_waveguide():
-    found = proxy_sensitivity(b.lens())
-    d = np.array([0.12, 0.17, 0.22])
-    height, index, wall = found.at(d)[:3]
-    k = 2 * np.pi / 0.85
-    phase = b.lens().proxy.phase_rad(d, 0.85)
-    # phase = k n_eff h
-    assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)
-    assert (height.imag > k).all()  # guided: n_eff above that of air
-    assert (index.imag > 0).all()
-    assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light
-    assert not wall.any()  # straight walls: second order
 
 
 def test_psfs_of_a_fitted_lens_hold_its_posterior_in_their_error(

@@ -86,41 +86,6 @@ def test_a_combination_without_a_prior_is_told_however_little_is_known():
         assert found[-1].rsplit(" to ", 1)[1] == f"{value**-0.5:.2g}"
 
 
-@pytest.mark.parametrize(
-    ("along", "parts"),
-    [
-        (
-            (0.16, -0.78, 0.05, 0.29, -0.53),
-            (1, 4, 3),
-        ),  # the three largest, though a fourth is above 0.15
-        ((0.97, -0.19, 0.13, 0.03, 0.04), (0, 1)),  # none below 0.15
-        ((-0.14, 0.02, 0.05, -0.17, 0.97), (4, 3)),
-    ],
-)
-def test_the_words_of_a_combination_name_its_large_parts_first(along, parts):
-    names = (*NAMES, "coma_x_rad", "wavelength_nm")
-    scale = np.array([PARAMETERS[PLACE[name]].scale for name in names])
-    along = np.array(along) / np.linalg.norm(along)
-    information = 900 * np.outer(along, along) / np.outer(scale, scale)
-    (line,) = identifiability.identifiable_combinations(names, information, 3 * scale)
-    sign = 1 if line.startswith(f"{along[parts[0]]:+.2f}") else -1
-    want = " ".join(f"{sign * along[i]:+.2f} {names[i]}/{scale[i]:g}" for i in parts)
-    assert line == f"{want} to 0.033"
-
-
-def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
-    sigma = np.array([0.3, 2.0, 5.0])
-    correlation = np.array([[1, -0.91, 0.2], [-0.91, 1, 0.89], [0.2, 0.89, 1.0]])
-    words = identifiability.correlated_pairs(
-        NAMES, correlation * np.outer(sigma, sigma), np.array([0.37, 2.6, np.inf])
-    )
-    assert len(words) == 2
-    assert "(correlation -0.910)" in words[0]
-    assert "SEM" in words[0]
-    # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
-    assert words[1].startswith("bias_nm comes from prior knowledge (0.37)")
-
-
 def asbuilt(**more):
     """A record with the numbers of its posterior alone."""
     found = object.__new__(AsBuilt)

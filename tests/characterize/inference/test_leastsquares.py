@@ -4,7 +4,6 @@ lowers.
 
 import numpy as np
 import pytest
-from scipy import special
 
 from characterize.inference.leastsquares import (
     FitImages,
@@ -13,47 +12,6 @@ from characterize.inference.leastsquares import (
     SolverSettings,
     invert_information,
 )
-
-
-@pytest.mark.parametrize("huber", [6.0, 2.6])
-def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
-    """Residuals of 9 and 15 sigma, a masked pixel of 40, one saturated pixel; Huber's
-    loss from scipy.
-    """
-    rng = np.random.default_rng(4)
-    shape, sigma = rng.uniform(0.5, 1.5, (1, 5, 7)), 3.1
-    noise = sigma * rng.standard_normal(shape.shape)
-    noise[0, 1, 2], noise[0, 3, 3], noise[0, 4, 4], noise[0, 0, 6] = (
-        9 * sigma,
-        -15 * sigma,
-        40 * sigma,
-        -11.0,
-    )
-    usable = np.ones(shape.shape, bool)
-    saturated = np.zeros(shape.shape, bool)
-    usable[0, 4, 4], saturated[0, 0, 6] = False, True
-    data = FitImages(
-        170.0 * shape + noise,
-        usable,
-        saturated,
-        np.full(shape.shape, sigma**2),
-        np.full(shape.shape, 1e12),
-        0.0,
-    )
-
-    def model(x, slopes):
-        return x[0] * shape, shape[None] if slopes else None
-
-    start = np.array([150.0])
-    found = FitProblem(model, data, GaussianPrior.none(start)).fit(
-        start, SolverSettings(huber=huber)
-    )
-    left = (data.electrons - found.value[0] * shape) / sigma
-    left = np.where(saturated, np.maximum(left, 0), left)[usable]
-    # scipy halves the square; the light's own noise, 170 / 1e12 of a variance, is left
-    # out
-    want = 2 * special.huber(huber, left).sum()
-    assert found.merit == pytest.approx(want, rel=1e-9)
 
 
 def test_the_variance_of_a_pixel_has_three_parts():
@@ -81,21 +39,6 @@ def test_the_variance_of_a_pixel_has_three_parts():
     dark, flat = seen.shared(image)  # of the variance the one, of the light the other
     assert dark**2 == pytest.approx(0.3 * floor, rel=1e-12)
     assert flat.ravel() == pytest.approx([1.14, 0.0, 0.0, 26.0], rel=1e-12)
-
-
-def test_some_frames_keep_what_belongs_to_them():
-    stack = np.arange(24.0).reshape(3, 2, 4)
-    data = FitImages(stack, stack > 5, stack > 20, stack + 0.3, stack + 0.7, 0.02)
-    part = data.planes(np.array([0, 2]))
-    assert part.model_error == 0.02
-    for name, want in (
-        ("electrons", stack),
-        ("usable", stack > 5),
-        ("saturated", stack > 20),
-        ("variance_e2", stack + 0.3),
-        ("scale", stack + 0.7),
-    ):
-        assert np.array_equal(getattr(part, name), want[[0, 2]])
 
 
 def test_a_straight_model_has_the_covariance_of_normal_equations():

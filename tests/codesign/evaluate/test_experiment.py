@@ -111,16 +111,6 @@ def test_impossible_experiments_are_refused(change):
         replace(SMALL, **change)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("hidden", -2), ("seed", -1), ("fixation_deg", -0.1), ("pupil_sd", -1.0), ("field_deg", (35.0, -25.0)),
-     ("field_deg", (400.0, 25.0))],
-)  # fmt: skip
-def test_settings_below_what_they_can_be_are_named(name, value):
-    with pytest.raises(ConfigError, match=name):
-        replace(SMALL, **{name: value})
-
-
 def test_an_eye_that_would_slip_into_the_lens_is_refused():
     scenes = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
     with pytest.raises(
@@ -235,9 +225,3 @@ def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder
     assert np.array_equal(found.model.mean, again.model.mean)
     # in the light of the experiment
     assert not np.allclose(found.middle, dim.middle, rtol=1e-3)
-
-
-@pytest.mark.parametrize("people", [0, 1])
-def test_one_person_tells_not_how_people_differ(people):
-    with pytest.raises(ConfigError, match=f"people = {people}"):
-        replace(SMALL, people=people)

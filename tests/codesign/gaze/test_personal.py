@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from codesign.eye import population as eye
@@ -14,7 +13,6 @@ from codesign.eye.population import CameraRig
 from codesign.gaze import personal
 from codesign.gaze.axis import EyeGeometry
 from codesign.gaze.readings import NetworkReadings
-from metalens.core.errors import TrainingError
 from tests.referees.seen_pupil import pupil_of
 
 RIG = CameraRig()
@@ -107,25 +105,6 @@ def test_noisy_slippage_makes_the_regressor_careful():
         ).mean()
         < 4.0
     )
-
-
-def test_angles_between_directions():
-    zero = np.zeros((3, 2))
-    assert np.allclose(
-        personal.angle_deg(zero, np.array([[3.0, 0.0], [0.0, -4.0], [0.0, 0.0]])),
-        [3.0, 4.0, 0.0],
-    )
-    one, other = np.array([[10.0, 20.0]]), np.array([[12.0, 20.0]])
-    assert personal.angle_deg(one, other)[0] == pytest.approx(
-        2 * np.cos(np.radians(20.0)), rel=1e-3
-    )
-
-
-def test_two_points_are_refused():
-    with pytest.raises(TrainingError, match="2 points"):
-        personal.calibrate_person(
-            np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2)), rig=RIG
-        )
 
 
 def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():

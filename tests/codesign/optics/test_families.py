@@ -26,24 +26,6 @@ def test_radial_terms_know_no_azimuth_and_free_ones_do():
         assert term.numpy() == pytest.approx(np.hypot(x, y) ** power)
 
 
-def test_free_terms_are_rings_and_waves_in_their_order():
-    x = np.array([0.6, -0.28, 0.0, 0.0, -1.1])
-    y = np.array([0.0, 0.53, -0.6, 0.0, 0.4])
-    free = families.phase_terms(torch.from_numpy(x), torch.from_numpy(y), 23, "free")
-    rho, theta = np.hypot(x, y), np.arctan2(y, x)
-    orders = [(n, m) for n in range(2, 7) for m in range(-n, n + 1, 2)]
-    assert len(free) == 23 < len(orders)
-    for (n, m), term in zip(orders, free, strict=False):
-        want = rho**n * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta))
-        # rounding of a dozen products below 3
-        assert term.numpy() == pytest.approx(want, abs=1e-13)
-    across = families.phase_terms(
-        torch.from_numpy(x), torch.from_numpy(y)[:, None], 5, "free"
-    )  # of a row and a column
-    assert all(term.shape == (5, 5) for term in across)
-    assert across[3].numpy().diagonal() == pytest.approx(free[3].numpy())
-
-
 @pytest.mark.parametrize(
     "change",
     [

@@ -3,12 +3,7 @@ budgets, refusals by name.
 """
 
 import gc
-import json
 import math
-import os
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -16,7 +11,6 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from codesign.batches import FramePool
-from codesign.commands import codesign as command_codesign
 from codesign.network import windows
 from codesign.network.architecture import smallest_architecture
 from codesign.train import run, search
@@ -92,12 +86,6 @@ def test_frames_are_those_of_the_run_s_own_camera(settings):
         assert scenes.sample_um == settings.optics.sample_um
         assert scenes.seed == settings.inner.seed
     assert going.scenes(5).stream == 5
-
-
-def test_preset_fills_what_the_file_leaves_out(settings):
-    assert settings.scenes.pixels == 48  # from the file
-    assert settings.scenes.margin == 8  # from the preset
-    assert settings.inner.weights.rate == 4e-3  # default
 
 
 @pytest.mark.parametrize("name", ["smoke", "laptop", "paper"])
@@ -194,13 +182,6 @@ def test_bad_configs_are_refused_by_name(tmp_path, change, message):
         run.load_run_settings(tmp_path / "run.toml")
 
 
-def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
-    with pytest.raises(TrainingError, match="below the smallest network"):
-        run.start_run(
-            replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,)))
-        )
-
-
 def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     """A pitch that does not divide the image and a resolution that does not divide the
     pixels, by torch's counter.
@@ -268,68 +249,3 @@ def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tm
     assert row == rows[0]
     assert torch.equal(made.coefficients_rad, going.trainer.model.coefficients_rad)
     assert not torch.equal(made.net.stem.weight, before["stem.weight"])
-
-
-def test_a_log_line_cut_by_a_kill_is_dropped(settings, tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    going = run.start_run(settings)
-    next(run.train_run(going, folder / "unused"))
-    run.save_run(folder / command_codesign.CHECKPOINT, going)
-    lines = [json.dumps({"kind": "step", "step": s}) for s in (1, 2, 3)]
-    (folder / command_codesign.LOG).write_text("\n".join(lines)[:-5])
-    command_codesign._resume(folder, settings)
-    assert (folder / command_codesign.LOG).read_text() == lines[0] + "\n"
-
-
-@pytest.mark.slow
-def test_killed_after_any_step_or_birth_the_command_ends_in_the_same_bytes(tmp_path):
-    (tmp_path / "run.toml").write_text(TINY)
-
-    def start(folder, *words):
-        command = [
-            sys.executable,
-            "-m",
-            "metalens",
-            "codesign",
-            "run.toml",
-            "-o",
-            folder,
-            *words,
-        ]
-        return subprocess.Popen(
-            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-
-    def end(child):
-        child.communicate()
-        return child.returncode
-
-    def begin():
-        resumable = (
-            tmp_path / "killed.unfinished" / command_codesign.CHECKPOINT
-        ).exists()
-        return start("killed", "--resume" if resumable else "--force")
-
-    assert end(start("whole")) == 0
-    for lines in (
-        0,
-        1,
-        1,
-        2,
-    ):  # what it says before it is killed: nothing, a step, the other step, births
-        child = begin()
-        assert all(child.stdout.readline() for _ in range(lines))
-        os.kill(child.pid, signal.SIGKILL)
-        assert end(child) == -signal.SIGKILL
-    assert end(begin()) == 0
-    for name in (
-        "result.json",
-        "log.jsonl",
-        "checkpoint.safetensors",
-        "lens.h5",
-        "subnet_2.safetensors",
-    ):
-        assert (tmp_path / "whole" / name).read_bytes() == (
-            tmp_path / "killed" / name
-        ).read_bytes(), name

@@ -2,10 +2,7 @@
 separating lines.
 """
 
-import math
-
 import numpy as np
-import pytest
 
 from layout.drc.geometry import contour_edges, measure_separation
 from tests.referees.convex import convex_gap
@@ -23,29 +20,6 @@ def distance(first, second, dx, dy):
     edges = [contour_edges([first]), contour_edges([second])]
     zero = np.zeros(1, np.int64)
     return measure_separation(edges, zero, zero + 1, np.array([[dx, dy]]))[0][0]
-
-
-@pytest.mark.parametrize(
-    ("dx", "dy", "wanted"),
-    [
-        (
-            200,
-            170,
-            30,
-        ),  # within the hull: 170 - 40 above the lower arm, 200 - 30 - 120 beside the other
-        (190, 350, 40),
-        (151, 141, 1),
-        (150, 300, 0),  # its corner on the arm
-        (150, 350, 0),
-        (149, 350, 0),  # into the arm
-        (60, 50, 0),  # wholly on the angle
-        (300, 500, 150),
-        (980, 780, math.hypot(980 - 30 - 900, 780 - 40 - 100)),
-    ],
-)
-def test_a_triangle_beside_an_angle(dx, dy, wanted):
-    assert distance(ANGLE, TURNED, dx, dy) == pytest.approx(wanted, abs=1e-12)
-    assert distance(TURNED, ANGLE, -dx, -dy) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_what_lies_in_a_hole_that_is_cut_in_is_apart_and_what_lies_on_the_ring_is_not():

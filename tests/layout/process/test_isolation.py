@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from layout.process.isolation import isolation_map
-from metalens.core.errors import ProcessError
 
 
 def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
@@ -51,9 +50,3 @@ def test_rows_of_a_rectangular_lattice_count_by_their_own_distance():
     assert isolation_map(present, (0.3, 0.7), 0.9)[10, 10] == pytest.approx(
         want, abs=1e-5
     )
-
-
-def test_a_range_at_which_nobody_has_neighbours_is_refused_by_name():
-    with pytest.raises(ProcessError, match="range_um"):
-        isolation_map(np.ones((9, 9), bool), (0.4, 0.4), 0.12)
-    assert isolation_map(np.ones((9, 9), bool), (0.4, 0.4), 0.14)[4, 4] < 0.01

@@ -130,14 +130,6 @@ def test_light_behind_films_is_that_of_plane_waves_through_them():
     assert np.linalg.norm(got - want) < 6e-3 * np.linalg.norm(want)
 
 
-def test_a_window_without_extent_is_refused():
-    lens = random_lens()
-    with pytest.raises(PropagationError, match="2 samples"):
-        focus.prepare_focus(
-            lens, FocusWindow(np.zeros(1), np.zeros(3), 150.0, 0.85, np.array([900.0]))
-        )
-
-
 def test_a_lens_behind_a_stop_is_refused_by_what_it_would_need():
     lens = random_lens()
     behind = dataclasses.replace(lens, layers=Layers(stop=Stop(31.0, 40.0)))

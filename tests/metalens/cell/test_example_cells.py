@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from metalens import library, rcwa
-from metalens.cell.orders import check_subwavelength
 from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.library import axes
@@ -35,22 +34,6 @@ def test_example_cells_read_and_are_subwavelength(path):
         wanted.cell, (low + high) / 2, wanted.sweep.wavelengths_um[0], harmonics=5
     )
     assert np.abs(got.energy - 1).max() < 1e-2  # power; the TiO2 film absorbs little
-
-
-def test_the_titania_pitch_keeps_the_aperture_it_promises():
-    cell = config.load(FOLDER / "tio2_532.toml", CellFile).cell
-    check_subwavelength(cell, 0.532)
-    assert cell.pitch_um < 0.532 / (2 * 0.8)
-
-
-def test_widest_pillar_leaves_the_gap():
-    wanted = config.load(FOLDER / "a_si_rectangle_940.toml", CellFile)
-    size = wanted.cell.widest_um(0.06)
-    # rows of rectangles along x are the nearest
-    assert size == pytest.approx(0.40 - 0.06, abs=0.004)
-    assert math.isclose(
-        config.load(FOLDER / "tio2_532.toml", CellFile).cell.widest_um(0.05), 0.27
-    )
 
 
 def coarse(text, **sweep):

@@ -8,7 +8,6 @@ import pytest
 
 from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.errors import StoreError
 from metalens.core.store import Provenance
 
 
@@ -80,11 +79,3 @@ def test_a_record_comes_back_from_its_file(tmp_path, changes):
         assert np.array_equal(back.missing.values, np.arange(3))
     names = set(store.load(path, "whole").arrays)
     assert {"part/values", "values"} <= names
-
-
-def test_a_missing_entry_is_refused_by_name(tmp_path):
-    arrays, attributes = store.flatten_record(whole())
-    del attributes["part/share"]
-    store.save(tmp_path / "a.h5", "whole", arrays, attributes=attributes)
-    with pytest.raises(StoreError, match="part/share"):
-        store.load_record(tmp_path / "a.h5", "whole", Whole)

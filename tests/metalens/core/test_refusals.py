@@ -80,11 +80,6 @@ def test_any_text_survives_dumps():
     assert tomllib.loads(config.dumps(record))["name"] == record.name
 
 
-def test_a_name_that_no_file_can_have_is_refused():
-    with pytest.raises(ConfigError, match="no name of a file"):
-        config.load("a\0b", Record)
-
-
 def test_an_array_that_the_file_cannot_hold_is_refused_unread(tmp_path):
     store.save(tmp_path / "f.h5", "lens", {"x": np.arange(3.0)})
     with h5py.File(tmp_path / "f.h5", "r+") as file:

@@ -63,12 +63,6 @@ def test_points_at_infinity_lie_where_and_are_as_bright_as_plane_waves_make_them
     )
 
 
-@pytest.mark.parametrize("depths", [(0.0, math.inf), (math.inf, 5e3), (math.nan, 5e3)])
-def test_depths_without_order_are_refused(depths):
-    with pytest.raises(SceneError, match="least <= largest"):
-        Grid((9, 7), STEP, depths)
-
-
 def waves(source, tolerance):
     grid = Grid((9, 7), STEP, (3e3, 9e3), margin=3, window=WINDOW)
     return plan.waves_of(

@@ -63,20 +63,3 @@ def test_outside_the_domain_is_refused(bad):
     ):
         with pytest.raises(DomainError, match=r"the proxy holds from 0\.08 to 0\.21"):
             verb(p, values)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_tensors_stay_on_their_device():
-    p = polynomial.chebyshev_curve(COEFFICIENTS, (LOW, HIGH), 3)
-    host = torch.linspace(0.09, 0.2, 1000, dtype=torch.float64)
-    d = host.cuda().requires_grad_()
-    value = polynomial.evaluate_curve(p, d)
-    value.sum().backward()
-    assert value.is_cuda
-    assert d.grad is not None
-    assert torch.allclose(
-        value.detach().cpu(), polynomial.evaluate_curve(p, host), rtol=1e-13
-    )
-    assert torch.allclose(d.grad.cpu(), polynomial.evaluate_slope(p, host), rtol=1e-12)
-    with pytest.raises(DomainError):
-        polynomial.evaluate_curve(p, 2 * d.detach())

@@ -71,21 +71,3 @@ def told(path: Path, script: str, *, width: int = 1440) -> str:
         server.shutdown()
     assert heard, "the browser ended without drawing the page"
     return answer[0]
-
-
-def printed(path: Path, target: Path) -> None:
-    """A page as the browser prints it, once its scripts are still."""
-    words = [
-        BROWSER,
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--no-first-run",
-        "--virtual-time-budget=20000",
-    ]
-    words += [
-        f"--user-data-dir={path.parent / 'profile'}",
-        f"--print-to-pdf={target}",
-        path.as_uri(),
-    ]
-    subprocess.run(words, check=True, capture_output=True, timeout=_PATIENCE_S)
