@@ -20,18 +20,11 @@ from metalens.cell.record import Cell, Index
 from metalens.core.store import Provenance
 from metalens.design.profiles import Focus
 from metalens.fabrication import proxy_sensitivity
-from metalens.library.proxy import Proxy
+from tests.proxies import proxy_of
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt;
 # |T| of 0.9 that varies a little
-PROXY = Proxy(
-    np.array([[6.0, 3 * math.pi]]),
-    np.array([[0.9, -0.03]]),
-    (0.08, 0.32),
-    (0.85, 0.85),
-    1e-6,
-    1e-6,
-)
+PROXY = proxy_of([6.0, 3 * math.pi], [0.9, -0.03], (0.08, 0.32), 0.85, 1e-6)
 CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
 TRUE = {
     "bias_nm": 6.0,

@@ -24,14 +24,12 @@ from metalens.core import store
 from metalens.core.errors import MetalensError
 from metalens.fabrication import Sensitivity
 from metalens.lens.record import DiameterMap, Lens
-from metalens.library.proxy import Proxy
 from metalens.library.record import PillarLibrary, Sweep
 from metalens.psf import PsfStack
+from tests.proxies import proxy_of
 
 CELL = Cell(pitch_um=0.30, pillar=Index(3.6))
-PROXY = Proxy(
-    np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
-)
+PROXY = proxy_of([8.0, 3.5], [0.9], (0.08, 0.21), 0.85)
 RESPONSE = Sensitivity(np.zeros((3, 6)), 0.15)
 
 

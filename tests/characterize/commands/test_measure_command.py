@@ -20,8 +20,8 @@ from metalens import lens as lenses
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Square
 from metalens.lens import DiameterMap, Lens
-from metalens.library.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 
 def spots(folder, sigma_um, pixel_um=0.9):
@@ -154,9 +154,7 @@ def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats)
         else np.pad(drawn, 2, mode="wrap")[:7, :7] + np.arange(7) ** 2
     )
     cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
-    proxy = Proxy(
-        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
-    )
+    proxy = proxy_of([1.0, 2.0], [0.9], (0.1, 0.35), 0.85)
     drawn_map = DiameterMap(mask * 1e-3, cell.pitch_um)
     lenses.save(
         tmp_path / "lens.h5", Lens(drawn_map, cell, proxy, 0.85, 100.0, 1e3, "map")
@@ -179,9 +177,7 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
     """
     mask = np.random.default_rng(4).uniform(160, 280, (7, 7))
     cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
-    proxy = Proxy(
-        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
-    )
+    proxy = proxy_of([1.0, 2.0], [0.9], (0.1, 0.35), 0.85)
     drawn = DiameterMap(mask * 1e-3, cell.pitch_um)
     lenses.save(tmp_path / "lens.h5", Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
     image = np.clip((test_sem.render(mask[1:6, 2:7]) + 0.5) * 2e4, 0, 65535).astype(
@@ -207,9 +203,7 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
 
 
 def _lens_file(path, cell, drawn_nm):
-    proxy = Proxy(
-        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
-    )
+    proxy = proxy_of([1.0, 2.0], [0.9], (0.1, 0.35), 0.85)
     drawn = DiameterMap(drawn_nm * 1e-3, cell.pitch_um, cell.lattice)
     lenses.save(path, Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
 

@@ -11,17 +11,10 @@ import pytest
 from metalens import design, lens
 from metalens.cell.record import Cell, Index
 from metalens.design.profiles import Focus
-from metalens.library.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
-IDEAL = Proxy(
-    np.array([[0.0, 3 * math.pi]]),
-    np.array([[1.0]]),
-    (0.08, 0.32),
-    (0.85, 0.85),
-    1e-6,
-    1e-6,
-)
+IDEAL = proxy_of([0.0, 3 * math.pi], [1.0], (0.08, 0.32), 0.85, 1e-6)
 CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
 TOML = """[axial]
 depths_mm = [1.6, 2.6]

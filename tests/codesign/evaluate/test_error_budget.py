@@ -21,17 +21,14 @@ from metalens.core.errors import LensError
 from metalens.design import Focus
 from metalens.fabrication import Spread, State, draw_lenses
 from metalens.image import with_psfs
-from metalens.library.proxy import Proxy
 from metalens.optics import Layers
 from tests.codesign import made_lens as m
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 SLOPE = 55.0  # rad / um: phase over diameter, a straight line
 CELL = Cell(pitch_um=0.30, height_um=0.5, pillar=Index(1.7))
-PROXY = Proxy(
-    np.array([[0.145 * SLOPE, 0.065 * SLOPE]]), np.array([[0.9, -0.03]]), (0.08, 0.21),
-    (0.85, 0.85), 0.0, 0.0,
-)  # fmt: skip
+PROXY = proxy_of([0.145 * SLOPE, 0.065 * SLOPE], [0.9, -0.03], (0.08, 0.21), 0.85)
 FILMS = Layers((Film(Index(1.45), 200.0),), (Film(Index(1.52), 180.0),))
 FRAMES = ExperimentConfig(
     subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 1.5), lateral_mm=(1.5,),

@@ -19,20 +19,13 @@ from metalens.design.profiles import DoubleHelix, Focus
 from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
 from metalens.image.pupil import Pupil
-from metalens.library.proxy import Proxy
 from metalens.optics import Layers, Stop
+from tests.proxies import proxy_of
 
 RADIUS_UM = 150.0
 # pillars that give the phase of their diameter exactly: 3 turns over the domain, no
 # loss
-IDEAL = Proxy(
-    np.array([[0.0, 3 * math.pi]]),
-    np.array([[1.0]]),
-    (0.08, 0.32),
-    (0.85, 0.85),
-    1e-6,
-    1e-6,
-)
+IDEAL = proxy_of([0.0, 3 * math.pi], [1.0], (0.08, 0.32), 0.85, 1e-6)
 CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
 
 

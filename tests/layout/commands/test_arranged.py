@@ -15,8 +15,8 @@ from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrar
 from metalens import lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from metalens.library.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 SIDES = {"a": 15, "b": 10}
 
@@ -34,14 +34,7 @@ def folder(tmp_path_factory):
     without correction.
     """
     target = tmp_path_factory.mktemp("arranged")
-    proxy = Proxy(
-        np.array([[3.0, 3.0]]),
-        np.array([[0.95]]),
-        (0.08, 0.32),
-        (0.85, 0.85),
-        0.01,
-        0.01,
-    )
+    proxy = proxy_of([3.0, 3.0], [0.95], (0.08, 0.32), 0.85, 0.01)
     for name in SIDES:
         made = Lens(
             lens_map(name), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"

@@ -14,12 +14,10 @@ from layout.formats.library import MaskCell, MaskLibrary
 from metalens import lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from metalens.library.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
-PROXY = Proxy(
-    np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01
-)
+PROXY = proxy_of([3.0, 3.0], [0.95], (0.08, 0.32), 0.85, 0.01)
 ALPHA_UM, BETA_UM, ETA, TOLERANCE = 0.013, 7.3, 0.62, 0.02
 PEC = f"""
 [exposure]

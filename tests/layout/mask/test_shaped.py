@@ -25,11 +25,9 @@ from metalens.cell.shapes import (
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
-from metalens.library import Proxy
+from tests.proxies import proxy_of
 
-PROXY = Proxy(
-    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01
-)
+PROXY = proxy_of([3.0, 3.0], [0.93], (0.05, 0.32), 0.94, 0.01)
 PROCESS = processes.Process()
 
 

@@ -12,19 +12,12 @@ from layout.study.focus import FocusWindow
 from metalens.cell import Cell, Film, Index
 from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Lens
-from metalens.library.proxy import Proxy
 from metalens.optics import Layers, Stop
+from tests.proxies import proxy_of
 from tests.referees import films, plain_sum
 
 RNG = np.random.default_rng(4)
-PROXY = Proxy(
-    np.array([[3.0, 2.8, 0.3]]),
-    np.array([[0.9, 0.05]]),
-    (0.1, 0.3),
-    (0.85, 0.85),
-    0.0,
-    0.0,
-)
+PROXY = proxy_of([3.0, 2.8, 0.3], [0.9, 0.05], (0.1, 0.3), 0.85)
 
 
 def random_lens(ny=90, nx=121, distance_um=150.0, source_um=900.0):

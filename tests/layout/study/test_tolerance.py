@@ -28,17 +28,10 @@ from metalens.fabrication import (
     solved_rates,
 )
 from metalens.lens.record import DiameterMap, Lens
-from metalens.library.proxy import Proxy
+from tests.proxies import proxy_of
 from tests.referees import plain_sum
 
-PROXY = Proxy(
-    np.array([[4.6, 4.2, 0.5, 0.3]]),
-    np.array([[0.9, 0.02, 0.04]]),
-    (0.1, 0.3),
-    (0.85, 0.85),
-    0.0,
-    0.0,
-)
+PROXY = proxy_of([4.6, 4.2, 0.5, 0.3], [0.9, 0.02, 0.04], (0.1, 0.3), 0.85)
 DIAMETERS = np.linspace(0.1, 0.3, 9)
 SENS = ResponseRates(
     DIAMETERS[:, None],

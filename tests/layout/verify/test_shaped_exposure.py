@@ -16,15 +16,13 @@ from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
 from metalens.fabrication import Bias
 from metalens.lens import DiameterMap, Lens
-from metalens.library import Proxy
+from tests.proxies import proxy_of
 from tests.referees import plain_exposure
 from tests.referees.verified import verify
 
 pytest.importorskip("klayout.db")
 
-PROXY = Proxy(
-    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01
-)
+PROXY = proxy_of([3.0, 3.0], [0.93], (0.05, 0.32), 0.94, 0.01)
 UNEXPOSED = (2, 7, 10)  # aperture (another step), write fields, outline
 ELL = Polygon(
     ((-0.5, -0.5), (0.5, -0.5), (0.5, -0.05), (0.0, 0.05), (-0.05, 0.5), (-0.5, 0.45))

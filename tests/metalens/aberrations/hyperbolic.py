@@ -8,19 +8,12 @@ import numpy as np
 
 from metalens.cell import Cell, Film, Index
 from metalens.lens import DiameterMap, Lens
-from metalens.library import Proxy
 from metalens.optics import Layers, Stop
+from tests.proxies import proxy_of
 from tests.referees import ray_trace
 
 WAVE, PITCH, RADIUS = 0.85, 0.42, 62.0
-PROXY = Proxy(
-    np.array([[0.0, 3 * math.pi]]),
-    np.array([[1.0]]),
-    (0.08, 0.32),
-    (0.85, 0.85),
-    1e-6,
-    1e-6,
-)
+PROXY = proxy_of([0.0, 3 * math.pi], [1.0], (0.08, 0.32), 0.85, 1e-6)
 CELL = Cell(pitch_um=PITCH, pillar=Index(3.6), substrate=Index(1.45))
 CASES = {
     "plain": (ray_trace.Lens(310.0, math.inf), math.inf),

@@ -13,8 +13,9 @@ from metalens import library
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import PropagationError, SceneError
-from metalens.library import GeometricPhase, Proxy
+from metalens.library import GeometricPhase
 from tests.command_line import call
+from tests.proxies import proxy_of
 from tests.referees.turned_pillar import isolated
 
 T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)
@@ -39,14 +40,7 @@ def folder(tmp_path_factory):
     where = tmp_path_factory.mktemp("circular")
     c, sizes = (T_X - T_Y) / 2, np.linspace(0.2, 0.26, 20)
     t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
-    proxy = Proxy(
-        np.array([[np.angle(c), 0.0]]),
-        np.array([[abs(c), 0.0]]),
-        (0.2, 0.26),
-        (0.94, 0.94),
-        0.0,
-        0.0,
-    )
+    proxy = proxy_of([np.angle(c), 0.0], [abs(c), 0.0], (0.2, 0.26), 0.94)
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
     turned = GeometricPhase(

@@ -14,9 +14,9 @@ from metalens.cell.record import Cell
 from metalens.commands.psf import Options, PsfSettings
 from metalens.core.errors import ConfigError
 from metalens.lens import NeighbourRows
-from metalens.library.proxy import Proxy
 from metalens.psf import lens_psfs
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 SETTINGS = """
 depths_mm = [0.8, 2.0, 0.4]
@@ -38,14 +38,7 @@ def small_lens(n=64):
     diameter = np.where(
         r2 < x[-1] ** 2, 0.1 + 0.2 * np.mod(phase, 2 * np.pi) / (2 * np.pi), 0
     )
-    proxy = Proxy(
-        np.array([[np.pi, np.pi]]),
-        np.array([[0.9, 0.0]]),
-        (0.1, 0.3),
-        (0.85, 0.85),
-        0.0,
-        0.0,
-    )
+    proxy = proxy_of([np.pi, np.pi], [0.9, 0.0], (0.1, 0.3), 0.85)
     return lens.Lens(
         lens.DiameterMap(diameter, 0.4),
         Cell(pitch_um=0.4),

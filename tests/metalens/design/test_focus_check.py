@@ -9,7 +9,7 @@ from metalens import design
 from metalens.cell.record import Cell, Index
 from metalens.design.focus_check import check_focus
 from metalens.design.profiles import Focus, hyperbolic_phase
-from metalens.library.proxy import Proxy
+from tests.proxies import proxy_of
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45))
 FOCUS = Focus(0.85, 200.0, 2000.0)
@@ -18,9 +18,7 @@ FOCUS = Focus(0.85, 200.0, 2000.0)
 @pytest.fixture(scope="module")
 def proxy():
     """A transparent pillar of 1.4 turns over 80-290 nm."""
-    return Proxy(
-        np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0
-    )
+    return proxy_of([0.0, 4.5], [0.95], (0.08, 0.29), 0.85)
 
 
 def _lens(proxy, phase=None):

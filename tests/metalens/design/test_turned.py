@@ -13,7 +13,8 @@ from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import LensError
 from metalens.design import Focus, Limits
-from metalens.library import GeometricPhase, PillarLibrary, Proxy, Sweep
+from metalens.library import GeometricPhase, PillarLibrary, Sweep
+from tests.proxies import proxy_of
 from tests.referees.turned_pillar import isolated
 
 CELL = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))
@@ -29,14 +30,7 @@ def library():
     sizes = np.linspace(0.2, 0.26, 20)
     t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
     c = (T_X - T_Y) / 2
-    proxy = Proxy(
-        np.array([[np.angle(c), 0.0]]),
-        np.array([[abs(c), 0.0]]),
-        (0.2, 0.26),
-        (0.94, 0.94),
-        0.0,
-        0.0,
-    )
+    proxy = proxy_of([np.angle(c), 0.0], [abs(c), 0.0], (0.2, 0.26), 0.94)
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
     turned = GeometricPhase(
@@ -125,14 +119,7 @@ def test_a_library_without_turned_pillars_is_refused():
 
 
 HEXAGONAL = Cell(0.336, 0.7, Index(3.6), lattice=Lattice("hexagonal"))
-ROUND = Proxy(
-    np.array([[3.4, 3.4]]),
-    np.array([[0.91, 0.0]]),
-    (0.08, 0.24),
-    (0.85, 0.85),
-    0.0,
-    0.0,
-)
+ROUND = proxy_of([3.4, 3.4], [0.91, 0.0], (0.08, 0.24), 0.85)
 AT = Focus(0.85, 33.0, math.inf)
 
 

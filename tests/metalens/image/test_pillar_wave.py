@@ -17,19 +17,12 @@ from metalens.design import Focus, profiles
 from metalens.image import Grid, Optics, PillarWave, Window, imager, model_error, psfs
 from metalens.image.texture import texture_error
 from metalens.lens import DiameterMap, Lens, NeighbourRows
-from metalens.library import Proxy
 from metalens.optics import Layers
 from metalens.psf import View, from_lens, integrate_pixels
+from tests.proxies import proxy_of
 
 PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15
-PROXY = Proxy(
-    np.array([[6.0, 3.2 * math.pi]]),
-    np.array([[0.9, -0.03]]),
-    (0.08, 0.32),
-    (0.85, 0.85),
-    1e-6,
-    1e-6,
-)
+PROXY = proxy_of([6.0, 3.2 * math.pi], [0.9, -0.03], (0.08, 0.32), 0.85, 1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,11 @@ from metalens.cell import Cell
 from metalens.core.errors import LensError
 from metalens.design import PhaseMap, phase_map
 from metalens.lens import DiameterMap, Lens, export
-from metalens.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 # phase 3.5 + 3.5 (d - 0.2) / 0.1: a little above a turn over the domain
-PROXY = Proxy(
-    np.array([[3.5, 3.5]]), np.array([[0.95, 0.02]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0
-)
+PROXY = proxy_of([3.5, 3.5], [0.95, 0.02], (0.1, 0.3), 0.85)
 X = (np.arange(101) - 50) * 0.4
 
 

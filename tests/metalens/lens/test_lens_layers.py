@@ -11,8 +11,8 @@ from metalens import design, lens, psf
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import LensError, PropagationError
 from metalens.design import Focus, check_focus
-from metalens.library.proxy import Proxy
 from metalens.optics import Layers, Stop
+from tests.proxies import proxy_of
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45), cover=Index(1.21))
 GLASS = Film(Index(1.52), 60.0)
@@ -27,9 +27,7 @@ FOCUS = Focus(0.85, 200.0, 2000.0, LAYERS)
 @pytest.fixture(scope="module")
 def proxy():
     """A transparent pillar of 1.4 turns over 80-290 nm."""
-    return Proxy(
-        np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0
-    )
+    return proxy_of([0.0, 4.5], [0.95], (0.08, 0.29), 0.85)
 
 
 def made(proxy, focus=FOCUS, cell=CELL):

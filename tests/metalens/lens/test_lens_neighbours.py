@@ -12,7 +12,7 @@ from metalens import lens as lenses
 from metalens.cell import Cell, Index
 from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, NeighbourRows
-from metalens.library import Proxy
+from tests.proxies import proxy_of
 
 SINE = np.array([0.5, 0.25, 0.6, 0.35])
 ASIDE = np.array([False, False, True, True])
@@ -90,14 +90,7 @@ def test_the_share_left_in_the_focus_is_the_square_of_the_mean_amplitude():
 
 
 def test_a_lens_file_carries_its_rows(tmp_path):
-    proxy = Proxy(
-        np.array([[6.0, 10.0]]),
-        np.array([[0.9, -0.03]]),
-        (0.08, 0.32),
-        (0.5, 0.6),
-        1e-6,
-        1e-6,
-    )
+    proxy = proxy_of([6.0, 10.0], [0.9, -0.03], (0.08, 0.32), (0.5, 0.6), 1e-6)
     cell = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
     lens = Lens(
         DiameterMap(np.full((3, 4), 0.21), 0.4), cell, proxy, 0.532, 240.0, 6e3, "map"

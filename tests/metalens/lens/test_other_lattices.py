@@ -12,11 +12,9 @@ from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, export
-from metalens.library import Proxy
+from tests.proxies import proxy_of
 
-PROXY = Proxy(
-    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.08, 0.32), (0.94, 0.94), 0.01, 0.01
-)
+PROXY = proxy_of([3.0, 3.0], [0.93], (0.08, 0.32), 0.94, 0.01)
 PITCH = 0.37
 
 

@@ -9,17 +9,10 @@ import pytest
 
 from metalens.cell import Cell, Film, Index
 from metalens.lens import DiameterMap, Lens, reach
-from metalens.library import Proxy
 from metalens.optics import Layers, Stop
+from tests.proxies import proxy_of
 
-PROXY = Proxy(
-    np.array([[3.0, 2.8, 0.3]]),
-    np.array([[0.9, 0.05]]),
-    (0.1, 0.3),
-    (0.85, 0.85),
-    0.0,
-    0.0,
-)
+PROXY = proxy_of([3.0, 2.8, 0.3], [0.9, 0.05], (0.1, 0.3), 0.85)
 
 
 def lens(sites=2501, source_um=20e3, sensor_um=3000.0, layers=None, cover="air"):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from metalens.core.errors import DomainError
 from metalens.library.proxy import Proxy
+from tests.proxies import proxy_of
 
 TURN = 2 * math.pi
 
@@ -186,21 +187,12 @@ def test_less_than_a_turn_is_refused_or_taken_to_the_nearest_end():
 
 
 def test_inverse_refuses_what_has_no_single_answer():
-    wavy = Proxy(
-        np.array([[0.0, 5.0, 0.0, 4.0]]),
-        np.array([[0.9]]),
-        (0.08, 0.2),
-        (0.85, 0.85),
-        0.0,
-        0.0,
-    )
+    wavy = proxy_of([0.0, 5.0, 0.0, 4.0], [0.9], (0.08, 0.2), 0.85)
     assert not wavy.monotone(0.85)
     assert wavy.monotone(0.85, within_um=(0.18, 0.2))
     with pytest.raises(DomainError, match="not monotone"):
         wavy.diameter_um(np.array([0.0]), 0.85)
-    flat = Proxy(
-        np.array([[1.0]]), np.array([[0.9]]), (0.08, 0.2), (0.85, 0.85), 0.0, 0.0
-    )
+    flat = proxy_of([1.0], [0.9], (0.08, 0.2), 0.85)
     with pytest.raises(DomainError, match="not monotone"):
         flat.diameter_um(np.array([0.0]), 0.85)
     with pytest.raises(DomainError, match="is not finite"):

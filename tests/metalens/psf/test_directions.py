@@ -13,15 +13,15 @@ from metalens import lens as lenses
 from metalens.cell import Cell, Film, Index, Lattice
 from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Lens
-from metalens.library import Proxy
 from metalens.optics import Layers, Stop
 from metalens.psf import far_field
 from tests.command_line import call
+from tests.proxies import proxy_of
 from tests.referees import plain_sum
 
 WAVE, PITCH = 0.633, 0.29
 # every pillar alike, |t| 0.83
-PROXY = Proxy(np.array([[1.3]]), np.array([[0.83]]), (0.1, 0.2), (WAVE, WAVE), 0.0, 0.0)
+PROXY = proxy_of([1.3], [0.83], (0.1, 0.2), WAVE)
 RNG = np.random.default_rng(3)
 
 

@@ -11,18 +11,11 @@ from scipy import special
 
 from metalens import design, lens, psf
 from metalens.cell.record import Cell
-from metalens.library.proxy import Proxy
 from tests.command_line import call
+from tests.proxies import proxy_of
 
 WAVE, PITCH, FOCAL, LEVEL = 0.78, 0.37, 210.0, 0.86
-PROXY = Proxy(
-    np.array([[np.pi, np.pi]]),
-    np.array([[LEVEL, 0.0]]),
-    (0.1, 0.3),
-    (WAVE, WAVE),
-    0.0,
-    0.0,
-)
+PROXY = proxy_of([np.pi, np.pi], [LEVEL, 0.0], (0.1, 0.3), WAVE)
 
 
 def flat_lens(n=180, source_um=np.inf, aside_um=0.0, error_rad=0.0):
