@@ -20,7 +20,6 @@ from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
 from layout.process.process import Process
 from layout.study import tolerance
-from metalens import fabrication
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle
 from metalens.core.errors import FitError, ProcessError
@@ -79,7 +78,6 @@ def response(lens):
         patch.setattr(solved_rates, "_TRUNCATIONS", (5, HARMONICS))
         # walls, which no test here leans: as few steps as there can be
         patch.setattr(solved_rates, "_WALL_STEP_RAD", 5e-5)
-        patch.setattr(fabrication.response, "_NODES", 6)
         return proxy_sensitivity(lens)
 
 
