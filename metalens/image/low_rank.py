@@ -22,6 +22,7 @@ CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
 SAMPLED = 1024  # node PSFs, drawn at random, of which the kernels are mixtures
 FEWEST = 24  # kernels: single points hold more fine detail than a textured scene
 FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
+SMOOTH = 0.0025  # change of a plane at most: half the error between nodes
 EVEN = 1e-3  # error of uniformly illuminated planes, a tenth of what shows
 
 
@@ -280,7 +281,8 @@ def low_rank_psfs(
     sources = values.detach().movedim(-1, 0).double()
     targets = torch.ones_like(sources[0].movedim(-1, 0))  # of full coverage
     if illuminated:
-        targets = plane_images(field.light.detach(), maps).to(sources)
+        planes = plane_images(field.light.detach(), maps).to(sources)
+        targets = smooth_planes(planes, psf.shape, min(SMOOTH, basis.error / 3))
     corrected = [
         correct_plane(sources[..., z], kernels.to(sources), target)
         for z, target in enumerate(targets)
@@ -397,6 +399,39 @@ def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:
         rows = torch.einsum("ayh,abhw->ybw", spread[0], light[:, :, z])
         planes.append(torch.einsum("ybw,bxw->yx", rows, spread[1]))
     return torch.stack(planes)
+
+
+def smooth_planes(planes: Tensor, nodes: torch.Size, error: float) -> Tensor:
+    """(depths, y, x) planes without rings, by least squares with the fewest splines.
+
+    The image of an even plane is smooth. Sums over samples and splines between nodes
+    have rings of 0.1 to 0.2 % rms beside it. Splines are fitted where all light reaches.
+
+    Args:
+        planes: (depths, y, x) images of uniformly illuminated planes.
+        nodes: (rows, columns, depths, h, w) of the PSFs.
+        error: relative RMS change of a plane that is allowed.
+    """
+    frame = planes.shape[-2:]
+    inside = [
+        slice(n // 2, size - n // 2) for n, size in zip(nodes[-2:], frame, strict=True)
+    ]
+    plane = planes[:, inside[0], inside[1]]
+    for most in range(TAPS, max(nodes[:2])):
+        fewer = tuple(min(most, n) for n in nodes[:2])
+        rows, columns = (
+            matrix[some] @ torch.linalg.pinv(matrix[some])
+            for matrix, some in zip(
+                frame_maps(frame, fewer, planes), inside, strict=True
+            )
+        )
+        smooth = rows @ plane @ columns
+        change = (smooth - plane).square().mean((1, 2)) / plane.square().mean((1, 2))
+        if float(change.max()) < error**2:
+            planes = planes.clone()
+            planes[:, inside[0], inside[1]] = smooth
+            break
+    return planes
 
 
 def moments(psf: Tensor) -> Tensor:

@@ -287,14 +287,16 @@ def test_occlusion_is_that_of_every_point_through_its_part_of_the_aperture(
             assert float((got / even - 1).abs().max()) < 0.01
 
 
-@pytest.mark.parametrize("tolerance", [0.1, 0.015])
-def test_planes_before_a_lens_of_a_millimetre_are_even(tolerance):
+@pytest.mark.parametrize(
+    ("focus", "tolerance"), [(33e3, 0.1), (33e3, 0.015), (20e3, 0.01)]
+)
+def test_planes_before_a_lens_of_a_millimetre_are_even(focus, tolerance):
     """±19 degrees and defocus from 12 to 50 mm on samples of 18 um, at depths that are
-    no nodes.
+    no nodes. Rings of a direct sum, 0.6 to 1 %, are of its samples.
     """
-    wave = SmoothWave(Focus(0.85, 2e3, 33e3), 500.0)
+    wave = SmoothWave(Focus(0.85, 2e3, focus), 500.0)
     grid = Grid((64, 64), 18.0, (12e3, 50e3), margin=8, window=17)
     made = imager(wave, grid, tolerance=tolerance)
-    for depth in (12e3, 13e3, 15.1e3, 17e3, 21e3, 27e3, 33e3, 40e3, 47e3):
+    for depth in (12e3, 13e3, 15.1e3, 17e3, 21e3, 27e3, 33e3, 40e3, 47e3, 50e3):
         one = torch.ones(1, 80, 80)
-        assert _rest(made.surface(one, depth * one)[0]) < 0.0105, depth
+        assert _rest(made.surface(one, depth * one)[0]) < 0.005, depth
