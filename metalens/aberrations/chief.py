@@ -10,7 +10,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import Lens
 from metalens.optics import media
 from metalens.optics.media import Media
 from metalens.psf import library_incidence
@@ -23,7 +23,6 @@ SPARSE = 0.3  # least share of occupied sites; with fewer the ray misses the len
 ROUGH = 0.6
 POWERS = [(i, j) for i in range(5) for j in range(5 - i)]  # terms x^i y^j
 TURNS = 4  # iterations of the polynomial fit
-FAR = 5  # slopes are compared over 1/FAR of the width of the patch
 PARALLEL = 1e-16  # (d lateral shift / d distance)² below which rays are parallel
 STEP = 1e-4  # of differences, in tangents or depths
 
@@ -269,13 +268,15 @@ def _wave_front(
         )
         raise PropagationError(_failure_text(lens, angle_rad, why))
     phasors = np.where(inside, np.exp(1j * phase), 0.0)
-    middle = ((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2)
-    guess = _initial_polynomial(phasors, middle, lens.diameters)
-    terms = np.stack(
+    powers = np.stack(
         [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
-    )[inside]
-    first = [guess.get((i, j), 0.0) * radius ** (i + j) for i, j in POWERS]
-    series, scatter = _fit_polynomial(terms, phasors[inside], np.array(first))
+    )
+    # on a hexagonal lattice every other place is a site
+    guess = _unwrapped_polynomial(
+        powers, phasors, 2 if lens.diameters.lattice.centred else 1
+    )
+    terms = powers[inside]
+    series, scatter = _fit_polynomial(terms, phasors[inside], guess)
     if scatter > ROUGH:
         why = f"meets no wave front: phases scatter by {scatter:.2f} rad rms"
         raise PropagationError(_failure_text(lens, angle_rad, why))
@@ -331,40 +332,26 @@ def _patch(
     )
 
 
-def _initial_polynomial(
-    turn: Array, middle_um: tuple[float, float], diameters: DiameterMap
-) -> dict[tuple[int, int], float]:
-    """First guess of a quadratic phase from differences of unit phasors.
+def _unwrapped_polynomial(powers: Array, phasors: Array, hop: int) -> Array:
+    """(terms,) coefficients, rad, of the least-squares polynomial of phase steps.
 
-    Slopes come from the mean phasor step between neighbours. Curvatures come from the
-    mean change of these steps over a fifth of the patch.
+    Steps are wrapped differences between neighbours about their mean (Hudgin 1977).
 
     Args:
-        turn: (y, x) phasors exp(i phase), 0 where there is no pillar.
-        middle_um: middle (x, y) of the map from the place of the slopes, um.
-        diameters: whose lattice it is.
-
-    Returns:
-        Coefficients by power (i, j) of x^i y^j, rad per um^(i + j).
+        powers: (y, x, terms) powers of the place.
+        phasors: (y, x) exp(i phase), 0 where there is no pillar.
+        hop: places from a site to the next.
     """
-    hop = 2 if diameters.lattice.centred else 1  # every other place is a site
-    (dx, dy), (x, y) = diameters.steps_um, middle_um
-
-    def change(field: Array, axis: int, sites: int) -> Array:
-        field = np.moveaxis(field, axis, 0)
-        return np.moveaxis(field[sites:] * field[:-sites].conj(), 0, axis)
-
-    def rate(steps: Array, axis: int) -> float:
-        sites = max(hop, turn.shape[axis] // FAR // hop * hop)
-        return float(np.angle(change(steps, axis, sites).sum()) / (hop * sites))
-
-    steps_x, steps_y = change(turn, 1, hop), change(turn, 0, hop)
-    xx, yy = rate(steps_x, 1) / dx**2, rate(steps_y, 0) / dy**2
-    xy = rate(steps_x, 0) / (dx * dy)
-    slope_x = float(np.angle(steps_x.sum())) / (hop * dx) - xx * x - xy * y
-    slope_y = float(np.angle(steps_y.sum())) / (hop * dy) - yy * y - xy * x
-    quadratic = {(2, 0): xx / 2, (1, 1): xy, (0, 2): yy / 2}
-    return quadratic | {(1, 0): slope_x, (0, 1): slope_y}
+    changes, steps = [], []
+    for axis in (0, 1):
+        field, terms = (np.moveaxis(part, axis, 0) for part in (phasors, powers))
+        turn = field[hop:] * field[:-hop].conj()
+        mean = np.angle(turn.sum())
+        known = turn != 0
+        changes.append((terms[hop:] - terms[:-hop])[known])
+        steps.append(mean + np.angle(turn[known] * np.exp(-1j * mean)))
+    fit = np.linalg.lstsq(np.concatenate(changes), np.concatenate(steps), rcond=None)
+    return np.asarray(fit[0])
 
 
 def _fit_polynomial(terms: Array, turn: Array, series: Array) -> tuple[Array, float]:

@@ -155,29 +155,31 @@ def phase_of(
         Function of x (columns,) and y (rows,) in um to the phase (rows, columns).
     """
 
-    def hyperbolic(x_um: Array, y_um: Array) -> Array:
-        return profiles.hyperbolic_phase(x_um, y_um[:, None], focus)
+    focusing = not isinstance(shape, PhaseMap) or shape.add_focus
+    samples = phase_map.read_phase_map(shape) if isinstance(shape, PhaseMap) else None
 
-    if isinstance(shape, PhaseMap):
-        samples = phase_map.read_phase_map(shape)
-        add_focus = shape.add_focus
-
-        def mapped(x_um: Array, y_um: Array) -> Array:
-            phase = phase_map.interpolate_phase(
-                samples, x_um, y_um, radius_um=radius_um
+    def added(x: Array, y: Array) -> Array | float:
+        if samples is not None:
+            return phase_map.interpolate_phase(samples, x, y, radius_um=radius_um)
+        if isinstance(shape, DoubleHelix):
+            return profiles.vortex_phase(
+                *(x, y[:, None]),
+                radius_um=radius_um,
+                zones=shape.zones,
+                exponent=shape.exponent,
             )
-            return phase + hyperbolic(x_um, y_um) if add_focus else phase
+        if isinstance(shape, Cubic):
+            cubes = (x / radius_um) ** 3 + (y[:, None] / radius_um) ** 3
+            return shape.strength_rad * cubes
+        return 0.0
 
-        return mapped
-    if isinstance(shape, DoubleHelix):
-        return lambda x, y: profiles.double_helix_phase(
-            x, y[:, None], focus, shape, radius_um=radius_um
-        )
-    if isinstance(shape, Cubic):
-        return lambda x, y: profiles.cubic_phase(
-            x, y[:, None], focus, shape, radius_um=radius_um
-        )
-    return hyperbolic
+    def phase(x_um: Array, y_um: Array) -> Array:
+        total = added(x_um, y_um)
+        if focusing:
+            total = total + profiles.hyperbolic_phase(x_um, y_um[:, None], focus)
+        return np.asarray(total)
+
+    return phase
 
 
 def make(

@@ -17,8 +17,7 @@ from metalens.core.foreign_arrays import read_matlab, read_npz
 from metalens.design.profiles import PhaseMap
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
-CORE = 8  # samples, largest half width of a ring around a vortex
-MANY = 256  # most places inside the rings of all vortices
+CORE = 8  # samples, largest half width of a spot around a vortex
 _COMMENT = re.compile(r"\s*(#|%|//)")
 SAME_STEP = 1e-6  # relative difference at which two spacings still agree
 EVEN_STEP = 1e-3  # of a step: tolerance of printed coordinates of an even grid
@@ -159,8 +158,8 @@ def interpolate_phase(
     """Phase in rad at positions, (y, x): bilinear interpolation of the phasor exp(i
     phase).
 
-    Around a vortex the phase passes whole turns however fine the map is. Up to 8
-    samples from one, the phase of the nearest sample is taken.
+    Around a vortex the phase passes whole turns however fine the map is. In spots of up
+    to 16 samples across, the phase of the nearest sample is taken.
 
     Args:
         samples: the phase map.
@@ -192,7 +191,8 @@ def interpolate_phase(
     inside = radius2 <= radius_um**2
     nearest_row = np.clip(np.rint(row).astype(int), 0, rows - 1)
     nearest_column = np.clip(np.rint(column).astype(int), 0, columns - 1)
-    no_data = np.isnan(samples.phase_rad[np.ix_(nearest_row, nearest_column)])
+    nearest = samples.phase_rad[np.ix_(nearest_row, nearest_column)]
+    no_data = np.isnan(nearest)
     at_rim = radius2 > max(radius_um - math.hypot(step_x, step_y), 0.0) ** 2
     empty = inside & (data_weight == 0) | inside & no_data & ~at_rim
     size = np.where(inside & ~empty, np.abs(phasor), 1.0)
@@ -202,51 +202,19 @@ def interpolate_phase(
         raise LensError(
             f"the phase map has no data {place}, inside the aperture; fill it or take a smaller aperture"
         )
-    coarse = np.argwhere(size < 0.5)  # neighbours differ by over 2/3 of half a turn
-    vortices = [
-        _vortex_phase(samples.phase_rad, float(row[i]), float(column[k]))
-        for i, k in coarse[:MANY]
-    ]
-    if len(coarse) > MANY or None in vortices:
+    coarse = size < 0.5  # neighbours differ by over 2/3 of half a turn
+    spots = ndimage.find_objects(ndimage.label(coarse, np.ones((3, 3)))[0])
+    if any(
+        np.ptp(places[part]) > 2 * CORE
+        for spot in spots
+        for places, part in zip((row, column), spot, strict=True)
+    ):
         raise LensError(
             f"the phase map turns by more than 2/3 of half a turn between samples {place}; "
             f"give it on a finer pitch than {max(step_x, step_y)} um, or state the unit "
             "of its phase if that is not radians"
         )
-    phases = np.angle(phasor)
-    for (i, k), phase in zip(coarse, vortices, strict=True):
-        phases[i, k] = phase
-    return np.asarray(phases)
-
-
-def _vortex_phase(phase_rad: Array, row: float, column: float) -> float | None:
-    """Phase in rad of the nearest sample, where the place lies near a vortex; else
-    None.
-
-    There is a vortex where the phase around some closed square ring of samples, half
-    width 2 to 8, changes by whole turns in steps below a third of a turn.
-
-    Args:
-        phase_rad: (y, x) samples.
-        row: fractional row of the place.
-        column: fractional column of the place.
-    """
-    rows, columns = phase_rad.shape
-    i = min(max(math.floor(row), 0), rows - 2)
-    k = min(max(math.floor(column), 0), columns - 2)
-    for half in range(2, CORE + 1):
-        if min(i, k) < half - 1 or i + half >= rows or k + half >= columns:
-            return None
-        block = phase_rad[i - half + 1 : i + half + 1, k - half + 1 : k + half + 1]
-        ring = np.concatenate(
-            [block[0, :-1], block[:-1, -1], block[-1, :0:-1], block[:0:-1, 0]]
-        )
-        steps = np.diff(ring, append=ring[:1]) / (2 * np.pi)
-        steps = steps - np.rint(steps)
-        # with nan among the steps both comparisons are false
-        if np.abs(steps).max() < 1 / 3 and abs(steps.sum()) > 0.5:
-            return float(phase_rad[round(row), round(column)])
-    return None
+    return np.where(coarse, nearest, np.angle(phasor))
 
 
 def _interpolated_phasor(

@@ -14,7 +14,6 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, LensError
 from metalens.lens import Lens
 from metalens.optics import Layers, check_gaps, media
-from metalens.optics.paths import path_difference, source_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +47,6 @@ class Focus:
         Args:
             radius2_um2: r², um².
         """
-        if self.layers.plain:
-            behind = path_difference(radius2_um2, self.sensor_distance_um)
-            before = path_difference(radius2_um2, self.source_distance_um)
-            return np.asarray(behind + before)
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um).layers
         total = media.path_difference(after, 0.0, 0.0, radius2_um2)[1]
         if math.isfinite(self.source_distance_um):
@@ -84,25 +79,19 @@ class Focus:
         Returns:
             Paths from the sensor point and from the source, um.
         """
-        sensor_um = self.sensor_distance_um
-        source_um = self.source_distance_um
-        if self.layers.plain:
-            sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / sensor_um)
-            source = source_path(x_um, y_um, (tangent, 0.0), 1 / source_um)
-            return np.asarray(sensor), np.asarray(source)
         sine = tangent / math.hypot(1.0, tangent)
-        behind = self.layers.after(sensor_um, self.wavelength_um)
-        paths = []
-        for gap, side in ((behind, 1), (None, -1)):  # None: in front of the lens
-            if gap is None and not math.isfinite(source_um):
-                paths.append(np.asarray(x_um * sine))
-                continue
-            pairs = (gap or self.layers.before(source_um, self.wavelength_um)).layers
-            reach = side * sine * media.reach_per_direction(pairs, sine**2)
+        behind = self.layers.after(self.sensor_distance_um, self.wavelength_um)
+        gaps = [(1, behind)]
+        if math.isfinite(self.source_distance_um):
+            front = self.layers.before(self.source_distance_um, self.wavelength_um)
+            gaps.append((-1, front))
+        paths = [np.asarray(x_um * sine)]  # of a collimated source
+        for side, gap in gaps:
+            reach = side * sine * media.reach_per_direction(gap.layers, sine**2)
             change = x_um**2 + y_um**2 - 2 * reach * x_um
-            path = media.path_difference(pairs, sine**2, reach**2, change)[1]
+            path = media.path_difference(gap.layers, sine**2, reach**2, change)[1]
             paths.append(np.asarray(path))
-        return paths[0], paths[1]
+        return paths[1], paths[-1] if len(gaps) > 1 else paths[0]
 
 
 def lens_focus(lens: Lens) -> Focus:
@@ -199,26 +188,6 @@ def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
     )
 
 
-def double_helix_phase(
-    x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float
-) -> Array:
-    """Hyperbolic phase plus annular vortices (:func:`vortex_phase`), (y, x) in rad.
-
-    The PSF has two lobes that rotate with depth.
-
-    Args:
-        x_um: places along x, um.
-        y_um: places along y, um; they broadcast to (y, x).
-        focus: source and sensor distances of the design.
-        shape: number of zones and exponent of their radii.
-        radius_um: radius R of the aperture, um.
-    """
-    vortices = vortex_phase(
-        x_um, y_um, radius_um=radius_um, zones=shape.zones, exponent=shape.exponent
-    )
-    return np.asarray(hyperbolic_phase(x_um, y_um, focus) + vortices)
-
-
 def vortex_phase(
     x_um: Array, y_um: Array, *, radius_um: float, zones: int, exponent: float = 0.5
 ) -> Array:
@@ -238,21 +207,3 @@ def vortex_phase(
     fraction = np.hypot(x_um, y_um) / radius_um
     ring = np.clip(np.ceil(zones * fraction ** (1 / exponent)), 1, zones)
     return np.asarray((2 * ring - 1) * np.arctan2(y_um, x_um))
-
-
-def cubic_phase(
-    x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float
-) -> Array:
-    """Hyperbolic phase plus strength ((x/R)³ + (y/R)³), (y, x) in rad.
-
-    Args:
-        x_um: places along x, um.
-        y_um: places along y, um; they broadcast to (y, x).
-        focus: source and sensor distances of the design.
-        shape: strength of the cubic term.
-        radius_um: radius R of the aperture, um.
-    """
-    x, y = x_um / radius_um, y_um / radius_um
-    return np.asarray(
-        hyperbolic_phase(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)
-    )

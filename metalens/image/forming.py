@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
-from metalens.image.compiled import has_no_gradient
 from metalens.image.low_rank import (
     EVEN,
     KernelBasis,
@@ -22,7 +21,7 @@ from metalens.image.low_rank import (
 )
 from metalens.image.plan import KERNELS, Grid, ImagingPlan
 from metalens.image.points import Window
-from metalens.image.scene import Frames, to_device
+from metalens.image.scene import Frames, has_no_gradient, to_device
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import StrayLight, add_stray
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
-from metalens.image.compiled import is_plain_value
 from metalens.image.model_error import (
     JudgedPsfs,
     choose_polarisation,
@@ -20,6 +19,7 @@ from metalens.image.model_error import (
     transform_error,
 )
 from metalens.image.points import Optics, Window, psfs
+from metalens.image.scene import is_plain_value
 from metalens.image.splines import TAPS, spline_matrix
 from metalens.image.texture import scene_error
 from metalens.image.waves import PillarWave

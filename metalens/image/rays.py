@@ -224,8 +224,8 @@ def source_paths(
     """(depths, *shape) optical paths from each source to the lens, less that to its
     middle, um.
 
-    In a single medium, √(z² + ρ²) less the same at the middle. Through films, a
-    Chebyshev interpolant of the squared reach, which is clamped at the rim of the lens.
+    A Chebyshev interpolant in the squared reach, which is clamped at the rim of the
+    lens, of :func:`metalens.optics.media.path_difference`.
 
     Args:
         layers: films and stop of the lens.
@@ -242,26 +242,16 @@ def source_paths(
         if math.isinf(depth):
             out.append((tangents[0] * x + tangents[1] * y) / math.hypot(1, slope))
             continue
-        before = layers.before(depth, wavelength_um)
-        distance = before.reduced_um
-        if slope > 0:
-            distance = media.lateral_reach(before, sine) / slope
-        sx, sy = (-distance * tangent for tangent in tangents)
-        if len(before.layers) == 1:  # a difference of roots without cancellation
-            extra = x * x + y * y - 2 * (x * sx + y * sy)
-            chief = math.sqrt(depth**2 + sx**2 + sy**2)
-            out.append(
-                before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief)
-            )
-            continue
-        chief = float(media.path_of_reach(before, np.float64(math.hypot(sx, sy))))
-        reach2 = (x - sx) ** 2 + (y - sy) ** 2
-        reach2 = reach2.clamp(max=float((reach2 * (bundle.whole > 0)).max()))
-        path = interpolant.chebyshev_interpolant(
-            lambda u: media.path_of_reach(before, u**0.5),  # noqa: B023 (called at once)
-            reach2,
+        pairs = layers.before(depth, wavelength_um).layers
+        reach = media.reach_per_direction(pairs, sine**2) / math.hypot(1, slope)
+        change = x * x + y * y + 2 * reach * (x * tangents[0] + y * tangents[1])
+        change = change.clamp(max=float((change * (bundle.whole > 0)).max()))
+        difference = functools.partial(
+            media.path_difference, pairs, sine**2, (slope * reach) ** 2
         )
-        out.append(path - chief)
+        out.append(
+            interpolant.chebyshev_interpolant(lambda u: difference(u)[1], change)
+        )
     return torch.stack(out)
 
 

@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from metalens.core.errors import SceneError
 
@@ -53,3 +54,21 @@ def to_device(record: Record, device: torch.device | str) -> Record:
     values = {name: getattr(record, name) for name in record.__dataclass_fields__}
     moved = {k: v.to(device) for k, v in values.items() if hasattr(v, "to")}
     return replace(record, **moved)
+
+
+def is_plain_value(a: Tensor) -> bool:
+    """Whether a tensor lies in main memory and carries no gradient of either mode.
+
+    Args:
+        a: a tensor.
+    """
+    return a.device.type == "cpu" and has_no_gradient(a)
+
+
+def has_no_gradient(a: Tensor) -> bool:
+    """Whether a tensor carries no gradient, of reverse or of forward mode.
+
+    Args:
+        a: a tensor.
+    """
+    return not a.requires_grad and forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.design import Focus
-from metalens.image import compiled
-from metalens.image.compiled import is_plain_value
+from metalens.image.scene import is_plain_value
 from metalens.lens import Lens, response
 from metalens.optics import Layers, interpolant
 from metalens.psf import neighbour_coupling
@@ -267,46 +266,20 @@ class PillarWave:
 
         An empty cell has the mean of the 3 x 3 cells around it.
         """
-        d = self.diameter_um
-        spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
-        if self.lens.neighbours is None and is_plain_value(d):
-            sizes = d.detach().numpy()
-            block = self._block, spare[0] // 2, spare[1] // 2
-            polynomials = response.response_polynomials(
-                self.lens.proxy, sizes, (wavelength_um, tilt)
-            )
-            mean = torch.from_numpy(
-                compiled.cells(sizes, self._ideal.numpy(), polynomials, block)
-            )
-        else:
-            mean = self._means(wavelength_um, tilt, spare)
-        near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
-        filled = torch.where(mean[2] > 0, mean[:2], near[:2])
-        return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
-
-    def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
-        """(3, cells y, cells x) means per cell: Re, Im of t exp(-i carrier), and fill.
-
-        As :func:`metalens.image.compiled.cells`, with derivatives and the factor of
-        neighbours.
-
-        Args:
-            spare: (y, x) rows and columns that are added to fill the last cells.
-        """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
         residual = torch.view_as_real(
             self._with_neighbours(t) * torch.polar(torch.ones_like(ideal), -ideal)
         ).permute(2, 0, 1)
-        layers = torch.cat([residual, open_[None]])
-        pad = (
-            spare[1] // 2,
-            spare[1] - spare[1] // 2,
-            spare[0] // 2,
-            spare[0] - spare[0] // 2,
-        )
-        return torch.nn.functional.avg_pool2d(
-            torch.nn.functional.pad(layers, pad)[None], self._block
+        pad = []
+        for padded, n in zip(self._padded[::-1], ideal.shape[::-1], strict=True):
+            pad += [(padded - n) // 2, (padded - n + 1) // 2]
+        mean = torch.nn.functional.avg_pool2d(
+            torch.nn.functional.pad(torch.cat([residual, open_[None]]), pad)[None],
+            self._block,
         )[0]
+        near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
+        filled = torch.where(mean[2] > 0, mean[:2], near[:2])
+        return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
 
 
 def interpolate_cells(

@@ -10,8 +10,6 @@ from metalens.core.threads import run_split
 from metalens.lens.record import Lens
 from metalens.library import Proxy
 
-# scale, shift, power, ceiling, monomials of φ and of |T|
-Polynomials = tuple[float, float, int, float, Array, Array]
 PART = 512  # pillars of a row per pass
 FASTMATH: set[str] = {"contract", "nsz", "reassoc"}
 
@@ -61,84 +59,54 @@ def fill_response_of(
         phase: (y, x) array that is filled, rad.
         level: (y, x) array that is filled.
     """
-    loop, numbers = _fill, response_polynomials(proxy, d, at)
+    in_phase, in_level = proxy.at(*at), proxy.level_at(*at)
+    most = float(np.max(d, initial=0.0))
+    if most > 0:  # raises outside the domain
+        sizes = np.array([np.min(d, where=d > 0, initial=most), most])
+        proxy.phase_rad(sizes, *at)
+    numbers = (
+        *(in_phase.scale, in_phase.shift, in_phase.power, in_level.ceiling),
+        *(np.array(part.monomials) for part in (in_phase, in_level)),
+    )
+    loop = _fill
     run_split(len(d), lambda a, b: loop(d[a:b], numbers, phase[a:b], level[a:b]))
-
-
-def response_polynomials(
-    proxy: Proxy, diameter_um: Array, at: tuple[float, float]
-) -> Polynomials:
-    """Numbers of the phase and |T| polynomials for :func:`evaluate_row`, after the
-    diameters are checked; raises as :func:`fill_response`.
-
-    Args:
-        proxy: phase and |T| over the diameter.
-        diameter_um: (y, x) sizes, um; 0 where there is no pillar.
-        at: wavelength in um and angle in rad.
-    """
-    phase, level = proxy.at(*at), proxy.level_at(*at)
-    most = float(np.max(diameter_um, initial=0.0))
-    if most > 0:
-        proxy.phase_rad(
-            np.array([np.min(diameter_um, where=diameter_um > 0, initial=most), most]),
-            *at,
-        )  # raises outside the domain
-    inner = phase.scale, phase.shift, phase.power, level.ceiling
-    return (*inner, np.array(phase.monomials), np.array(level.monomials))
-
-
-@numba.njit(
-    fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True
-)
-def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
-    """Fill the phase in rad and |T| of a part of a row, by Horner's rule in x = scale
-    d^power + shift.
-
-    Args:
-        d: (n,) diameters, um.
-        numbers: scale, shift, power, ceiling and monomials of phase and |T|.
-        x: (n,) work array.
-        phase: (n,) that is filled, rad.
-        level: (n,) that is filled; 0 where there is no pillar.
-    """
-    scale, shift, power, ceiling, in_phase, in_level = numbers
-    for j in range(d.size):
-        x[j] = scale * d[j]
-    for _ in range(power - 1):
-        for j in range(d.size):
-            x[j] *= d[j]
-    for j in range(d.size):
-        x[j] += shift
-        phase[j], level[j] = in_phase[-1], in_level[-1]
-    for k in range(in_phase.size - 2, -1, -1):
-        for j in range(d.size):
-            phase[j] = phase[j] * x[j] + in_phase[k]
-    for k in range(in_level.size - 2, -1, -1):
-        for j in range(d.size):
-            level[j] = level[j] * x[j] + in_level[k]
-    for j in range(d.size):
-        level[j] = min(level[j], ceiling) if d[j] > 0 else 0.0
 
 
 @numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True)
 def _fill(d, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
-    """Fill some rows of :func:`fill_response`, in parts of 512 pillars.
+    """Fill some rows of :func:`fill_response`, in parts of 512 pillars, by Horner's
+    rule in x = scale d^power + shift.
 
     Args:
         d: (rows, x) diameters, um.
-        numbers: as for :func:`evaluate_row`.
+        numbers: scale, shift, power, ceiling and monomials of phase and |T|.
         out_phase: (rows, x) that is filled, rad within ±π.
         out_level: (rows, x) that is filled.
     """
+    scale, shift, power, ceiling, in_phase, in_level = numbers
     x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
     for i in range(d.shape[0]):
         for start in range(0, d.shape[1], PART):
             row = d[i, start : start + PART]
             n = row.size
-            evaluate_row(row, numbers, x[:n], phase[:n], level[:n])
+            for j in range(n):
+                x[j] = scale * row[j]
+            for _ in range(power - 1):
+                for j in range(n):
+                    x[j] *= row[j]
+            for j in range(n):
+                x[j] += shift
+                phase[j], level[j] = in_phase[-1], in_level[-1]
+            for k in range(in_phase.size - 2, -1, -1):
+                for j in range(n):
+                    phase[j] = phase[j] * x[j] + in_phase[k]
+            for k in range(in_level.size - 2, -1, -1):
+                for j in range(n):
+                    level[j] = level[j] * x[j] + in_level[k]
             for j in range(n):
                 t = phase[j] / (2 * np.pi)
+                has_pillar = row[j] > 0
                 out_phase[i, start + j] = (
-                    (t - np.rint(t)) * (2 * np.pi) if row[j] > 0 else 0.0
+                    (t - np.rint(t)) * (2 * np.pi) if has_pillar else 0.0
                 )
-                out_level[i, start + j] = level[j]
+                out_level[i, start + j] = min(level[j], ceiling) if has_pillar else 0.0

@@ -1,5 +1,5 @@
 """What all pillars answer, by compiled loops: against the series of the proxy summed by
-numpy, and cells by means.
+numpy.
 """
 
 import math
