@@ -142,8 +142,6 @@ _LARGEST = 1e9  # size of a number among options, in its unit
 _PARTED = re.compile(
     r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+"
 )  # numbers of an option, with commas
-_AGAIN_S = 0.02  # delay after which a dropped interrupt is raised again
-_PREVIOUS_HOOK: list[Any] = []  # the hook for dropped exceptions before this one
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -214,15 +212,12 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _prepare() -> None:
-    """Set signals, hooks and the environment of the process for a command."""
+    """Set signals and the environment of the process for a command."""
     # a lost terminal ends a command as Ctrl-C does, unless under nohup
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _stop)
-    if sys.unraisablehook is not _raise_again:
-        _PREVIOUS_HOOK[:] = [sys.unraisablehook]
-        sys.unraisablehook = _raise_again
     # Waiting threads of OpenMP release their core early: spinning by default makes
     # training ten times slower next to another busy program, and alone a tenth faster.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -263,9 +258,6 @@ def _guarded(words: list[str], *, debug: bool) -> int:
             f"{type(error).__name__}: {_line(error)}; not foreseen: {_write_report(words)}"
         )
     finally:
-        if hasattr(signal, "setitimer"):
-            # a dropped interrupt that came by another way is not raised again
-            signal.setitimer(signal.ITIMER_REAL, 0)
         store.COMMAND.reset(token)
 
 
@@ -420,16 +412,3 @@ def _refuse(message: str, status: int = BAD_INPUT) -> int:
 
 def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt
-
-
-def _raise_again(dropped: Any) -> None:
-    """Raise an interrupt again that Python dropped (in a callback of an import, a
-    finaliser).
-
-    Other dropped exceptions go to the previous hook.
-    """
-    if issubclass(dropped.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, _stop)
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-    else:
-        _PREVIOUS_HOOK[0](dropped)

@@ -97,37 +97,6 @@ def test_what_exists_is_kept(folder, verb):
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        ("export lens.h5", "out.npz"),
-        ("export lens.h5", "out.mat"),
-        ("export lens.h5 --samples 9", "out.dat"),
-        ("psf lens.h5 --config psf.toml", "out.tif"),
-        ("psf lens.h5 --config psf.toml", "out.mat"),
-        ("check mask.gds", "out.lyrdb"),
-        ("view lens.h5", "out.html"),
-    ],
-)
-def test_force_knows_every_format_that_a_command_writes(
-    folder, monkeypatch, words, name
-):
-    """A file of the same format that somebody else made stays."""
-    monkeypatch.chdir(folder)
-    (folder / "psf.toml").write_text(
-        "depths_mm = [20.0, 20.0, 1.0]\nangles_deg = [0.0]\nsamples = 8\n"
-    )
-    command = [*words.split(), "-o", name]
-    assert cli.main(command) in (0, 1)
-    made = (folder / name).read_bytes()
-    assert cli.main(command) == cli.BAD_INPUT
-    assert call(*command, "--force") in (0, 1)
-    theirs = made.replace(b"metalens", b"elsewhere").replace(b" \t\n", b"\n")
-    (folder / name).write_bytes(theirs)
-    assert call(*command, "--force") == cli.BAD_INPUT
-    assert (folder / name).read_bytes() == theirs
-
-
 def test_a_run_folder_half_written_is_named(folder):
     """Started but never finished: no result, and no checkpoint to resume from."""
     (folder / "half").mkdir()

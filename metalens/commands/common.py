@@ -30,7 +30,7 @@ class CommonOptions:
     Attributes:
         quiet: show nothing but errors.
         json: print the result as JSON.
-        force: replace what exists, if this toolchain wrote it.
+        force: replace what exists; a folder only if this toolchain wrote it.
     """
 
     quiet: bool = False

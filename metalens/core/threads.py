@@ -17,11 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_CONCURRENT = threading.local()  # stop: event of a thread of run_each
-
-
-class WorkStopped(Exception):  # no error: the result of the item is not used
-    """Raised within an item of :func:`run_each` that is cancelled."""
+_CONCURRENT = threading.local()  # inside: of a thread of run_each
 
 
 def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -29,8 +25,7 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     within an item stays in its thread.
 
     For work of calls that release the interpreter lock, and that changes nothing
-    shared. An interrupt or the first failure stops the other items at their next
-    :func:`run_split`. It is raised when they have ended.
+    shared. After an interrupt or the first failure no further item begins.
 
     Args:
         work: called with each item.
@@ -40,35 +35,18 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     count = min(thread_count(), len(items), 16)  # each has memory of its own
     if count <= 1:
         return [work(item) for item in items]
-    stop = threading.Event()
 
-    def run_item(item: Item) -> Result:
-        _CONCURRENT.stop = stop
-        return work(item)
+    def begin() -> None:
+        _CONCURRENT.inside = True
 
-    with (
-        ThreadPoolExecutor(count, thread_name_prefix="metalens-concurrent") as pool,
-        one_blas_thread(),
-    ):
-        try:
-            jobs = [pool.submit(run_item, item) for item in items]
-            return [job.result() for job in jobs]
-        except BaseException:
-            stop.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with ThreadPoolExecutor(count, initializer=begin) as pool, one_blas_thread():
+        return list(pool.map(work, items))
 
 
 def run_split(count: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads
     (see :func:`thread_count`).
-
-    Raises:
-        WorkStopped: the item of :func:`run_each` that calls this was cancelled.
     """
-    stop = getattr(_CONCURRENT, "stop", None)
-    if stop is not None and stop.is_set():
-        raise WorkStopped
     _run_parts(count, min(thread_count(), count), work)
 
 
@@ -130,7 +108,7 @@ def thread_count() -> int:
     """Threads for parallel loops: torch's where it is loaded, else OMP_NUM_THREADS,
     else the cores of this process; one within :func:`run_each`.
     """
-    if getattr(_CONCURRENT, "stop", None) is not None:
+    if getattr(_CONCURRENT, "inside", False):
         return 1
     torch = sys.modules.get("torch")
     if torch is not None:

@@ -18,24 +18,6 @@ ROOM = 1 << 22  # bytes that every output may need
 # endings of the names that an interruption leaves for the next run
 UNFINISHED, JOURNAL = ".unfinished", ".resume"
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
-_ENDS = 1 << 16  # bytes at either end of a file that are searched for its signature
-# signatures of our files: first bytes, and bytes further on
-_MARKS = (
-    (b"\x89PNG", b"Software\0metalens"),
-    (b"<!doctype html>", b'name="generator" content="metalens'),
-    (b"MATLAB 5.0 MAT-file, metalens", b""),
-    (b"file,depth_um,angle_deg,exposure_s", b""),
-    (
-        b'<?xml version="1.0" encoding="utf-8"?>\n<report-database>',
-        b"<generator>metalens",
-    ),
-    (b"PK", b"metalens"),  # NumPy's archive, with a comment
-    (b"II*\0", b"metalens"),  # TIFF, BigTIFF
-    (b"MM\0*", b"metalens"),
-    (b"II+\0", b"metalens"),
-    (b"MM\0+", b"metalens"),
-    (b"", b" 0 0 0\t \t\n"),  # Zemax grid phase: blanks end its first line
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +39,7 @@ class OutputDraft:
 class ClaimTerms:
     """What a claim allows.
 
-    force: whether an existing output may be replaced, if it is ours.
+    force: whether an existing output may be replaced; of folders only ours.
     inputs: files and folders that are read.
     room: bytes that the output needs.
     parents: whether missing folders above it are created.
@@ -276,8 +258,8 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
 def _refuse(
     target: Path, companions: Iterable[str], terms: ClaimTerms, *, is_folder: bool
 ) -> None:
-    """Refuse an output that is an input, exists without --force, is not ours, or finds
-    no room.
+    """Refuse an output that is an input, exists without --force, is a folder of others,
+    or finds no room.
 
     Args:
         target: the output.
@@ -314,8 +296,7 @@ def _refuse(
             continue
         if not terms.force:
             raise OutputError(f"{path} exists; give --force to overwrite it")
-        reason = foreign_reason(path)
-        if reason:
+        if path.is_dir() and (reason := _foreign_folder(path)):
             raise OutputError(
                 f"{path} {reason}: not overwritten, not even with --force; move it or give another name"
             )
@@ -535,31 +516,9 @@ def empty_folder(folder: Path) -> None:
             path.unlink()
 
 
-def foreign_reason(path: Path) -> str:
-    """Why a file or folder may not be replaced as one of ours; '' where it may.
-
-    A folder is ours with a manifest and no file beyond those that it lists; a file by
-    its kind or signature.
-
-    Args:
-        path: of what stands there.
-    """
-    if path.is_dir():
-        return _foreign_folder(path)
-    try:
-        with open(path, "rb") as file:
-            ends = file.read(_ENDS)
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
-            ends += file.read()
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
-    marked = any(ends.startswith(first) and mark in ends for first, mark in _MARKS)
-    return "" if marked or store.kind_of(path) else "was not made by metalens"
-
-
 def _foreign_folder(path: Path) -> str:
-    """Why a folder may not be replaced: files without a manifest, a damaged manifest,
-    or files beyond those listed. '' where it may.
+    """Why a folder may not be replaced as one of ours: files without a manifest, a
+    damaged manifest, or files beyond those listed. '' where it may.
     """
     present = set(iterate_files(path))
     if not present and not (path / NAME).exists():

@@ -158,8 +158,8 @@ def interpolate_phase(
     """Phase in rad at positions, (y, x): bilinear interpolation of the phasor exp(i
     phase).
 
-    Around a vortex the phase passes whole turns however fine the map is. In spots of up
-    to 16 samples across, the phase of the nearest sample is taken.
+    Around a vortex the phase passes whole turns however fine the map is. In round spots
+    of up to 16 samples across, the phase of the nearest sample is taken.
 
     Args:
         samples: the phase map.
@@ -204,11 +204,8 @@ def interpolate_phase(
         )
     coarse = size < 0.5  # neighbours differ by over 2/3 of half a turn
     spots = ndimage.find_objects(ndimage.label(coarse, np.ones((3, 3)))[0])
-    if any(
-        np.ptp(places[part]) > 2 * CORE
-        for spot in spots
-        for places, part in zip((row, column), spot, strict=True)
-    ):
+    sides = [(np.ptp(row[a]), np.ptp(column[b])) for a, b in spots]
+    if any(max(side) > 2 * CORE or max(side) - min(side) > CORE / 2 for side in sides):
         raise LensError(
             f"the phase map turns by more than 2/3 of half a turn between samples {place}; "
             f"give it on a finer pitch than {max(step_x, step_y)} um, or state the unit "

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from metalens.image.points import Optics, Window, psfs, sampling
 from metalens.image.texture import texture_error, weigh_by_light
-from metalens.image.waves import PillarPlane
+from metalens.image.waves import PillarWave
 from metalens.optics import media
 from metalens.psf import Polarisation, SpectralNodes, blur_um, psf_stack
 
@@ -158,7 +158,7 @@ def gathering_error(
         at: (field points, [x, y]) in um, and (depths,) in um.
     """
     wave = optics.wave
-    if not isinstance(wave, PillarPlane):
+    if not isinstance(wave, PillarWave):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
     # points per sample, at half of Nyquist's step: its triangle is then summed to
@@ -200,7 +200,7 @@ def _triangles(count: int, finer: int) -> Tensor:
 
 def _of_pillars(
     optics: Optics,
-    wave: PillarPlane,
+    wave: PillarWave,
     wavelength_um: float,
     at: tuple[Tensor, Tensor],
     sampled: tuple[float, int, int],

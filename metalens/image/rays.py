@@ -249,9 +249,11 @@ def source_paths(
         difference = functools.partial(
             media.path_difference, pairs, sine**2, (slope * reach) ** 2
         )
-        out.append(
-            interpolant.chebyshev_interpolant(lambda u: difference(u)[1], change)
+        path = interpolant.chebyshev_interpolant(
+            lambda u: difference(u)[1],  # noqa: B023 (called at once)
+            change,
         )
+        out.append(path)
     return torch.stack(out)
 
 

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -37,18 +37,6 @@ class Wave(Protocol):
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
     ) -> Tensor | None:
         """Complex transmission less the carrier, differentiable; None where it is 1."""
-
-
-@runtime_checkable
-class PillarPlane(Protocol):
-    """A lens plane whose factor is a mean over pillars of known transmission."""
-
-    @property
-    def pitch_um(self) -> float:
-        """Of the square lattice."""
-
-    def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

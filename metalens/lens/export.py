@@ -4,7 +4,6 @@ tracers (Zemax grid phase).
 
 import io
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,20 +66,15 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
         return grid.error_rad
     values = lens_arrays(lens)
     file = io.BytesIO()
+    head = b""
     if suffix == ".npz":
         np.savez_compressed(file, allow_pickle=False, **values)
-        with zipfile.ZipFile(file, "a") as archive:
-            archive.comment = b"metalens lens, um and rad"
-        write_bytes(path, file.getvalue())
     else:
         from scipy.io import savemat
 
         savemat(file, values, oned_as="column")
-        write_bytes(
-            path,
-            b"MATLAB 5.0 MAT-file, metalens lens, um and rad".ljust(116)
-            + file.getvalue()[116:],
-        )
+        head = b"MATLAB 5.0 MAT-file, um and rad".ljust(116)  # in place of the date
+    write_bytes(path, head + file.getvalue()[len(head) :])
     return 0.0
 
 
@@ -127,11 +121,10 @@ class GridPhase:
         dxy nodata`` per point, largest y first.
 
         Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the
-            program then takes differences. The blanks at the end of the first line mark
-            it as our file.
+            program then takes differences.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
-        lines = [f"{n} {n} {step} {step} 0 0 0\t \t"]
+        lines = [f"{n} {n} {step} {step} 0 0 0"]
         lines += [
             f"0 0 0 0 {_NO_DATA}" if math.isnan(value) else f"{value!r} 0 0 0 0"
             for value in self.phase_rad.ravel().tolist()
