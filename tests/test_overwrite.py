@@ -14,7 +14,7 @@ from metalens.cell.record import Cell, Index
 from metalens.core import store
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
-from tests.command_line import call, run
+from tests.command_line import run
 
 # verb: words after it, and the target that already exists; %s is the folder of inputs
 CASES = {
