@@ -31,7 +31,7 @@ def main(words: list[str]) -> int:
     failed = 0
     for name in names or known:
         start = time.monotonic()
-        notebook = jupytext.read(FOLDER / f"{name}.py")
+        notebook = jupytext.read(FOLDER / f"{name}.py", fmt="py:percent")
         client = NotebookClient(
             notebook,
             timeout=600,
@@ -64,11 +64,16 @@ def write_page(notebook: nbformat.NotebookNode, name: str) -> None:
             f"    {line}" for line in f"```python\n{cell.source}\n```".splitlines()
         )
         parts.append(f'??? note "code"\n{code}')
+        printed = "".join(
+            output.text
+            for output in cell.outputs
+            if output.output_type == "stream" and output.name == "stdout"
+        )
+        if printed:
+            parts.append(f"```text\n{printed.rstrip()}\n```")
         for output in cell.outputs:
             data = output.get("data", {})
-            if output.output_type == "stream" and output.name == "stdout":
-                parts.append(f"```text\n{output.text.rstrip()}\n```")
-            elif "image/png" in data:
+            if "image/png" in data:
                 pictures += 1
                 (GALLERY / f"{name}_{pictures}.png").write_bytes(
                     base64.b64decode(data["image/png"])

@@ -124,6 +124,18 @@ UNITS = {
 }
 
 
+LABELS = {
+    "steepest": "steepest phase gradient / k",
+    "sampled_aperture": "NA sampled by the lattice",
+    "focuses": "the phase forms a focus",
+    "focus_passed": "focus at the image point",
+    "turns": "phase coverage / turns",
+    "entry_error": "rms error of t of the meta-atoms",
+    "proxy_phase_error_rad": "fit error of the phase / rad",
+    "proxy_transmission_error": "fit error of |t|",
+}
+
+
 def in_words(key: str) -> str:
     """A key of a result in words, with its unit after a slash.
 
@@ -132,6 +144,8 @@ def in_words(key: str) -> str:
     >>> [in_words(key) for key in ("mtf50_x_per_um", "depth_response_mm_per_mm")]
     ['mtf50 x / (1/µm)', 'depth response / (mm/mm)']
     """
+    if key in LABELS:
+        return LABELS[key]
     *parts, last = key.split("_")
     unit = UNITS.get(last, "") if parts else ""
     if unit and parts[-1] == "per":
@@ -161,7 +175,7 @@ def in_figures(value: Any, digits: int = 4) -> str:
 
 
 def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
-    """PNG bytes of a matplotlib figure, equal for equal drawings; the figure is closed.
+    """PNG bytes of a matplotlib figure, equal for equal drawings.
 
     Two pixels of the file stand for one of the page, for dense screens and print.
 
@@ -169,8 +183,6 @@ def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
         figure: that is drawn.
         dpi: dots per inch.
     """
-    from matplotlib import pyplot
-
     buffer = io.BytesIO()
     figure.savefig(
         buffer,
@@ -179,7 +191,6 @@ def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
         bbox_inches="tight",
         metadata={"Software": "metalens"},
     )
-    pyplot.close(figure)
     return buffer.getvalue()
 
 
@@ -197,13 +208,11 @@ def make_figure(
         rows: panels along a column.
         columns: panels along a row.
         size: width and height, inches.
-        options: of ``pyplot.subplots``.
+        options: of ``Figure.subplots``.
     """
     import matplotlib
-
-    matplotlib.use("Agg")
     from cycler import cycler
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure as Canvas
 
     style: dict[Any, Any] = {
         "font.size": 9,
@@ -220,9 +229,8 @@ def make_figure(
         ),
     }
     with matplotlib.rc_context(style):
-        return pyplot.subplots(
-            rows, columns, figsize=size, layout="constrained", **options
-        )
+        figure = Canvas(figsize=size, layout="constrained")
+        return figure, figure.subplots(rows, columns, **options)
 
 
 def write_report(
