@@ -34,30 +34,28 @@ def stated_axes(about: dict[str, Any], where: str) -> str | None:
     return None if order is None else str(order)
 
 
-def frames_first(
-    stack: Array, path: Path, order: str | None, *, count: int | None = None
-) -> tuple[Array, str]:
+def frames_first(stack: Array, path: Path, order: str | None) -> tuple[Array, str]:
     """A stack as (n, y, x), and what to say where it lay otherwise.
 
     Args:
         stack: (n, y, x) or (y, x, n), of colour images with these behind.
         path: the file.
         order: one of ``ORDERS``, as stated; None where nobody says.
-        count: of its frames, where they are listed: it tells axes of different length.
 
     Raises:
-        CaptureError: nothing is known, and the last axis is the shortest, as of stacks
+        CaptureError: nothing is stated, and the last axis is the shortest, as of stacks
             whose frames run along it.
     """
     if stack.ndim < 3 or len(stack) == 1 or order == "nyx":
         return stack, ""
     first, second, last = stack.shape[:3]
     if order == "yxn":
-        return _last_to_first(stack, path, "as stated")
-    if count is not None:
-        if count == last != first:
-            return _last_to_first(stack, path, f"since {count} frames of it are listed")
-        return stack, ""
+        name = reading.to_valid_utf8(path.name)
+        note = (
+            f"{name} taken as (y, x, n), {last} frames of {first} x {second} pixels, "
+            "as stated"
+        )
+        return np.ascontiguousarray(np.moveaxis(stack, 2, 0)), note
     if last < min(first, second):
         raise CaptureError(
             f"{path}: a stack of shape {stack.shape[:3]} is {first} frames of "
@@ -66,35 +64,3 @@ def frames_first(
             "in capture.toml (of a single file, in the TOML of its name beside it)"
         )
     return stack, ""
-
-
-def as_large(
-    stack: Array, path: Path, size: tuple[int, ...], *, pitch: int = 1
-) -> tuple[Array, str]:
-    """Dark or flat as (n, y, x), by the size of the frames, and what to say where it
-    lay otherwise.
-
-    Args:
-        stack: images as they lie in the file.
-        path: the file.
-        size: (y, x) of the frames as they are used, one pixel in ``pitch`` each way of
-            those on disk.
-        pitch: pixels from one that is used to the next.
-    """
-
-    def fits(shape: tuple[int, ...]) -> bool:
-        return all(abs(a - pitch * b) < pitch for a, b in zip(shape, size, strict=True))
-
-    if stack.ndim >= 3 and not fits(stack.shape[1:3]) and fits(stack.shape[:2]):
-        return _last_to_first(stack, path, "since frames are as large")
-    return stack, ""
-
-
-def _last_to_first(stack: Array, path: Path, why: str) -> tuple[Array, str]:
-    """A (y, x, n) stack as (n, y, x), and a note."""
-    first, second, last = stack.shape[:3]
-    name = reading.to_valid_utf8(path.name)
-    note = (
-        f"{name} taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
-    )
-    return np.ascontiguousarray(np.moveaxis(stack, 2, 0)), note

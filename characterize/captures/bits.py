@@ -38,122 +38,85 @@ def right_align(
             of which no counts can be made; unsigned words saved as signed ones.
     """
     stacks = [images, *beside]
-    _check_signs(stacks, where)
+    if any(stack.dtype == np.int16 and stack.min() < _WRAPPED for stack in stacks):
+        raise CaptureError(
+            f"{where}: signed counts far below 0: words of 16 bits without a sign that "
+            "were saved as signed, or with 32768 taken off; save them as unsigned "
+            "(uint16)"
+        )
     note = ""
     if bits is not None and _is_fraction(images):
         scale = _full_scale(images, bits, where)
         stacks = [stack * scale if _is_fraction(stack) else stack for stack in stacks]
         note = f"shares of full scale multiplied by {scale}; "
     counts = [_as_integers(stack) for stack in stacks]
-    integers = [
-        stack for stack in counts if stack.dtype.kind != "f" and stack.min() >= 0
-    ]
-    if not integers or integers[0] is not counts[0]:
+    whole = [stack for stack in counts if _is_whole(stack)]
+    if not _is_whole(counts[0]):
         if bits is not None and images.max() >= 1 << bits:
             raise CaptureError(
                 f"{where}: counts are real numbers up to {images.max():.6g}, the "
                 f"capture states {bits} bits (at most {(1 << bits) - 1}); correct "
-                "bits, "
-                "or divide by the shift"
+                "bits, or divide by the shift"
             )
         note += "counts are real numbers: taken as they are"
         return counts[0], bits or 16, note, tuple(counts[1:])
-    factor, depth, text = _stretch(integers, bits)
-    if not text:
-        shift, depth, text = _alignment(integers, bits, where)
-        factor = 0.5**shift
-    if factor < 1:
+    step, depth, text = _step_of_counts(whole, bits, where)
+    if step > 1:
         counts = [
-            np.rint(stack * factor).astype(stack.dtype)
-            if stack.dtype.kind != "f" and stack.min() >= 0
-            else stack * factor
+            np.rint(stack / step).astype(stack.dtype)
+            if _is_whole(stack)
+            else stack / step
             for stack in counts
         ]
     return counts[0], depth, note + text, tuple(counts[1:])
 
 
-def _alignment(
+def _step_of_counts(
     whole: Sequence[Array], bits: int | None, where: str
-) -> tuple[int, int, str]:
-    """(shift to undo, bits of the converter, note in words) of whole counts."""
-    used = 0
-    for stack in whole:
-        used |= int(np.bitwise_or.reduce(stack.astype(np.int64), axis=None))
+) -> tuple[float, int, str]:
+    """(values a count, bits of the converter, note in words) of whole numbers.
+
+    A stretch over 16 bits multiplies by 65535 / (2**bits - 1), or repeats the highest
+    bits in the lowest.
+    """
+    levels = np.unique(np.concatenate([np.unique(stack) for stack in whole]))
+    levels = levels.astype(np.int64)
+    used = int(np.bitwise_or.reduce(levels))
     shift = (used & -used).bit_length() - 1  # -1 where all is dark
     used_bits = used.bit_length()
     word_bytes = whole[0].dtype.itemsize
-    if bits is not None and used_bits <= bits:
-        return 0, bits, f"{bits} bits as stated"
-    if bits is not None and not 16 - bits <= shift < used_bits <= 16:
-        raise CaptureError(
-            f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, "
-            f"the capture states {bits}; correct bits, or the bit shift"
-        )
-    if bits is not None:
-        text = f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
-        return 16 - bits, bits, text
-    if shift > 0 and used_bits > 12 and word_bytes == 2:
+    if bits is None and shift > 0 and used_bits > 12 and word_bytes == 2:
         text = f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
-        return shift, 16 - shift, text
-    depth = (
-        next(
-            (
-                depth_candidate
-                for depth_candidate in _DEPTHS
-                if used_bits <= depth_candidate
-            ),
-            16,
-        )
-        if word_bytes > 1
-        else 8
-    )
-    return 0, depth, f"counts of {used_bits} bits: taken as a {depth}-bit converter"
-
-
-def _stretch(whole: Sequence[Array], bits: int | None) -> tuple[float, int, str]:
-    """(factor, bits, note) that undo a stretch of counts from ``bits`` over 16 bits.
-
-    A stretch repeats the highest bits in the lowest, or multiplies by
-    65535 / (2**bits - 1). The note is empty where there is none.
-    """
-    if bits is None or bits >= 16 or any(stack.dtype.itemsize != 2 for stack in whole):
-        return 1.0, 0, ""
-    levels = np.unique(np.concatenate([np.unique(stack) for stack in whole]))
-    stretch = 65_535 / ((1 << bits) - 1)
-    top_bits = levels >> (16 - bits)
-    repeated = (top_bits << (16 - bits)) | (top_bits >> max(2 * bits - 16, 0))
-    scaled = np.rint(np.rint(levels / stretch) * stretch)
-    exceeds = levels[-1] >= 1 << bits
-    if not exceeds or not (
-        np.array_equal(levels, repeated) or np.array_equal(levels, scaled)
-    ):
-        return 1.0, 0, ""
-    return (
-        1 / stretch,
-        bits,
-        f"{bits}-bit counts were stretched over 16 bits: taken back",
+        return 1 << shift, 16 - shift, text
+    if bits is None:
+        deep_enough = (depth for depth in _DEPTHS if used_bits <= depth)
+        depth = 8 if word_bytes == 1 else next(deep_enough, 16)
+        return 1, depth, f"counts of {used_bits} bits: taken as a {depth}-bit converter"
+    if used_bits <= bits:
+        return 1, bits, f"{bits} bits as stated"
+    left = 16 - bits
+    if left > 0 and used_bits <= 16:
+        if shift >= left:
+            text = f"{bits}-bit counts were shifted left by {left} bits: shifted back"
+            return 1 << left, bits, text
+        stretch = 65_535 / ((1 << bits) - 1)
+        count = np.rint(levels / stretch).astype(np.int64)
+        repeated = (count << left) | (count >> max(2 * bits - 16, 0))
+        if any(
+            np.array_equal(levels, stretched)
+            for stretched in (np.rint(count * stretch), repeated)
+        ):
+            text = f"{bits}-bit counts were stretched over 16 bits: taken back"
+            return stretch, bits, text
+    raise CaptureError(
+        f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, the "
+        f"capture states {bits}; correct bits, or the bit shift"
     )
 
 
-def _check_signs(stacks: Sequence[Array], where: str) -> None:
-    """Refuse 16-bit counts that lie in signed words: their brighter half is below 0, or
-    all are moved by 32768.
-    """
-    smallest = min(
-        (
-            int(stack.min())
-            for stack in stacks
-            if stack.dtype.kind == "i" and stack.dtype.itemsize == 2
-        ),
-        default=0,
-    )
-    if smallest < _WRAPPED:
-        raise CaptureError(
-            f"{where}: signed counts down to {smallest}: words of 16 bits without a "
-            "sign that were saved as signed, or with 32768 taken off; save them as "
-            "unsigned "
-            "(uint16)"
-        )
+def _is_whole(stack: Array) -> bool:
+    """Whether values are integers from 0 on."""
+    return bool(stack.dtype.kind != "f" and stack.min() >= 0)
 
 
 def _as_integers(image: Array) -> Array:
@@ -182,14 +145,12 @@ def _is_fraction(image: Array) -> bool:
 
 def _full_scale(images: Array, bits: int, where: str) -> int:
     """Factor from shares of full scale to counts: 2**bits - 1 or 2**bits."""
-    shares = np.asarray(images, float)
     for scale in ((1 << bits) - 1, 1 << bits):
-        if np.abs(shares * scale - np.rint(shares * scale)).max() < _ROUNDING:
+        counts = images.astype(float) * scale
+        if np.abs(counts - np.rint(counts)).max() < _ROUNDING:
             return scale
     raise CaptureError(
         f"{where}: real numbers up to {images.max():.3g}, no counts over the full "
-        "scale "
-        f"of {bits} bits; save counts as they come from the camera, or multiply "
-        "frames, "
-        "dark and flat by the full scale in counts"
+        f"scale of {bits} bits; save counts as they come from the camera, or multiply "
+        "frames, dark and flat by the full scale in counts"
     )

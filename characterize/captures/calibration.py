@@ -9,14 +9,11 @@ import numpy as np
 from scipy import ndimage
 
 from characterize.captures.capture import Capture
-from characterize.captures.rounding import DarkStatistics
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
 # least noise in counts at which the mean of rounded counts errs by 1/20 count at most
 _ROUNDING_NOISE = 0.3
-# largest variance between dark frames, counts², at which the noise may be below that
-_DARK_VARIANCE = 0.35
 _SIGMA_LIMIT = 3.0  # standard errors by which the noise must grow with light
 
 
@@ -105,7 +102,7 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
             f"photon transfer: {len(flat)} flat frame; need two or more of one level"
         )
     offset = float(np.mean(dark)) if dark is not None else 0.0
-    floor = _dark_variance(dark) if dark is not None and len(dark) > 1 else None
+    floor = _pair_variance(dark) if dark is not None and len(dark) > 1 else None
     order = np.argsort([_typical_level(frame) for frame in flat], kind="stable")
     pairs = [
         (flat[first], flat[second])
@@ -390,7 +387,7 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
         read_noise_e = float(description["read_noise_e"])
         origin = "as stated"
     elif dark is not None and len(dark) > 1:
-        read_noise_e = gain * math.sqrt(max(_dark_variance(dark) - 1 / 12, 0.0))
+        read_noise_e = gain * math.sqrt(max(_pair_variance(dark) - 1 / 12, 0.0))
         origin = f"measured in {len(dark)} dark frames"
     elif measured is not None:
         read_noise_e = measured.read_noise_e
@@ -408,7 +405,7 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
 
 def _dark_level(
     capture: Capture, gain: SensorNoise, notes: list[str]
-) -> tuple[Array | float, Array | float]:
+) -> tuple[Array | float, float]:
     """(counts without light, their standard error): (y, x) from dark frames, else the
     stated offset, else 0; appends a note.
     """
@@ -421,18 +418,15 @@ def _dark_level(
             "fit's background and weigh as light; add dark.tif or state offset"
         )
         return 0.0, 0.0
-    mean = np.mean(capture.dark, axis=0)
-    error = math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5)
-    offset = mean
-    errors = np.full_like(mean, error / math.sqrt(len(capture.dark)))
-    if gain.coarse:
-        rounded = DarkStatistics.of(capture.dark)
-        offset, errors = rounded.level, rounded.error
+    level = np.mean(capture.dark, axis=0)
+    # the rounding of coarse counts is one error in all frames
+    frames = 1 if gain.coarse else len(capture.dark)
+    error = math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5) / math.sqrt(frames)
     notes.append(
-        f"offset {np.mean(offset):.4g} counts on average, measured pixel by pixel in "
+        f"offset {np.mean(level):.4g} counts on average, measured pixel by pixel in "
         f"{len(capture.dark)} dark frames, subtracted"
     )
-    return np.asarray(offset), errors
+    return np.asarray(level), error
 
 
 def _flat_field(
@@ -479,18 +473,6 @@ def _isolated_pixels(frames: Array) -> Array:
     )
     spike = (frames - brightest > 6 * spread) & (frames > 1.5 * brightest)
     return np.asarray(spike.mean(0) > (0.8 if len(frames) >= 3 else 2))
-
-
-def _dark_variance(dark: Array) -> float:
-    """Variance of a dark count, counts²: between frames, or for coarse counts that
-    before rounding plus 1/12.
-    """
-    variance = _pair_variance(dark)
-    return (
-        variance
-        if variance > _DARK_VARIANCE
-        else DarkStatistics.of(dark).noise ** 2 + 1 / 12
-    )
 
 
 def _pair_variance(frames: Array) -> float:

@@ -7,9 +7,8 @@ import logging
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,29 +152,19 @@ def read_images(path: Path) -> Array:
 
 
 def _file_frames(
-    path: Path, colours: ColourChannels, order: str | None, *, count: int | None = None
+    path: Path, colours: ColourChannels, order: str | None, *, grey: bool = False
 ) -> Stack:
     """(n, y, x) frames of one file in one colour, and a note on their axes.
 
     Args:
         order: stated order of the axes, or None.
-        count: number of frames that the stage file lists, or None.
+        grey: whether grey images are taken where a channel is stated.
     """
     images = read_all(path, colours)
     if order is None and path.suffix.lower() in TIFF:
         order = tiff_pages.page_order(path)
-    images, note = axes.frames_first(images, path, order, count=count)
-    return check_images(colours.pick(images, path, grey=False), path), note
-
-
-def _companion_frames(
-    path: Path, colours: ColourChannels, size: tuple[int, ...]
-) -> Stack:
-    """(k, y, x) dark or flat frames for frames of a size, and a note on their axes."""
-    images, note = axes.as_large(
-        read_all(path, colours), path, size, pitch=colours.pitch
-    )
-    return check_images(colours.pick(images, path, grey=True), path), note
+    images, note = axes.frames_first(images, path, order)
+    return check_images(colours.pick(images, path, grey=grey), path), note
 
 
 def check_images(images: Array, path: Path) -> Array:
@@ -186,11 +175,27 @@ def check_images(images: Array, path: Path) -> Array:
         path: the file.
 
     Raises:
-        CaptureError: empty, of numbers that hold no counts, or non-finite.
+        CaptureError: empty, of numbers that hold no counts, of half precision, or
+            non-finite.
     """
     if images.size == 0:
         raise CaptureError(f"{path}: images of shape {images.shape} are empty")
-    _check_values(images, path)
+    kind = images.dtype.kind
+    if kind not in "uif" or images.dtype.itemsize > 8:
+        raise CaptureError(
+            f"{path}: values of type {images.dtype}; need whole or real numbers"
+        )
+    if kind == "f" and images.dtype.itemsize < 4:
+        raise CaptureError(
+            f"{path}: values of type {images.dtype} round counts above 2048; save "
+            "whole numbers"
+        )
+    if not (finite := np.isfinite(images)).all():
+        frame, row, column = (int(i) for i in np.argwhere(~finite)[0][:3])
+        raise CaptureError(
+            f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column "
+            f"{column}"
+        )
     return images
 
 
@@ -211,26 +216,20 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
             f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save "
             "TIFF, PNG or HDF5"
         )
-    read_tiff = partial(
-        tiff_pages.read_tiff,
-        coloured=colours.channel is not None,
-        mosaic=bool(colours.mosaic),
-    )
-    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {
-        TIFF: read_tiff,
-        PNG: png.read_png,
-        HDF5: _read_hdf5,
-    }
-    reader = next(
-        (read for suffixes, read in readers.items() if suffix in suffixes), None
-    )
-    if reader is None:
+    if suffix in TIFF:
+        images = tiff_pages.read_tiff(
+            path, coloured=colours.channel is not None, mosaic=bool(colours.mosaic)
+        )
+    elif suffix in PNG:
+        images = png.read_png(path)
+    elif suffix in HDF5:
+        images = _read_hdf5(path)
+    else:
         kind = suffix or "a file without suffix"
         raise CaptureError(
             f"{path}: cannot read {kind}; need TIFF, PNG or "
             f"HDF5{folder.conversion_hint(suffix)}"
         )
-    images = reader(path)
     return images[None] if images.ndim == 2 else images
 
 
@@ -299,7 +298,7 @@ def _load_folder(path: Path) -> Capture:
             order,
         )
     companions = {
-        name: _companion_frames(file, colours, frames.shape[1:])
+        name: _file_frames(file, colours, order, grey=True)
         for name, file in companion_files.items()
     }
     stacks = {name: images for name, (images, _) in companions.items()}
@@ -384,8 +383,7 @@ def _listed_frames(
                 f"{folder.similar_name_hint(name, files_by_name)}"
             )
         if name not in stacks:
-            count = row_count[name] if stated is None else None
-            stacks[name] = _file_frames(path, colours, order, count=count)
+            stacks[name] = _file_frames(path, colours, order)
         stack = stacks[name][0]
         page = min(pages_taken[name], len(stack) - 1) if stated is None else stated
         pages_taken[name] += 1
@@ -421,49 +419,25 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
 
 def _read_hdf5(path: Path) -> Array:
     """Data set ``frames`` of an HDF5 file; refuses a damaged file."""
+    if not path.is_file():  # a pipe would be waited for
+        raise CaptureError(f"{path}: {reading.missing_reason(path)}")
     try:
-        if not path.is_file():  # a pipe would be waited for
-            raise CaptureError(f"{path}: {reading.missing_reason(path)}")
         with h5py.File(path, "r") as file:
-            return _frames_of(path, file)
+            frames = file.get("frames")
+            link = file.get("frames", getlink=True)
+            if not isinstance(frames, h5py.Dataset) or not isinstance(
+                link, h5py.HardLink
+            ):
+                raise CaptureError(
+                    f"{path}: 'frames' is no data set (n, y, x) of this file; found "
+                    f"{', '.join(sorted(file)) or 'nothing'}"
+                )
+            store.check_claim(path, frames, "frames")
+            native = frames.dtype.newbyteorder("=")
+            return np.asarray(frames[...]).astype(native, copy=False)
     except MetalensError:
         raise
     except store.DAMAGE as error:
         raise CaptureError(
             f"{path}: truncated or not an HDF5 file ({error})"
         ) from error
-
-
-def _frames_of(path: Path, file: h5py.File) -> Array:
-    """The data set ``frames``."""
-    if "frames" not in file:
-        raise CaptureError(
-            f"{path}: no data set 'frames' (n, y, x); found "
-            f"{', '.join(sorted(file)) or 'nothing'}"
-        )
-    if not isinstance(file.get("frames", getlink=True), h5py.HardLink):
-        raise CaptureError(f"{path}: 'frames' is a link; need the data set itself")
-    frames = file["frames"]
-    if not isinstance(frames, h5py.Dataset):
-        raise CaptureError(f"{path}: 'frames' is a group, need a data set (n, y, x)")
-    store.check_claim(path, frames, "frames")
-    return np.asarray(frames[...]).astype(frames.dtype.newbyteorder("="), copy=False)
-
-
-def _check_values(images: Array, path: Path) -> None:
-    """Refuse types that hold no counts, half precision, and non-finite values."""
-    if images.dtype.kind not in "uif" or images.dtype.itemsize > 8:
-        raise CaptureError(
-            f"{path}: values of type {images.dtype}; need whole or real numbers"
-        )
-    if images.dtype.kind == "f" and images.dtype.itemsize < 4:
-        raise CaptureError(
-            f"{path}: values of type {images.dtype} round counts above 2048; save "
-            "whole numbers"
-        )
-    if images.dtype.kind == "f" and not np.isfinite(images).all():
-        frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
-        raise CaptureError(
-            f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column "
-            f"{column}"
-        )

@@ -2,18 +2,15 @@
 holds.
 """
 
-import importlib.util
 import math
 import struct
 import warnings
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from characterize.captures.colour import red_first
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
@@ -21,17 +18,12 @@ from metalens.core.errors import CaptureError
 DENSEST = 1040  # values' bytes for a byte of the file, at best
 _MOST_BYTES = 1 << 34  # largest size of all frames of a file
 _LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
+_PACKBITS = 32773  # whose predictor libtiff, and so all programs, ignore
 _CFA = 32803  # photometric interpretation of a raw mosaic of colours
 _REFUSED = {
     0: "says that white is 0 (photometric 0)",
     3: "holds places in a table of colours",
 }
-_OPENCV_CODECS = {
-    5: "LZW",
-    32773: "PackBits",
-}  # what OpenCV's reader unpacks and tifffile leaves to a package of its own
-_IMAGECODECS_ONLY = {34925: "LZMA", 50000: "Zstandard"}  # only that package
-_ORIENTATION_TAG = 274  # the tag that says which way up an image is
 
 
 def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
@@ -44,10 +36,9 @@ def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Ar
         mosaic: whether the layout of a raw mosaic of colours is stated.
 
     Raises:
-        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be
-            read, values packed without gaps, pages of different size or type; inverted
-            values, colour tables (except of greys in order), a raw mosaic without its
-            layout.
+        CaptureError: truncated, no TIFF file, JPEG inside, pages of different size or
+            type; inverted values, colour tables (except of greys in order), a raw
+            mosaic without its layout.
     """
     import tifffile
 
@@ -70,6 +61,7 @@ def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Ar
         *store.DAMAGE,
         IndexError,
         ArithmeticError,
+        RuntimeError,  # of a codec
         struct.error,
         zlib.error,
     ) as error:
@@ -118,7 +110,12 @@ def _read_images(path: Path, file: Any) -> Array:
     count = count_images(file)
     first = file.pages.first
     if count == len(file.pages):
-        return np.stack(_check_equal(_page_images(path, file), path))
+        images = []
+        for page in file.pages:
+            if int(page.compression) == _PACKBITS:
+                page.keyframe.predictor = 1
+            images.append(page.asarray())
+        return np.stack(images)
     offset = first.dataoffsets[0]
     size = path.stat().st_size
     if int(first.compression) != 1 or offset + count * first.nbytes > size:
@@ -133,51 +130,9 @@ def _read_images(path: Path, file: Any) -> Array:
     return values.astype(first.dtype, copy=False).reshape(count, *first.shape)
 
 
-def _page_images(path: Path, file: Any) -> list[Array]:
-    """Image of every page, in the file's own order of colours.
-
-    Without imagecodecs, LZW and PackBits pages are read by OpenCV.
-    """
-    compressed = {
-        n
-        for n, page in enumerate(file.pages)
-        if int(page.compression) in _OPENCV_CODECS
-    }
-    if not compressed or importlib.util.find_spec("imagecodecs") is not None:
-        return [page.asarray() for page in file.pages]
-    unpacked = _opencv_images(path)
-    images = []
-    for number, page in enumerate(file.pages):
-        if number not in compressed:
-            images.append(page.asarray())
-            continue
-        image = unpacked[number] if len(unpacked) == len(file.pages) else np.empty(0)
-        is_turned = (
-            page.tags.valueof(_ORIENTATION_TAG, 1) != 1
-        )  # which OpenCV turns upright
-        if is_turned or image.shape != page.shape or image.dtype != page.dtype:
-            raise CaptureError(
-                f"{path}: frame {number} is compressed ({_OPENCV_CODECS[int(page.compression)]}) and damaged, "
-                f"turned or of a kind ({page.dtype}) that is not read so; save it plain or deflated, or install imagecodecs"
-            )
-        images.append(red_first(image))
-    return images
-
-
-def _opencv_images(path: Path) -> Sequence[Array]:
-    """All images of a file as OpenCV reads them, with its log switched off."""
-    import cv2
-
-    previous_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        return tuple(cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)[1])
-    finally:
-        cv2.utils.logging.setLogLevel(previous_level)
-
-
 def _check_pages(path: Path, file: Any) -> None:
     """Refuse pages that form a ring, claim more values than the file can hold, are
-    truncated, lossy, or need imagecodecs that is not installed.
+    truncated, lossy, or of different size or type.
     """
     size = path.stat().st_size
     claimed = 0
@@ -209,27 +164,18 @@ def _check_pages(path: Path, file: Any) -> None:
             raise CaptureError(
                 f"{path}: truncated in frame {number} ({size} bytes, need {end})"
             )
-        compression = int(page.compression)
-        if compression in _LOSSY:
+        if int(page.compression) in _LOSSY:
             raise CaptureError(
-                f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain"
+                f"{path}: frame {number} is JPEG-compressed, its noise says nothing; "
+                "save plain"
             )
-        if (
-            compression in _IMAGECODECS_ONLY
-            and importlib.util.find_spec("imagecodecs") is None
-        ):
-            raise CaptureError(
-                f"{path}: frame {number} is compressed ({_IMAGECODECS_ONLY[compression]}); save it plain or "
-                "deflated, or install imagecodecs"
-            )
-        if (
-            page.bitspersample not in (8, 16, 32, 64)
-            and importlib.util.find_spec("imagecodecs") is None
-        ):
-            raise CaptureError(
-                f"{path}: values of frame {number} are {page.bitspersample} bits wide, packed without gaps; save them "
-                "in words of 16 bits, or install imagecodecs"
-            )
+        for name, word in (("shape", "size"), ("dtype", "type")):
+            here, there = getattr(page, name), getattr(file.pages.first, name)
+            if here != there:
+                raise CaptureError(
+                    f"{path}: frame {number} is {here}, frame 0 {there}; keep one "
+                    f"{word} a file"
+                )
 
 
 def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
@@ -261,17 +207,3 @@ def _grey_table(page: Any) -> bool:
     return bool(
         (np.abs(table - linear) <= linear[1]).all()
     )  # 257 or 256 a step of 8 bits
-
-
-def _check_equal(pages: Sequence[Array], path: Path) -> Sequence[Array]:
-    """The pages; refuses pages of different size or type."""
-    for number, page in enumerate(pages):
-        if page.shape != pages[0].shape:
-            raise CaptureError(
-                f"{path}: frame {number} is {page.shape}, frame 0 {pages[0].shape}; keep one size a file"
-            )
-        if page.dtype != pages[0].dtype:
-            raise CaptureError(
-                f"{path}: frame {number} is {page.dtype}, frame 0 {pages[0].dtype}; keep one type a file"
-            )
-    return pages

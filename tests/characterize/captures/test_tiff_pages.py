@@ -2,7 +2,6 @@
 in planes of their own.
 """
 
-import importlib.util
 import struct
 
 import numpy as np
@@ -27,29 +26,15 @@ def test_plain_frames_are_read_as_they_are(tmp_path):
     assert np.array_equal(tiff_pages.read_tiff(written(tmp_path)), FRAMES)
 
 
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        *(
-            (code, "JPEG-compressed, its noise says nothing")
-            for code in (6, 7, 33003, 33005, 34712)
-        ),
-        (5, r"compressed \(LZW\) and damaged"),
-        (32773, r"compressed \(PackBits\) and damaged"),
-        (34925, r"compressed \(LZMA\)"),
-        (50000, r"compressed \(Zstandard\)"),
-    ],
-)
-def test_frames_that_are_compressed_with_loss_or_by_a_stranger_are_refused_by_name(
-    tmp_path, code, words
-):
+@pytest.mark.parametrize("code", [6, 7, 33003, 33005, 34712])
+def test_frames_that_are_compressed_with_loss_are_refused_by_name(tmp_path, code):
     """The tag of the last frame of a plain file says another compression."""
-    if "JPEG" not in words and importlib.util.find_spec("imagecodecs"):
-        pytest.skip("read by its package")
     path = written(tmp_path)
     with tifffile.TiffFile(path, mode="r+") as file:
         file.pages[2].tags[259].overwrite(code)
-    with pytest.raises(CaptureError, match=f"frame 2 is {words}"):
+    with pytest.raises(
+        CaptureError, match=r"frame 2 is JPEG-compressed, its noise says nothing"
+    ):
         tiff_pages.read_tiff(path)
 
 
