@@ -102,19 +102,19 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
             f"photon transfer: {len(flat)} flat frame; need two or more of one level"
         )
     offset = float(np.mean(dark)) if dark is not None else 0.0
-    floor = _pair_variance(dark) if dark is not None and len(dark) > 1 else None
-    order = np.argsort([_typical_level(frame) for frame in flat], kind="stable")
+    floor = pair_variance(dark) if dark is not None and len(dark) > 1 else None
+    order = np.argsort([typical_level(frame) for frame in flat], kind="stable")
     pairs = [
         (flat[first], flat[second])
         for first, second in zip(order[:-1:2], order[1::2], strict=False)
     ]
     mean = np.array(
         [
-            (_typical_level(first) + _typical_level(second)) / 2 - offset
+            (typical_level(first) + typical_level(second)) / 2 - offset
             for first, second in pairs
         ]
     )
-    variance = np.array([_pair_variance(np.stack(pair)) for pair in pairs])
+    variance = np.array([pair_variance(np.stack(pair)) for pair in pairs])
     if not (variance > 0).all() or not (mean > 0).all():
         raise CaptureError(
             "photon transfer: flats without noise or light; take them anew, evenly lit "
@@ -125,7 +125,7 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
         dark_part + mean * (variance - dark_part).sum() / mean.sum()
     )  # its own variance as weight would favour low variances
     has_dark = floor is not None
-    inverse, sigma, floor = _noise_line(
+    inverse, sigma, floor = fit_noise_line(
         mean, variance, expected * math.sqrt(2 / flat[0].size), floor
     )
     if inverse <= (_SIGMA_LIMIT * sigma if has_dark else 0):
@@ -255,10 +255,10 @@ def bad_pixels(capture: Capture) -> Array:
         capture: frames in counts with their stage and camera.
     """
     frames = np.asarray(capture.frames, float)
-    bad = _isolated_pixels(frames)
+    bad = isolated_pixels(frames)
     if capture.dark is not None:
         level = np.asarray(capture.dark, float).mean(0)
-        bad |= np.abs(level - np.median(level)) > 8 * max(_robust_sigma(level), 0.5)
+        bad |= np.abs(level - np.median(level)) > 8 * max(robust_sigma(level), 0.5)
     if capture.flat is not None:
         level = np.asarray(capture.flat, float).mean(0)
         bad |= ~((level > 0.3 * np.median(level)) & (level < 3 * np.median(level)))
@@ -387,7 +387,7 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
         read_noise_e = float(description["read_noise_e"])
         origin = "as stated"
     elif dark is not None and len(dark) > 1:
-        read_noise_e = gain * math.sqrt(max(_pair_variance(dark) - 1 / 12, 0.0))
+        read_noise_e = gain * math.sqrt(max(pair_variance(dark) - 1 / 12, 0.0))
         origin = f"measured in {len(dark)} dark frames"
     elif measured is not None:
         read_noise_e = measured.read_noise_e
@@ -441,21 +441,24 @@ def _flat_field(
     flat = level / np.median(level)
     noise = math.inf
     if len(capture.flat) > 1:
-        noise = math.sqrt(_pair_variance(capture.flat) / len(capture.flat)) / float(
+        noise = math.sqrt(pair_variance(capture.flat) / len(capture.flat)) / float(
             np.median(level)
         )
-    if _robust_sigma(flat) < 1.2 * noise:
+    if robust_sigma(flat) < 1.2 * noise:
         notes.append(
             "flat is a single frame, or even to within its noise: not divided by"
         )
         return np.ones((1, 1)), 0.0
-    notes.append(f"divided by the flat, {_robust_sigma(flat):.2%} robust spread")
+    notes.append(f"divided by the flat, {robust_sigma(flat):.2%} robust spread")
     return np.where((flat > 0.3) & (flat < 3), flat, 1.0), noise
 
 
-def _isolated_pixels(frames: Array) -> Array:
+def isolated_pixels(frames: Array) -> Array:
     """(y, x) True for single pixels far above all eight neighbours in most of three or
     more frames; False everywhere with fewer frames.
+
+    Args:
+        frames: (n, y, x) counts.
     """
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
@@ -464,7 +467,7 @@ def _isolated_pixels(frames: Array) -> Array:
     )
     spread = np.stack(
         [
-            np.full(frame.shape, max(_robust_sigma(frame - median), 0.5))
+            np.full(frame.shape, max(robust_sigma(frame - median), 0.5))
             for frame, median in zip(frames, neighbours, strict=True)
         ]
     )
@@ -475,19 +478,22 @@ def _isolated_pixels(frames: Array) -> Array:
     return np.asarray(spike.mean(0) > (0.8 if len(frames) >= 3 else 2))
 
 
-def _pair_variance(frames: Array) -> float:
+def pair_variance(frames: Array) -> float:
     """Temporal variance of one frame, from successive differences, robust to a few bad
     pixels.
+
+    Args:
+        frames: (k, y, x) counts at one level of light.
     """
     steps = np.diff(np.asarray(frames, float), axis=0) / math.sqrt(2)
     steps = steps - steps.mean((1, 2), keepdims=True)
-    regular = np.abs(steps) <= 6 * max(_robust_sigma(steps), 0.5)
+    regular = np.abs(steps) <= 6 * max(robust_sigma(steps), 0.5)
     return float(
         np.mean(steps[regular] ** 2) * frames[0].size / max(frames[0].size - 1, 1)
     )
 
 
-def _noise_line(
+def fit_noise_line(
     mean: Array, variance: Array, spread: Array, floor: float | None
 ) -> tuple[float, float, float]:
     """(slope, standard error, intercept) of a weighted line variance = slope mean +
@@ -514,12 +520,16 @@ def _noise_line(
     return float(slope), float(covariance[0, 0] ** 0.5), max(float(intercept), 0.0)
 
 
-def _typical_level(frame: Array) -> float:
-    """Mean of the pixels within 8 robust sigma of the median."""
-    regular = np.abs(frame - np.median(frame)) <= 8 * max(_robust_sigma(frame), 0.5)
+def typical_level(frame: Array) -> float:
+    """Mean of the pixels within 8 robust sigma of the median.
+
+    Args:
+        frame: (y, x) counts.
+    """
+    regular = np.abs(frame - np.median(frame)) <= 8 * max(robust_sigma(frame), 0.5)
     return float(frame[regular].mean())
 
 
-def _robust_sigma(values: Array) -> float:
-    """Standard deviation from the median absolute deviation."""
+def robust_sigma(values: Array) -> float:
+    """Standard deviation from the median absolute deviation of the values."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))

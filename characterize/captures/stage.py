@@ -24,14 +24,25 @@ from metalens.core.errors import CaptureError, nearest_name_hint
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _BARE = ("depth", "z", "position", "exposure")
-_POSITIONS = {
-    f"{name}_{unit}": scale for name in _BARE[:3] for unit, scale in _LENGTHS.items()
+# column of a stage table: (quantity, value of its unit in um, rad or s)
+_COLUMNS = {
+    **{
+        f"{name}_{unit}": ("position", scale)
+        for name in _BARE[:3]
+        for unit, scale in _LENGTHS.items()
+    },
+    "angle_deg": ("angle", math.pi / 180),
+    "angle_rad": ("angle", 1.0),
+    "angle_y_deg": ("angle along y", math.pi / 180),
+    "angle_y_rad": ("angle along y", 1.0),
+    "exposure_s": ("exposure", 1.0),
+    "exposure_ms": ("exposure", 1e-3),
+    "exposure_us": ("exposure", 1e-6),
+    "file": ("file", 1.0),
+    "page": ("page", 1.0),
 }
-_ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
-_EXPOSURES = {"exposure_s": 1.0, "exposure_ms": 1e-3, "exposure_us": 1e-6}
 # of a plan (metalens capture --protocol): in proportion, no times
 _PLANNED = "relative_exposure"
-_ANGLES_Y = ("angle_y_deg", "angle_y_rad")
 _ALIASES = {
     f"{name}_{unit}": (entry, scale)
     for entry, names in {
@@ -69,7 +80,6 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MICRO = str.maketrans("\u00b5\u03bc", "uu")
 _SIMILARITY = 0.75  # least similarity of a misspelt name
-_COLUMNS = {"file", "page", *_EXPOSURES, *_ANGLES_Y, *_POSITIONS, *_ANGLES}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -331,35 +341,31 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
             raise CaptureError(
                 f"{path}, row {row}: no 'file'; name the image of every row"
             )
-    head = table[0].keys()
-    for kind in (_POSITIONS, _ANGLES, _ANGLES_Y, _EXPOSURES):
-        if len(duplicates := [key for key in kind if key in head]) > 1:
+    columns: dict[str, list[str]] = {}
+    for key in table[0]:
+        columns.setdefault(_COLUMNS[key][0], []).append(key)
+    for keys in columns.values():
+        if len(keys) > 1:
             raise CaptureError(
-                f"{path}: columns {' and '.join(duplicates)} say the same; leave the "
-                "one that holds"
+                f"{path}: columns {' and '.join(keys)} say the same; leave the one "
+                "that holds"
             )
-    position_column = next((key for key in _POSITIONS if key in head), None)
-    exposure_column = next((key for key in _EXPOSURES if key in head), None)
-    angle_columns = [
-        next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)
-    ]
-    scales = [
-        _ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle_columns
-    ]
-    columns = [
-        _column(table, key, path) * scale
-        for key, scale in zip(angle_columns, scales, strict=True)
-    ]
+
+    def values_of(quantity: str, default: float) -> Array:
+        """(n,) values of a quantity in um, rad or s."""
+        if quantity not in columns:
+            return np.full(len(table), default)
+        (key,) = columns[quantity]
+        return _column(table, key, path) * _COLUMNS[key][1]
+
+    pages = values_of("page", np.nan)
     return StageRows(
-        files=tuple(str(entries["file"]) for entries in table),
-        page=_pages(table, path) if "page" in head else (None,) * len(table),
-        position_um=_column(table, position_column, path, np.nan)
-        * _POSITIONS.get(position_column or "", 1.0),
-        angle_rad=np.stack(columns, 1),
-        exposure_s=np.full(len(table), np.nan)
-        if exposure_column is None
-        else _exposures(table, exposure_column, path) * _EXPOSURES[exposure_column],
-        source=str(path),
+        tuple(str(entries["file"]) for entries in table),
+        tuple(int(page) if page == page else None for page in pages),
+        values_of("position", np.nan),
+        np.stack([values_of("angle", 0.0), values_of("angle along y", 0.0)], 1),
+        values_of("exposure", np.nan),
+        str(path),
     )
 
 
@@ -438,52 +444,25 @@ def normalize_spelling(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
-    """Page numbers of all rows; refuses fractions."""
-    pages = _column(table, "page", path)
-    for row, page in enumerate(pages, 2):
-        if page != round(page):
-            raise CaptureError(
-                f"{path}, row {row}: page is {page:g}, need a whole number from 0 on"
-            )
-    return tuple(int(page) for page in pages)
-
-
-def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
-    """(n,) exposures of all rows in the column's unit; refuses 0 and less."""
-    times = _column(table, key, path)
-    for row, time in enumerate(times, 2):
-        if time <= 0:
-            raise CaptureError(
-                f"{path}, row {row}: {key} is {time:g}, need above 0; leave the column "
-                "out if unknown"
-            )
-    return times
-
-
-def _column(
-    table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0
-) -> Array:
-    """(n,) finite numbers of a column; ``default`` everywhere where ``key`` is None."""
-    if key is None:
-        return np.full(len(table), default)
+def _column(table: list[dict[str, Any]], key: str, path: Path) -> Array:
+    """(n,) finite numbers of a column; pages are whole, exposures above 0."""
     values = []
     for row, entries in enumerate(table, 2):
+        text = entries.get(key)
+        where = f"{path}, row {row}: {key} is"
         try:
-            value = float(entries[key])
-        except (TypeError, ValueError, KeyError):
-            text = entries.get(key)
-            hint = (
-                " with a point, as 0.73"
-                if isinstance(text, str) and "," in text
-                else ""
-            )
-            raise CaptureError(
-                f"{path}, row {row}: {key} is {text!r}, need a number{hint}"
-            ) from None
+            value = float(text)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            has_comma = isinstance(text, str) and "," in text
+            hint = " with a point, as 0.73" if has_comma else ""
+            raise CaptureError(f"{where} {text!r}, need a number{hint}") from None
         if not math.isfinite(value):
+            raise CaptureError(f"{where} {value}, need a finite number")
+        if key == "page" and value != round(value):
+            raise CaptureError(f"{where} {value:g}, need a whole number from 0 on")
+        if key.startswith("exposure") and value <= 0:
             raise CaptureError(
-                f"{path}, row {row}: {key} is {value}, need a finite number"
+                f"{where} {value:g}, need above 0; leave the column out if unknown"
             )
         values.append(value)
     return np.array(values)
