@@ -54,9 +54,7 @@ def test_the_texts_themselves_are_good(tmp_path, kind):
 @given(data=st.data())
 def test_damaged_settings_are_refused_by_type(tmp_path_factory, kind, data):
     whole = bytearray(TEXTS[kind][0].encode())
-    how = data.draw(
-        st.sampled_from(["cut", "flip", "byte", "twice", "value"]), label="how"
-    )
+    how = data.draw(st.sampled_from(["cut", "flip", "byte", "twice"]), label="how")
     if how == "cut":
         whole = whole[: data.draw(st.integers(0, len(whole)), label="length")]
     elif how == "flip":
@@ -67,34 +65,8 @@ def test_damaged_settings_are_refused_by_type(tmp_path_factory, kind, data):
             data.draw(st.integers(0, len(whole)), label="at"),
             data.draw(st.integers(0, 255), label="byte"),
         )
-    elif how == "twice":
-        whole = whole + whole
     else:
-        lines = TEXTS[kind][0].splitlines()
-        at = data.draw(
-            st.sampled_from([i for i, line in enumerate(lines) if "=" in line]),
-            label="line",
-        )
-        odd = [
-            "nan",
-            "inf",
-            "-inf",
-            "-1",
-            "0",
-            "1e308",
-            "99999999999999999999",
-            '""',
-            "[]",
-            "{}",
-            "true",
-            "1979-05-27",
-        ]
-        lines[at] = (
-            lines[at].split("=")[0]
-            + "= "
-            + data.draw(st.sampled_from(odd), label="value")
-        )
-        whole = bytearray("\n".join(lines).encode())
+        whole = whole + whole
     path = tmp_path_factory.mktemp("fuzz") / "c.toml"
     path.write_bytes(bytes(whole))
     try:

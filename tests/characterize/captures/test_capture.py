@@ -113,16 +113,6 @@ def test_dark_and_flat_are_shifted_back_with_the_frames(tmp_path, stated):
     assert capture.load(tmp_path).dark[0] == pytest.approx(average / 16)
 
 
-def test_imagej_spacing_gives_the_positions(tmp_path):
-    tifffile.imwrite(
-        tmp_path / "a.tif",
-        FRAMES,
-        imagej=True,
-        metadata={"spacing": 300.0, "unit": "nm", "axes": "ZYX"},
-    )
-    assert np.allclose(capture.load(tmp_path / "a.tif").position_um, [0, 0.3, 0.6, 0.9])
-
-
 def test_wrong_bit_shift_is_refused(tmp_path):
     with pytest.raises(
         CaptureError,
@@ -242,21 +232,6 @@ def test_compressed_frames_of_another_program_are_read(tmp_path):
     """OpenCV writes LZW unless told otherwise."""
     cv2.imwrite(str(tmp_path / "a.tif"), FRAMES[0], [cv2.IMWRITE_TIFF_COMPRESSION, 5])
     assert np.array_equal(capture.load(tmp_path / "a.tif").frames, FRAMES[:1])
-
-
-def test_imagej_tags_tell_pixel_and_step(tmp_path):
-    frames = np.random.default_rng(0).integers(0, 900, (5, 20, 31), dtype=np.uint16)
-    about = {"spacing": 0.25, "unit": "um", "axes": "ZYX"}
-    tifffile.imwrite(
-        tmp_path / "a.tif",
-        frames,
-        imagej=True,
-        resolution=(1 / 0.13, 1 / 0.13),
-        metadata=about,
-    )
-    shots = capture.load(tmp_path / "a.tif")
-    assert np.allclose(shots.position_um, np.arange(5) * 0.25)
-    assert abs(shots.pixel_um - 0.13) < 1e-6
 
 
 @pytest.mark.parametrize(

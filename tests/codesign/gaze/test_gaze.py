@@ -43,18 +43,6 @@ def test_solver_inverts_the_projection(yaw, pitch, dx, dy, dz):
         assert float(gaze.angle_rad(found, direction)) < 1e-6
 
 
-def test_a_ray_that_misses_gives_the_nearest_place_and_a_finite_gradient():
-    pupil = torch.tensor(
-        [[50.0, 0.0], [0.0, 0.0]], dtype=torch.float64, requires_grad=True
-    )
-    found = gaze.optical_axis(pupil, torch.zeros(2, 3, dtype=torch.float64), GEOMETRY)
-    ray = torch.tensor([50.0, 0.0, GEOMETRY.sensor_distance_mm], dtype=torch.float64)
-    assert float((found[0] @ ray).detach()) == pytest.approx(0, abs=1e-9)
-    found.sum().backward()
-    assert torch.isfinite(pupil.grad).all()
-    assert torch.allclose(found.norm(dim=-1), torch.ones(2, dtype=torch.float64))
-
-
 def test_gradients_agree_with_finite_differences():
     pupil = torch.tensor(
         [[0.1, -1.2], [0.3, -0.9]], dtype=torch.float64, requires_grad=True
@@ -98,8 +86,10 @@ def test_pupil_on_the_sensor_by_similar_triangles():
 
 
 def test_a_missing_ray_points_to_the_place_on_the_sphere_nearest_to_it():
-    pupil = torch.tensor([[9.0, -3.0]], dtype=torch.float64)
+    pupil = torch.tensor([[9.0, -3.0]], dtype=torch.float64, requires_grad=True)
     found = gaze.optical_axis(pupil, torch.zeros(1, 3, dtype=torch.float64), GEOMETRY)
+    found.sum().backward()
+    assert torch.isfinite(pupil.grad).all()
     ray = torch.tensor([9.0, -3.0, 2.0], dtype=torch.float64)
     along = (
         torch.linspace(0, 60, 600_001, dtype=torch.float64)[:, None] * ray / ray.norm()

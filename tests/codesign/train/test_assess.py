@@ -11,6 +11,14 @@ from codesign.train import assess
 from codesign.train.assess import SensorFrames
 
 
+def frames(mask, slip):
+    """Three frames of 5 x 5 pixels in batches of two."""
+    return SensorFrames(torch.zeros(3, 1, 5, 5), mask, slip, 2, torch.zeros(3, 7, 7))
+
+
+BLANK = frames(torch.zeros(3, 5, 5), torch.zeros(3, 3))
+
+
 class Typed(torch.nn.Module):
     """Answers in the units of its scale, frame by frame."""
 
@@ -35,7 +43,7 @@ def test_answers_are_scaled_and_errors_are_means_over_frames():
     # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[0, :2], mask[0, 1:3] = (1.0, 1.0)
     logits[1, 0], mask[1, 0] = 1.0, 1.0
-    seen = SensorFrames(torch.zeros(3, 1, 5, 5), mask, truth, 2, torch.zeros(3, 7, 7))
+    seen = frames(mask, truth)
     net = Typed((truth + off) / scale, logits)
     inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0)
     got = assess.predict_frames(net, None, seen, inner)
@@ -63,18 +71,11 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
             found = super().forward(frames, architecture)
             return replace(found, depth=depth[part], slip_log_sd=log_sd[part])
 
-    seen = SensorFrames(
-        torch.zeros(3, 1, 5, 5),
-        torch.zeros(3, 5, 5),
-        torch.zeros(3, 3),
-        2,
-        torch.zeros(3, 7, 7),
-    )
     net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
     got = assess.predict_frames(
         net,
         None,
-        seen,
+        BLANK,
         SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0),
     )
     assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
@@ -89,18 +90,11 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
             axis = torch.tensor([[0.3, -0.4, 1.2]]).expand(len(frames), 3)
             return replace(found, axis=axis)
 
-    seen = SensorFrames(
-        torch.zeros(3, 1, 5, 5),
-        torch.zeros(3, 5, 5),
-        torch.zeros(3, 3),
-        2,
-        torch.zeros(3, 7, 7),
-    )
     told = [
         assess.predict_frames(
             Turned(torch.ones(3, 3), -torch.ones(3, 5, 5)),
             None,
-            seen,
+            BLANK,
             SimpleNamespace(slip_scale_mm=(1.0,) * 3, axis_weight=weight),
         ).axis
         for weight in (0.5, 0.0)

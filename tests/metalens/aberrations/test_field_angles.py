@@ -2,6 +2,7 @@
 name.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -31,34 +32,30 @@ def _place(case, angle):
     )
 
 
-@pytest.fixture(scope="module")
-def seen():
-    return {
-        case: over_field(
-            made(case), ANGLES, depth_um=CASES[case][1], frequencies=(41.0,)
-        )
-        for case in CASES
-    }
+@functools.cache
+def seen(case):
+    depth = CASES[case][1]
+    return over_field(made(case), ANGLES, depth_um=depth, frequencies=(41.0,))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_distortion_is_by_how_much_a_traced_image_is_not_linear(case, seen):
+def test_distortion_is_by_how_much_a_traced_image_is_not_linear(case):
     """Landing places of traced rays over the line through those of ± 0.02 degrees."""
     ends = [(_landing(case, a), _place(case, a)) for a in (-0.02, 0.02)]
     line = (ends[1][0] - ends[0][0]) / (ends[1][1] - ends[0][1])
     for n, angle in enumerate(ANGLES):
-        assert seen[case].chief_um[n] == pytest.approx(_landing(case, angle), abs=6e-4)
+        assert seen(case).chief_um[n] == pytest.approx(_landing(case, angle), abs=6e-4)
         if angle:
             linear = line * (_place(case, angle) - _place(case, 0.0))
             want = (_landing(case, angle) - _landing(case, 0.0)) @ linear / (
                 linear @ linear
             ) - 1
-            assert seen[case].distortion[n] == pytest.approx(want, abs=5e-5)
-    assert seen[case].distortion[1] == 0.0
+            assert seen(case).distortion[n] == pytest.approx(want, abs=5e-5)
+    assert seen(case).distortion[1] == 0.0
     if case == "plain":
-        assert np.abs(seen[case].distortion).max() < 1e-5
+        assert np.abs(seen(case).distortion).max() < 1e-5
     else:
-        assert np.abs(seen[case].distortion).max() > 1e-3
+        assert np.abs(seen(case).distortion).max() > 1e-3
 
 
 def _counted(case, angle, step_um):
@@ -90,13 +87,13 @@ def test_vignetting_is_the_share_of_counted_rays_that_miss_the_pillars(case, ang
     assert got > 0.04
 
 
-def test_without_a_stop_nothing_is_vignetted(seen):
-    assert seen["plain"].vignetting.tolist() == [0.0, 0.0, 0.0]
-    assert seen["stop"].vignetting[1] == pytest.approx(0.0, abs=1e-3)
+def test_without_a_stop_nothing_is_vignetted():
+    assert seen("plain").vignetting.tolist() == [0.0, 0.0, 0.0]
+    assert seen("stop").vignetting[1] == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("case", ["plain", "off-centre", "glass", "stop"])
-def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
+def test_illumination_is_light_by_light_of_an_even_plane(case):
     """Light of a square of the plane on every eleventh (third) pillar, cos⁴ / z² each,
     over the area of its image.
 
@@ -135,8 +132,8 @@ def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
 
     for n in (0, 2):
         want = irradiance(ANGLES[n]) / irradiance(0.0)
-        assert seen[case].illumination[n] == pytest.approx(want, abs=0.004)
-    assert seen[case].illumination[1] == pytest.approx(1.0, rel=1e-6)
+        assert seen(case).illumination[n] == pytest.approx(want, abs=0.004)
+    assert seen(case).illumination[1] == pytest.approx(1.0, rel=1e-6)
 
 
 def _across(case, angle):
