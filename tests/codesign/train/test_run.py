@@ -16,7 +16,6 @@ from codesign.network.architecture import smallest_architecture
 from codesign.train import run, search
 from codesign.train.results import finished_budgets
 from metalens.core.errors import ConfigError, TrainingError
-from tests.command_line import call
 
 TINY = """
 preset = "smoke"
@@ -195,16 +194,6 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
         net(torch.zeros(1, 1, pixels, pixels), chosen)
     # taken by slices: not counted
     assert going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS
-
-
-def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys):
-    text = TINY.replace(
-        "budgets_mmacs = [2.0]", "budgets_mmacs = [2.0]\npitch_um = 17.0"
-    )
-    (tmp_path / "run.toml").write_text(text)
-    assert call(f"codesign {tmp_path}/run.toml -o {tmp_path}/out") == 0
-    words = "run.pitch_um = 17 is finer than the samples of the image, optics.sample_um = 18"
-    assert words in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("pitch_um", [18.3, pytest.param(21.1, marks=pytest.mark.slow)])

@@ -100,32 +100,6 @@ def test_dies_are_those_that_keep_away_from_every_point_of_the_edge(wafer):
     )
 
 
-def test_a_flat_takes_a_row_and_a_notch_one_die():
-    plain = WaferSettings(
-        (5000.0, 5000.0),
-        diameter_mm=100.0,
-        edge_exclusion_mm=2.0,
-        offset_um=(0.0, 1000.0),
-    )
-    box = (-2500.0, -2500.0, 2500.0, 2500.0)
-    whole = {tuple(pair) for pair in usable_dies(plain, box).index.tolist()}
-    flat = WaferSettings(
-        (5000.0, 5000.0), flat_mm=32.5, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
-    )
-    cut = {tuple(pair) for pair in usable_dies(flat, box).index.tolist()}
-    # the chord lies sqrt(50^2 - 16.25^2) = 47.28 mm below the middle: rows that end
-    # above -45.28 mm stay
-    lowest = min(j for _, j in whole)
-    assert lowest * 5000 + 1000 - 2500 == -46500
-    assert whole - cut == {(i, j) for i, j in whole if j == lowest}
-    notch = WaferSettings(
-        (5000.0, 5000.0), notch_mm=1.6, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
-    )
-    assert whole - {tuple(pair) for pair in usable_dies(notch, box).index.tolist()} == {
-        (0, lowest)
-    }  # tip at -48.4 mm
-
-
 def test_dies_that_touch_a_mark_are_left_out():
     box = (-2000.0, -1500.0, 2000.0, 1500.0)
     free = WaferSettings((4000.0, 3000.0), diameter_mm=40.0)

@@ -3,7 +3,6 @@ out of it, a browser shows it.
 """
 
 import base64
-import dataclasses
 import json
 import re
 import shutil
@@ -108,24 +107,6 @@ def test_nothing_in_a_page_leads_out_of_it(folder):
     assert not outside
     assert _content(text)["title"] == "a & b </script><script>alert(1)</script>"
     assert "<script>alert" not in text
-
-
-def test_a_psf_tells_what_its_error_is_made_of(folder):
-    budget = {
-        row[0]: row[1] for row in artefacts.psf_panels(folder / "psf.h5")[-1].rows
-    }
-    held = psf.load(folder / "psf.h5").budget
-    assert budget["numerical"] == held.numerical
-    assert budget["outside"] == (held.outside if held.outside == held.outside else "–")
-    assert len(budget) == len(dataclasses.fields(held))
-
-
-def test_the_command_writes_a_page_once(folder, tmp_path):
-    target = tmp_path / "out.html"
-    assert (
-        view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
-    )
-    assert _content(target.read_text(encoding="utf-8"))["about"]["made with"]
 
 
 def test_a_page_goes_beside_a_report_of_the_same_name(folder, tmp_path):
