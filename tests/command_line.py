@@ -4,10 +4,14 @@ or in one of its own.
 
 import contextlib
 import io
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from metalens import cli
 
@@ -23,6 +27,11 @@ def split_words(parts: tuple[object, ...]) -> list[str]:
 def call(*parts: object) -> int:
     """Exit status of ``metalens PARTS``."""
     return cli.main(split_words(parts))
+
+
+def printed(capsys: pytest.CaptureFixture[str]) -> Any:
+    """Values that ``--json`` printed since the last look."""
+    return json.loads(capsys.readouterr().out)
 
 
 def run(*parts: object, cwd: Path | None = None) -> DONE:

@@ -345,7 +345,7 @@ def _plain_image(p, axis, radiance, depth, inner, window_um) -> np.ndarray:
     for i, v in enumerate(axis):
         waves = [p.t * plain.source_wave(p.x, p.y, front(depth[i, j]), np.array([u, v]) / REDUCED_UM, WAVE)
                  for j, u in enumerate(axis)]  # fmt: skip
-        near = np.abs(nodes - v) <= window_um / 2
+        near = abs(nodes - v) <= window_um / 2
         light = (
             np.abs(
                 plain.fields(
@@ -360,7 +360,7 @@ def _plain_image(p, axis, radiance, depth, inner, window_um) -> np.ndarray:
             )
             ** 2
         )
-        light *= np.abs(nodes - axis[:, None])[:, None] <= window_um / 2
+        light *= abs(nodes - axis[:, None])[:, None] <= window_um / 2
         total[near] += np.tensordot(radiance[i], light, 1)
     return plain.on_pixels(total, weight)
 

@@ -180,7 +180,7 @@ def picture(made: Comparison, path: Path) -> None:
     import cv2
 
     shown = np.concatenate(
-        [made.ours, made.traced, np.abs(made.ours - made.traced)], 1
+        [made.ours, made.traced, abs(made.ours - made.traced)], 1
     ).clip(0, 1) ** (1 / 1.8)
     large = (255 * shown).astype(np.uint8).repeat(3, 0).repeat(3, 1)
     done, coded = cv2.imencode(".png", large)

@@ -150,9 +150,7 @@ class Resist:
         side = keep + max(blur)
         axis = np.arange(-side, side + 1) * pixel_um
         dose = np.zeros((len(axis), len(axis)))
-        for n in np.flatnonzero(
-            np.abs(self._at - middle).max(1) < axis[-1] + self._reach
-        ):
+        for n in np.flatnonzero(abs(self._at - middle).max(1) < axis[-1] + self._reach):
             self._draw(self._drawn[n], middle, pixel_um, dose)
         image = np.zeros_like(dose)
         for (a, energy), taps in zip(self._near, blur, strict=True):

@@ -108,6 +108,6 @@ def plain_psfs(case: RandomCase) -> tuple[np.ndarray, np.ndarray]:
         for j, a in enumerate(places + cx):
             r = np.sqrt((a - px) ** 2 + (b - py) ** 2 + d**2)
             h = d / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * r)
-            out[:, i, j] = np.abs(lights @ h) ** 2 * g["pitch_um"] ** 4
+            out[:, i, j] = abs(lights @ h) ** 2 * g["pitch_um"] ** 4
     energy = out.sum((1, 2))
     return out / energy[:, None, None], energy * step**2

@@ -127,6 +127,4 @@ def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
 
 def _nearest(some, every):
     """Largest difference to every second pixel, whichever these are."""
-    return min(
-        np.abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1)
-    )
+    return min(abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1))

@@ -22,7 +22,7 @@ from metalens import lens
 from metalens.cli import main
 from metalens.core import config
 from tests.codesign import made_lens as m
-from tests.command_line import call, run
+from tests.command_line import call, printed, run
 
 DIES = """
 import os, signal, sys
@@ -203,7 +203,7 @@ def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(
         )
         == 0
     )
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     assert "no correction" in told["correction_refused"]
     assert not (folder / "open" / "bias.toml").exists()
     assert not (folder / "open" / "lens_corrected.h5").exists()
@@ -231,7 +231,7 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
     through the lens as made.
     """
     assert _shown(folder, "run", "out/nominal.safetensors", "out", out="shown") == 0
-    seen = json.loads(capsys.readouterr().out)
+    seen = printed(capsys)
     assert [row["name"] for row in seen["runs"]] == ["run", "out nominal", "out"]
     assert list(seen["lenses"].values()) == ["as designed", "as made", "as made"]
     assert (

@@ -84,7 +84,7 @@ def test_images_and_a_table_give_the_predictions_of_the_path_in_memory(device, c
         assert np.allclose(got[f"slip_{name}_mm"], slip[:, axis], atol=1e-4)
     assert np.allclose(got["pupil_error_px"], 5.0, atol=1e-3)
     assert np.allclose(got["iou"], predicted.iou.numpy(), atol=1e-3)
-    assert told["slip_error_mm"] == pytest.approx(np.abs(slip - truth).mean(), abs=1e-4)
+    assert told["slip_error_mm"] == pytest.approx(abs(slip - truth).mean(), abs=1e-4)
     target = _unit(*np.array([row[7:] for row in rows]).T)
     cosine = (_unit(got["gaze_x_deg"], got["gaze_y_deg"]) * target).sum(0)
     judged = np.isfinite(got["gaze_error_deg"])

@@ -11,7 +11,7 @@ from codesign.commands import paper as command_paper
 from codesign.evaluate import paper
 from codesign.evaluate.paper import MeasuredNumber
 from tests.codesign import made_lens as m
-from tests.command_line import call
+from tests.command_line import call, printed
 
 RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
 
@@ -120,7 +120,7 @@ def test_equal_budgets_and_equal_accuracy_of_two_runs():
 def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys):
     words = f"evaluate paper -o {tmp_path}/out"
     assert call(f"{words} --json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     assert len(told["lines"]) == len(paper.load_claims())
     assert all(line["ours"] is None for line in told["lines"])
     assert "not measured" in (tmp_path / "out" / "report.html").read_text()
@@ -138,7 +138,7 @@ def test_one_command_measures_and_compares(tmp_path, capsys):
         m.finished_run(tmp_path / name, text)
     words = f"evaluate paper {tmp_path}/a {tmp_path}/b -o {tmp_path}/out --json"
     assert call(f"{words} --subjects 2 --scenes 2") == 0
-    told = {line["key"]: line for line in json.loads(capsys.readouterr().out)["lines"]}
+    told = {line["key"]: line for line in printed(capsys)["lines"]}
     assert told["gaze_axial/ratio"]["ours"]["value"] == 1.0  # the same run twice
     assert told["scenes/slip/proposed"]["ours"]["value"] == pytest.approx(1.0)
     assert told["picture/experiment/ambiguity.png"]["picture"]

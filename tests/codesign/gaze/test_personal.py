@@ -87,7 +87,7 @@ def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
     assert error.mean() < 0.15
     assert personal.angle_deg(alone.sphere(pupil, slip), gaze).mean() < 0.25
     # kappa trades with the centre to first order
-    assert np.abs(alone.own[4:6] + np.array([5.0, 1.5])).max() < 1.5
+    assert abs(alone.own[4:6] + np.array([5.0, 1.5])).max() < 1.5
 
 
 def test_noisy_slippage_makes_the_regressor_careful():
@@ -132,5 +132,5 @@ def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
     left = -(slope @ at) / (at @ at)
     assert left > 0
     # where the search ends: 1e-4 of it
-    assert np.abs(slope + left * at).max() < 0.01 * left * np.abs(at).max()
+    assert abs(slope + left * at).max() < 0.01 * left * np.abs(at).max()
     assert np.abs(at).min() > 0.02  # none is at the mean, which would say nothing

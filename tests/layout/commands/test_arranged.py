@@ -2,7 +2,6 @@
 place, by another reader.
 """
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrar
 from metalens import lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from tests.command_line import call
+from tests.command_line import call, printed
 from tests.proxies import proxy_of
 
 SIDES = {"a": 15, "b": 10}
@@ -128,7 +127,7 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
     db = pytest.importorskip("klayout.db")
     monkeypatch.setattr(make, "KEPT", kept)
     assert run(folder, WAFER, tmp_path / "m", "--json") == 0
-    values = json.loads(capsys.readouterr().out)
+    values = printed(capsys)
     table = np.loadtxt(tmp_path / "m" / "dies.csv", delimiter=",", skiprows=1)
     dies = [(round(1000 * x), round(1000 * y)) for x, y in table[:, 3:]]
     assert len(dies) == values["dies"] > 40  # more than one of the readers keeps
@@ -232,7 +231,7 @@ def test_doses_of_lenses_and_their_surroundings_are_corrected_each(
     text = 'name = "DUO"\n[die]\nsize_um = [1500, 800]\n[[lens]]\nfile = "a.h5"\nname = "A"\n'
     text += "at = [{x_um = -40, y_um = 21}, {x_um = 60, turn_deg = 90}]\n"
     assert run(folder, text, tmp_path / "m", "--json") == 0
-    values = json.loads(capsys.readouterr().out)
+    values = printed(capsys)
     assert values["failures"] == []
     held = job_files.read_dose_table(tmp_path / "m" / "doses.csv")
     assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(

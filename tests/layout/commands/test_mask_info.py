@@ -1,7 +1,6 @@
 """``metalens info`` of a mask: its layers and shapes as another reader counts them."""
 
 import gzip
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from layout.formats import gdsii_write, oasis_write
 from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
 from metalens.cli import BAD_INPUT, SUCCESS
-from tests.command_line import call
+from tests.command_line import call, printed
 
 klayout = pytest.importorskip("klayout.db")
 
@@ -46,7 +45,7 @@ def test_shapes_of_every_layer_are_those_that_klayout_counts(
         make_plan(seed=7), path
     )
     assert call(f"info {path} --json") == SUCCESS
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     shapes, tops = counted(path)
     assert {
         number: entry["shapes"] for number, entry in told["layers"].items()
@@ -100,7 +99,7 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
     write = oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii
     write(MaskLibrary("WAFER", cells), tmp_path / f"w.{ending}")
     assert call(f"info {tmp_path}/w.{ending} --json") == SUCCESS
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     lenses = 210 * 330 * 40 * 50 + 1
     found = {number: entry["shapes"] for number, entry in told["layers"].items()}
     assert found == {"7/0": lenses * 600 * 700, "7/1": 2 * (lenses + 210 * 330 * 3)}
@@ -125,7 +124,7 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
         MaskLibrary("L", {cell.name: cell for cell in cells}), tmp_path / "w.gds"
     )
     assert call(f"info {tmp_path}/w.gds --json") == SUCCESS
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     assert told["layers"] == {"7/0": {"name": "", "shapes": 4}}
     assert sorted(told["tops"]) == ["ONE", "TWO"]
 

@@ -1,7 +1,6 @@
 """``metalens check`` says what it looked at, and agrees with KLayout's projections."""
 
 import gzip
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from layout.drc.library import check_library
 from layout.formats.reading import read_mask
 from layout.process.process import DesignRules
-from tests.command_line import call
+from tests.command_line import call, printed
 
 db = pytest.importorskip("klayout.db")
 
@@ -35,7 +34,7 @@ def write(path, layers, *, build=None):
 def run(capsys, *arguments):
     """Exit code and values of the command."""
     code = call("check", *map(str, arguments), "--json")
-    return code, json.loads(capsys.readouterr().out)
+    return code, printed(capsys)
 
 
 def box(x, y, width=300, height=200):
@@ -119,7 +118,7 @@ def test_one_top_cell_of_several_is_chosen(tmp_path, capsys):
     assert call(f"check {path} --top NONE") == 2
     assert "no cell 'NONE' in the mask; top cells: " in capsys.readouterr().err
     assert call(f"info {path} --top INNER --json") == 0
-    info = json.loads(capsys.readouterr().out)
+    info = printed(capsys)
     assert (info["tops"], info["layers"]["1/0"]["shapes"]) == (["INNER"], 1)
 
 

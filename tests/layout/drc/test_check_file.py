@@ -14,7 +14,7 @@ from layout.formats.reading import read_mask
 from layout.process import process as processes
 from layout.process.process import DesignRules
 from metalens.lens import DiameterMap
-from tests.command_line import call
+from tests.command_line import call, printed
 
 db = pytest.importorskip("klayout.db")
 
@@ -130,7 +130,7 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
         call(f"check {path} --process {process} --json --output {tmp_path}/m.lyrdb")
         == 1
     )
-    values = json.loads(capsys.readouterr().out)
+    values = printed(capsys)
     found = values["violations"]
     assert (
         found["width"]
@@ -268,7 +268,7 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
     layout.write_oasis(plan, tmp_path / "m.oas")
     planned = check_plan(plan, rules.rules)
     assert call(f"check {tmp_path}/m.oas --process {process} --json") == 1
-    found = json.loads(capsys.readouterr().out)
+    found = printed(capsys)
     assert found["violations"]["width"] == planned.counts["width"] > 20
     assert found["violations"]["space"] == planned.counts["space"] == 0
     assert found["minimum_width_nm"] == pytest.approx(planned.minimum_width_nm)

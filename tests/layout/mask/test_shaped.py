@@ -200,7 +200,7 @@ def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, sh
             round(1e3 * d.y_um[row] + plan.axis[1]),
         )
         want = 1e3 * np.array([size[row, column], length[row, column]])
-        assert np.abs(placed[at] - want).max() <= grid
+        assert abs(placed[at] - want).max() <= grid
     wide = np.array(
         [c.outline for c in plan.classes if c.name.startswith("D")], dtype=object
     )
@@ -216,9 +216,7 @@ def test_pillars_of_a_hexagonal_lattice_stand_on_it(tmp_path, suffix):
     axis = np.array(plan.axis)  # it may lie half a step off the grid
     want = np.stack([1e3 * d.x_um[columns], 1e3 * d.y_um[rows]], 1) + axis
     got = np.array([(x, y) for x, y, _ in found], float)
-    assert (
-        np.abs(got[np.lexsort(got.T)] - want[np.lexsort(np.rint(want).T)]).max() < 1e-6
-    )
+    assert abs(got[np.lexsort(got.T)] - want[np.lexsort(np.rint(want).T)]).max() < 1e-6
     apart = np.hypot(*(got[:, None] - got).T)
     # hypot(168, 291) = 336.01
     assert np.sort(apart[apart > 0])[0] == pytest.approx(336, abs=0.02)
@@ -305,14 +303,14 @@ def test_edges_of_a_lone_pillar_of_any_shape_move_by_what_it_lacks(shape):
     among, lone = kinds[number[15, 8]], kinds[number[15, 28]]
     spread = np.ptp(lone.outline, axis=0) - np.ptp(among.outline, axis=0)
     # corners on a grid of 1 nm on both sides, both of the same design
-    assert np.abs(spread - 14).max() <= 1
+    assert abs(spread - 14).max() <= 1
     edge = kinds[number[15, 21]]  # at a straight rim
     lost = sum(math.exp(-((0.4 * i / 0.6) ** 2)) for i in range(1, 9))
     share = lost * (1 + 2 * lost) / ((1 + 2 * lost) ** 2 - 1)
     # a step of 2 nm; the other side 1.4 of half a step
     assert abs(edge.diameter_nm - 200 - 14 * share) <= 1.01
     assert (
-        np.abs(
+        abs(
             np.ptp(edge.outline, axis=0) - np.ptp(among.outline, axis=0) - 14 * share
         ).max()
         <= 3
@@ -365,7 +363,7 @@ def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
         if a
     }:
         assert (
-            np.abs(
+            abs(
                 np.ptp(kinds[now].outline, axis=0)
                 - np.ptp(before[was].outline, axis=0)
                 - 20

@@ -128,7 +128,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
         process.layers.marks[0],
         process.layers.labels[0],
     }
-    assert np.abs(found.exposure - 1).max() < 0.01
+    assert abs(found.exposure - 1).max() < 0.01
     assert 2 * np.abs(found.shift_nm).max() < 1
     rng = np.random.default_rng(4)
     each = [
@@ -136,7 +136,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
         for layer in sorted(set(found.layer.tolist()))
     ]
     picked = np.concatenate([rng.choice(some, 4, replace=False) for some in each])
-    worst = np.argsort(-np.abs(found.exposure - 1))[:3]
+    worst = np.argsort(-abs(found.exposure - 1))[:3]
     around = np.array([(s.corners.min(0) - 0.1, s.corners.max(0) + 0.1) for s in drawn])
     for n in [*picked.tolist(), *worst.tolist()]:
         at = np.array([found.x_um[n], found.y_um[n]])

@@ -2,7 +2,6 @@
 known pillar.
 """
 
-import json
 import math
 
 import numpy as np
@@ -14,7 +13,7 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import PropagationError, SceneError
 from metalens.library import GeometricPhase
-from tests.command_line import call
+from tests.command_line import call, printed
 from tests.proxies import proxy_of
 from tests.referees.turned_pillar import isolated
 
@@ -88,14 +87,14 @@ def test_design_and_psf_of_either_hand(folder, capsys, hand):
     assert (
         call(f"design {folder}/{hand}.toml -o {target} --json --skip-focus-check") == 0
     )
-    found = json.loads(capsys.readouterr().out)
+    found = printed(capsys)
     assert found["circular"]["hand"] == hand
     assert found["circular"]["converted"] == pytest.approx(abs(T_X - T_Y) ** 2 / 4)
     assert found["circular"]["isolated_error"] == pytest.approx(0, abs=1e-9)
     assert lenses.load(target).hand == hand
     out = folder / f"psf_{hand}.h5"
     assert call(f"psf {target} --config {folder}/psf.toml -o {out} --json") == 0
-    assert json.loads(capsys.readouterr().out)["converged"]
+    assert printed(capsys)["converged"]
 
 
 def test_the_image_is_that_of_the_converted_light(folder):

@@ -13,7 +13,7 @@ from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.library import ProxyTolerances
 from metalens.library.record import DEFAULT_CELL
-from tests.command_line import call
+from tests.command_line import call, printed
 
 QUICK = """
 [cell]
@@ -44,7 +44,7 @@ def files(folder):
 
 def test_library_with_proxy_and_figure(cell, tmp_path, capsys):
     assert cell(QUICK, "--json") == 0
-    values = json.loads(capsys.readouterr().out)
+    values = printed(capsys)
     assert values["turns"] >= 1
     assert values["max_error"] <= 1e-2
     assert values["max_phase_error_rad"] <= 1e-3  # the default phase_tolerance_rad
@@ -127,7 +127,7 @@ def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(
     unless 1e-2 was asked for.
     """
     d = np.linspace(0.12, 0.2, 40)
-    bars = np.where(np.abs(d - 0.13) < 3e-3, 0.05, 0.012)
+    bars = np.where(abs(d - 0.13) < 3e-3, 0.05, 0.012)
     monkeypatch.setattr(library, "sweep", known_within(d, bars))
     assert cell(SQUARES, "--accept-partial-turn") == 0
     told = capsys.readouterr().out
@@ -207,7 +207,7 @@ def test_study(tmp_path, capsys):
     path.write_text(STUDY)
     out = tmp_path / "study"
     assert call(f"study {path} -o {out} --json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = printed(capsys)
     assert (told["pitch_um"], told["cells"]) == (0.3, 1)  # no other material is tried
     assert files(out) == ["cell_study.json", "cell_study.png", "manifest.json"]
     assert call(f"study {path} -o {out}") == 2

@@ -20,7 +20,7 @@ def read(path, pitch=STEP, **settings):
 
 
 def phasor_error(samples, phase):
-    return np.abs(np.exp(1j * samples.phase_rad) - np.exp(1j * phase)).max()
+    return abs(np.exp(1j * samples.phase_rad) - np.exp(1j * phase)).max()
 
 
 def test_levels_of_8_bits_are_refused_as_radians_and_read_as_stated(tmp_path):

@@ -267,7 +267,7 @@ def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
         assert (off[far] < abs(charge) * 0.25**2 / radius[far] ** 2 + 5e-3).all()
         samples_near = phase[np.hypot(x - x0, x[:, None] - y0) < 1.0]
         turns = (found[radius < 0.4, None] - samples_near) / (2 * np.pi)
-        assert (np.abs(turns - np.rint(turns)).min(1) < 0.1).all()
+        assert (abs(turns - np.rint(turns)).min(1) < 0.1).all()
 
 
 def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():

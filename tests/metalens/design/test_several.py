@@ -98,10 +98,10 @@ def test_no_other_diameter_and_no_other_piston_lowers_the_sum_over_wavelengths(t
     # the best for these pillars
     pistons = np.angle((t * np.exp(-1j * np.array(phases))).sum(1))
     goal = np.exp(1j * (np.array(phases) + pistons[:, None]))
-    found = weights @ np.abs(t - goal) ** 2
+    found = weights @ abs(t - goal) ** 2
     every = answers(np.linspace(*SPAN, 20_001), ACHROMATIC)
     least = np.array(
-        [(weights @ np.abs(every - one[:, None]) ** 2).min() for one in goal.T]
+        [(weights @ abs(every - one[:, None]) ** 2).min() for one in goal.T]
     )
     # pistons settled to 1e-3 rad: 1e-3 times the slope of a sum, about 2
     assert (found - least).max() < 2e-3

@@ -54,7 +54,7 @@ def test_one_bar_above_the_tolerance_is_enough_to_miss_it(made):
 
 
 def test_energy_is_conserved_within_the_error_bars(made):
-    assert np.abs(made.energy - 1).max() < 2 * COARSE.tolerance
+    assert abs(made.energy - 1).max() < 2 * COARSE.tolerance
 
 
 def test_axes_and_record(made):

@@ -31,11 +31,10 @@ def test_value_and_slope(power, shape):
     d = np.random.default_rng(0).uniform(LOW, HIGH, shape)
     p = polynomial.chebyshev_curve(COEFFICIENTS, (LOW, HIGH), power)
     # monomials up to 40: 40 eps
-    assert np.abs(polynomial.evaluate_curve(p, d) - reference(d, power)).max() < 1e-12
+    assert abs(polynomial.evaluate_curve(p, d) - reference(d, power)).max() < 1e-12
     step = np.imag(reference(d + 1e-30j, power)) / 1e-30
     assert (
-        np.abs(polynomial.evaluate_slope(p, d) - step).max()
-        < 1e-12 * np.abs(step).max()
+        abs(polynomial.evaluate_slope(p, d) - step).max() < 1e-12 * np.abs(step).max()
     )  # monomials of the slope up to 300
 
 

@@ -37,7 +37,7 @@ def test_one_pillar_is_a_spherical_wavelet():
         * np.exp(1j * K * r)
     )
     # source phase is 0 at the lens centre
-    assert np.abs(field - want).max() < 1e-13 * np.abs(want).max()
+    assert abs(field - want).max() < 1e-13 * np.abs(want).max()
 
 
 def test_sum_agrees_with_a_plain_loop_off_axis():
@@ -68,7 +68,7 @@ def test_sum_agrees_with_a_plain_loop_off_axis():
                 * np.exp(1j * K * r)
             )
     # rounding of paths of 1e4 rad: 1e-12
-    assert np.abs(got[0] - want).max() < 1e-12 * np.abs(want).max()
+    assert abs(got[0] - want).max() < 1e-12 * np.abs(want).max()
 
 
 def test_circular_aperture_has_the_closed_form_on_its_axis():

@@ -2,7 +2,6 @@
 Rayleigh-Sommerfeld sums written here.
 """
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy import special
 
 from metalens import design, lens, psf
 from metalens.cell.record import Cell
-from tests.command_line import call
+from tests.command_line import call, printed
 from tests.proxies import proxy_of
 
 WAVE, PITCH, FOCAL, LEVEL = 0.78, 0.37, 210.0, 0.86
@@ -132,7 +131,7 @@ def test_figures_of_a_defocused_lens_are_those_of_a_plain_sum():
     # all pillars in phase on the axis
     d, k, z = made.diameters, 2 * np.pi / WAVE, made.sensor_distance_um
     r = np.sqrt(d.x_um**2 + d.y_um[:, None] ** 2 + z**2)[there]
-    level = (PITCH**2 * LEVEL * z / (2 * np.pi * r**2) * np.abs(1 / r - 1j * k)).sum()
+    level = (PITCH**2 * LEVEL * z / (2 * np.pi * r**2) * abs(1 / r - 1j * k)).sum()
     assert found.strehl == pytest.approx(mean[0] / level**2, rel=3e-3)
 
 
@@ -155,7 +154,7 @@ def test_a_lens_for_collimated_light_is_looked_at_from_infinity(saved, capsys):
     """
     folder = saved()
     assert run(folder, "--json") == 0
-    said = json.loads(capsys.readouterr().out)
+    said = printed(capsys)
     assert said["depths_um"] == [None]
     assert said["angles_rad"][0] == [0, 0]
     axis, rim = said["focus"]
@@ -187,7 +186,7 @@ def test_planes_behind_the_lens_are_those_of_a_plain_sum():
 def test_a_window_without_light_ends_1_and_says_where_the_rays_meet(saved, capsys):
     folder = saved(aside_um=48.0)
     assert run(folder, "--json", "--window-um", "40", "--angles-deg", "0") == 1
-    said = json.loads(capsys.readouterr().out)
+    said = printed(capsys)
     # rays are those of the nearest pillars, up to half a pitch of a radius of 33 um off
     assert said["rays_meet_um"] == pytest.approx([48.0, 0.0, FOCAL], rel=3e-3, abs=0.02)
     assert "(+48" in said["failures"][0]
@@ -202,7 +201,7 @@ def test_a_window_without_light_ends_1_and_says_where_the_rays_meet(saved, capsy
         "--force",
     ]
     assert run(folder, "--json", *there) == 0
-    focus = json.loads(capsys.readouterr().out)["focus"][0]
+    focus = printed(capsys)["focus"][0]
     assert focus["window_share"] > 0.9
     assert focus["efficiency"] == pytest.approx(LEVEL**2 * 0.855, rel=0.03)
 

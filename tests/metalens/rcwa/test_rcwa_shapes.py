@@ -41,7 +41,7 @@ def test_round_pillar_by_the_general_way_agrees_with_the_modal_method():
     want = modal.solve(Cell(0.35, **ABOUT), 0.2, WAVE, tolerance=1e-4)
     got = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, harmonics=12)
     for found, exact in ((got.t, want.t), (got.r, want.r)):
-        assert np.abs(found - exact * np.eye(2)).max() < got.t_error + want.t_error
+        assert abs(found - exact * np.eye(2)).max() < got.t_error + want.t_error
     assert got.t_error < 2e-2
 
 
@@ -71,7 +71,7 @@ def test_many_sides_are_a_circle_of_equal_area():
         Cell(0.35, **ABOUT, shape=RegularPolygon(48)), 0.2 * swell, WAVE, harmonics=6
     )
     # of second order in the 1.3 % by which corners stand out
-    assert np.abs(circle.t - polygon.t).max() < 1e-3
+    assert abs(circle.t - polygon.t).max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -84,9 +84,9 @@ def test_a_quarter_turn_exchanges_x_and_y(shape):
     )
     first = rcwa.jones(Cell(0.35, **ABOUT, shape=shape), 0.25, WAVE, harmonics=5)
     second = rcwa.jones(Cell(0.35, **ABOUT, shape=turned), 0.25, WAVE, harmonics=5)
-    assert np.abs(second.t - swap(first.t)).max() < 1e-9
-    assert np.abs(second.r - swap(first.r)).max() < 1e-9
-    assert np.abs(first.t[0, 0] - first.t[1, 1]) > 1e-2  # they do differ
+    assert abs(second.t - swap(first.t)).max() < 1e-9
+    assert abs(second.r - swap(first.r)).max() < 1e-9
+    assert abs(first.t[0, 0] - first.t[1, 1]) > 1e-2  # they do differ
 
 
 def test_one_truncation_alone_is_told_as_knowing_nothing():
@@ -115,8 +115,8 @@ def test_a_ring_with_thin_walls_lies_within_its_bar():
     found, finer = (
         rcwa.jones(cell, 0.267746, 0.85, harmonics=count) for count in (13, 20)
     )
-    assert np.abs(found.t - finer.t).max() + 1.1e-4 < found.t_error
-    assert np.abs(found.r - finer.r).max() + 1.1e-4 < found.t_error
+    assert abs(found.t - finer.t).max() + 1.1e-4 < found.t_error
+    assert abs(found.r - finer.r).max() + 1.1e-4 < found.t_error
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 0.11])
@@ -128,7 +128,7 @@ def test_lossless_cells_keep_the_power_whatever_their_symmetry(shape, angle_rad)
     got = rcwa.jones(
         cell, 0.25, WAVE, angle_rad=angle_rad, azimuth_rad=0.7, harmonics=4
     )
-    assert np.abs(got.energy - 1).max() < 1e-10
+    assert abs(got.energy - 1).max() < 1e-10
     assert abs(got.t[0, 1]) > 1e-3
 
 
@@ -172,7 +172,7 @@ def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
         Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=5
     )
     cut = Cell(0.35, **ABOUT, shape=Rectangle(0.5), layers=(Layer(0.2), Layer(0.3)))
-    assert np.abs(rcwa.jones(cut, 0.25, WAVE, harmonics=5).t - whole.t).max() < 1e-10
+    assert abs(rcwa.jones(cut, 0.25, WAVE, harmonics=5).t - whole.t).max() < 1e-10
     same = Cell(
         0.35,
         **ABOUT,
@@ -180,14 +180,14 @@ def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
         layers=(Layer(0.5, grow_um=-0.02, coat_um=0.01, coat=Index(2.6)),),
     )
     # normals of the inner wall differ
-    assert np.abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
+    assert abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
 
 
 def test_a_hole_is_the_pillar_with_materials_exchanged():
     hole = Cell(0.35, **ABOUT, shape=Circle(hole=True))
     swapped = Cell(0.35, **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}))
     one, other = (rcwa.jones(c, 0.2, WAVE, harmonics=5) for c in (hole, swapped))
-    assert np.abs(one.t - other.t).max() < 1e-12
+    assert abs(one.t - other.t).max() < 1e-12
 
 
 def test_solve_gives_the_diagonal_and_refuses_what_touches():
@@ -252,6 +252,6 @@ def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():
         area += 0.4 * (contrast * wide * deep + contrast / 2 * rim)
         want = np.exp(2j * np.pi / 0.633 * (n * 0.58 + area / pitch**2 / (2 * n)))
         got = rcwa.jones(cell, size, 0.633, harmonics=4)
-        off.append(np.abs(got.t - want * np.eye(2)).max())
+        off.append(abs(got.t - want * np.eye(2)).max())
     assert off[0] < 3e-3
     assert off[1] == pytest.approx(off[0] / 4, rel=0.2)
