@@ -33,7 +33,6 @@ from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import CaptureError, ConfigError, FitError
-from metalens.fabrication import SolvedResponse
 from metalens.psf.lens_psfs import View
 from tests.command_line import call
 
@@ -262,20 +261,6 @@ def test_saved_result_comes_back(fitted, tmp_path):
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
-def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
-    rng = np.random.default_rng(3)
-    powers = rng.normal(size=(3, 4, 7)) + 1j * rng.normal(size=(3, 4, 7))
-    solved = SolvedResponse(0.8471, np.linspace(0.071, 0.233, 7), powers)
-    built = dataclasses.replace(
-        fitted, response=dataclasses.replace(fitted.response, solved=solved)
-    )
-    built.save(tmp_path / "asbuilt.h5")
-    read = AsBuilt.load(tmp_path / "asbuilt.h5").response.solved
-    assert read.wavelength_um == 0.8471
-    assert np.array_equal(read.diameter_um, solved.diameter_um)
-    assert np.array_equal(read.powers, powers)
-
-
 def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
     """The PSFs of a file are those of the fit, and of the hidden lens; a draw of the
     posterior gives others.
@@ -359,27 +344,6 @@ def test_samples_have_the_posterior_covariance_but_for_what_bounds_cut_off(fitte
     ).mean() > 0.5
 
 
-def test_as_built_lens_goes_through_the_psf_engine(fitted):
-    lens = fitted.lens()
-    grown = lens.diameters.diameter_um - b.lens().diameters.diameter_um
-    inside = b.lens().diameters.diameter_um > 0
-    assert (
-        abs(grown[inside].mean() * 1e3 - fitted.value[fitted.names.index("bias_nm")])
-        < 1.0
-    )
-    stack = psf.psf_stack(
-        lens.phase_rad(),
-        lens.transmission(),
-        pitch_um=0.4,
-        wavelength_um=lens.wavelength_um,
-        sensor_distance_um=lens.sensor_distance_um,
-        depths_um=[600.0],
-        window_um=24.0,
-        samples=48,
-    )
-    assert abs(stack.intensity.sum() - 1) < 1e-6
-
-
 def test_captures_of_another_lens_are_refused():
     random = np.random.default_rng(0)
     other = np.zeros((5, 16, 16))
@@ -401,11 +365,6 @@ def test_missing_numbers_are_refused(change, words):
     shots = dataclasses.replace(b.capture(b.electrons()), **change)
     with pytest.raises(CaptureError, match=words):
         characterize.fit(shots, b.lens(), USUAL, response=b.RESPONSE)
-
-
-def test_unknown_parameters_name_the_nearest():
-    with pytest.raises(ConfigError, match="did you mean 'height_nm'"):
-        KnownValue("heigth_nm", 0.0)
 
 
 def test_what_is_never_fitted_is_stated_by_its_size_alone():

@@ -317,23 +317,6 @@ def test_edges_of_a_lone_pillar_of_any_shape_move_by_what_it_lacks(shape):
     )
 
 
-def test_a_round_pillar_of_a_hexagonal_lattice_lacks_what_is_missing_of_that_lattice():
-    """Half the places of the map hold no site: a pillar with all its neighbours must
-    not count as half alone.
-    """
-    size = np.full((31, 41), 0.16)
-    size[(np.arange(31)[:, None] + np.arange(41)) % 2 == 1] = 0
-    size[:, 30:] = 0
-    size[15, 39] = 0.16
-    source = hexagonal()
-    made = dataclasses.replace(
-        source, diameters=dataclasses.replace(source.diameters, diameter_um=size)
-    )
-    number, kinds = drawn_of(made, LONE)
-    assert kinds[number[15, 15]].diameter_nm == 160
-    assert kinds[number[15, 39]].diameter_nm == 174
-
-
 def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
     there = np.zeros((9, 12), bool)
     axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
