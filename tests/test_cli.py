@@ -124,26 +124,23 @@ def test_info_shows_kind_and_provenance(tmp_path):
     assert values["arrays"]["image"] == "float64 (20, 20)"
 
 
-# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.06 mm,
-# a network that hardly trains.
+# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.02 mm
+# that nobody measures (tests/golden does), and a network that hardly trains.
 CHAIN = {
-    name: small.SETTINGS[name] for name in ("run.toml", "metrology.toml", "chain.toml")
-} | {
+    "run.toml": small.SETTINGS["run.toml"],
     "psf.toml": """
         depths_mm = [18.0, 23.0, 5.0]
         angles_deg = [4.0]
         samples = 24
         tolerance = 0.01
     """,
-    "truth.toml": """
-        depths_um = [2500.0, 4500.0, 15000.0]
-        peak_e = 6000.0
-        camera = { pixel_um = 2.0, pixels = 24 }
-        parameter = [
-            { name = "bias_nm", value = 5.0 },
-            { name = "distance_um", value = 12.0 },
-            { name = "crosstalk_px", value = 0.02 },
-        ]
+    "chain.toml": """
+        cell = "cell.toml"
+        design = "design.toml"
+        process = "process.toml"
+        psf = "psf.toml"
+        run = "run.toml"
+        budget = false
     """,
 }
 
