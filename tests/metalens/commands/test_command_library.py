@@ -244,9 +244,8 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
     process.write_text(
         "[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n"
     )
-    assert (
-        call(f"study {path} --process {process} -o {out} --json") == 1
-    )  # a stretch this short
+    # a stretch this short
+    assert call(f"study {path} --process {process} -o {out} --json") == 1
     found = json.loads((out / "cell_study.json").read_text())
     assert found["study"]["min_diameter_um"] >= 0.31
     # 0.24 between drawn polygons, whose flats lie inside the circle
