@@ -17,7 +17,7 @@ from characterize.bench import (
 from characterize.commands.capture_options import Options
 from characterize.model import log_response_slopes
 from metalens import lens as lenses
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.errors import ConfigError
 from metalens.lens import Lens
 
@@ -114,9 +114,7 @@ def _shoot(options: Options, path: Path) -> int:
     target = options.output
     truth = config.load(path, HiddenLens)
     design = lenses.load(options.lens)
-    frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
-    room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
-    with options.claim_folder(target, room=room) as draft, options.shared():
+    with options.claim_folder(target) as draft, options.shared():
         simulated = bench.simulate_frames(
             design,
             truth,

@@ -20,7 +20,7 @@ from characterize.inference import FitOptions as FitOptions
 from characterize.model import KnownValue
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save_pupil
 from metalens import lens as lenses
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.errors import ConfigError
 
 # endings of the files of a correction
@@ -91,9 +91,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     present_bias = next_mask.present_bias(options.process)
     provenance = _provenance(options, design)
     with options.claim(
-        target,
-        companions=report.BESIDE + (NEXT_MASK if options.next_mask else ()),
-        room=transaction.ROOM + capture.frames.nbytes,
+        target, companions=report.BESIDE + (NEXT_MASK if options.next_mask else ())
     ) as draft:
         result = dataclasses.replace(fit(capture, lens, choice), provenance=provenance)
         asbuilt.save(draft.path, result)
@@ -127,9 +125,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     capture = captures.load(options.capture)
     provenance = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
-    with options.claim(
-        target, companions=report.BESIDE, room=transaction.ROOM + capture.frames.nbytes
-    ) as draft:
+    with options.claim(target, companions=report.BESIDE) as draft:
         pupil_fit = fit_pupil(capture, spec, insist=options.insist)
         save_pupil(draft.path, pupil_fit, provenance)
         report.pupil_report(draft.path.with_suffix(".html"), pupil_fit)

@@ -21,7 +21,7 @@ from codesign.eye import (
 )
 from codesign.settings import LEAST, check_ranges
 from metalens import lens as lenses
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.errors import ConfigError
 from metalens.core.store import Provenance
 
@@ -109,9 +109,7 @@ def run(options: Options) -> int:
         )
     lens = lenses.load(options.lens) if options.lens else None
     folder, failures = options.output, list[str]()
-    with options.claim_folder(
-        folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
-    ) as draft:
+    with options.claim_folder(folder) as draft:
         _render_and_write(settings, draft.path)
         values: dict[str, object] = {"frames": settings.frames, "folder": str(folder)}
         summary = f"{settings.frames} frames: {folder}/sheet.png"

@@ -3,7 +3,6 @@ verified, with its companions.
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +34,7 @@ from layout.verify.exposure import verify_exposure
 from layout.verify.report import ExposureReport
 from layout.verify.written_lens import LensRows
 from metalens import lens as lenses
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.units import nm
 from metalens.lens import Lens
@@ -87,7 +86,6 @@ def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnL
             if options.process is None
             else processes.load_process(options.process)
         )
-        transaction.check_room(options.output, _room(options, source))
     with stages("classes"):
         mask = build.draw_mask(source, process, name=options.name, furniture=furniture)
     return DrawnLens(options, source, process, mask, stages)
@@ -149,18 +147,6 @@ def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> Lay
         drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
     return LayoutJob(
         drawing.options, source, process, mask, dose, write_fields, plan, drc, stages
-    )
-
-
-def _room(options: Options, source: Lens) -> int:
-    """Bytes that the mask files need: a reference of GDSII for each pillar, of OASIS a
-    byte for each site at most.
-    """
-    small = math.prod(source.diameters.diameter_um.shape)
-    return (
-        gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small
-        if options.writes_gds
-        else small
     )
 
 

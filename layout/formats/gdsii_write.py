@@ -35,7 +35,6 @@ from metalens.core.errors import ProcessError
 _BLOCK = 1 << 19
 _FLUSHED = 16  # pieces after which the disk is given what was written
 _AT_ONCE = 1 << 18  # references
-REFERENCE_BYTES = 28  # of each pillar: a reference to a cell of a four-letter name
 MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
 
 

@@ -48,7 +48,6 @@ class CommonOptions:
         *,
         companions: Sequence[str] = (),
         inputs: Sequence[Path] = (),
-        room: int = transaction.ROOM,
     ) -> contextlib.AbstractContextManager[OutputDraft]:
         """Context that claims a file and its companions before the work.
 
@@ -58,17 +57,16 @@ class CommonOptions:
             target: file to write.
             companions: endings of the companions, as ``_xz.png``.
             inputs: files that are read, in addition to those that the options name.
-            room: bytes that the output needs.
 
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_file`.
         """
         return transaction.claim_file(
-            target, companions=companions, terms=self._terms(inputs, room)
+            target, companions=companions, terms=self._terms(inputs)
         )
 
     def claim_folder(
-        self, target: Path, *, inputs: Sequence[Path] = (), room: int = transaction.ROOM
+        self, target: Path, *, inputs: Sequence[Path] = ()
     ) -> contextlib.AbstractContextManager[OutputDraft]:
         """Context that claims a folder before the work.
 
@@ -77,12 +75,11 @@ class CommonOptions:
         Args:
             target: folder to write.
             inputs: files that are read, in addition to those that the options name.
-            room: bytes that the output needs.
 
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_folder`.
         """
-        return transaction.claim_folder(target, terms=self._terms(inputs, room))
+        return transaction.claim_folder(target, terms=self._terms(inputs))
 
     def claim_work(
         self,
@@ -104,13 +101,13 @@ class CommonOptions:
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_long_work`.
         """
-        terms = dataclasses.replace(self._terms((), transaction.ROOM), parents=True)
+        terms = dataclasses.replace(self._terms(), parents=True)
         return transaction.claim_long_work(
             target, keep=keep, resume=resume, grow=grow, terms=terms
         )
 
-    def _terms(self, inputs: Sequence[Path], room: int) -> ClaimTerms:
-        return ClaimTerms(force=self.force, inputs=(*self._paths(), *inputs), room=room)
+    def _terms(self, inputs: Sequence[Path] = ()) -> ClaimTerms:
+        return ClaimTerms(force=self.force, inputs=(*self._paths(), *inputs))
 
     def _paths(self) -> Iterator[Path]:
         """Every path among the options that is read."""

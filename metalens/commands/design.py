@@ -15,7 +15,7 @@ from metalens import design, lens, library
 from metalens.cell import Cell, describe_order_loss
 from metalens.cli import load_above
 from metalens.commands.common import CommonOptions, Output
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.errors import ConfigError
 from metalens.core.report import CommandConsole
 from metalens.core.store import write_bytes
@@ -345,8 +345,6 @@ def _design_one_size(settings: DesignSettings, options: Options) -> _Outcome:
     cell = pillars.cell
     proxy = library.proxy_of(pillars)
     folder = options.config.parent
-    sites = int(math.pi * (1e3 * settings.aperture_mm / cell.pitch_um) ** 2)
-    transaction.check_room(options.output, sites)  # 4 bytes each
     settings = settings.at(proxy.wavelengths_um)
     proxy.at(settings.focus.wavelength_um)  # refused here, not after the search
     settings = _fill_limits(settings, options, cell, inputs)

@@ -9,7 +9,6 @@ import tyro
 
 from metalens import lens
 from metalens.commands.common import CommonOptions, Output
-from metalens.core import transaction
 from metalens.core.errors import LensError
 from metalens.lens import export
 
@@ -46,11 +45,6 @@ def run(options: Options) -> int:
         )
     with options.claim(options.output) as draft:
         device = lens.load(options.lens)
-        grid = options.output.suffix.lower() == export.GRID
-        rows, columns = device.diameters.diameter_um.shape
-        transaction.check_room(
-            options.output, 12 * options.samples**2 if grid else 4 * rows * columns
-        )
         error = export.export_lens(draft.path, device, samples=options.samples)
     values = {
         "file": options.output.name,

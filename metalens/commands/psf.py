@@ -18,7 +18,7 @@ from metalens.cell import describe_order_loss
 from metalens.commands import far_field
 from metalens.commands.common import CommonOptions, MaybeOutput
 from metalens.commands.design import format_place
-from metalens.core import config, store, transaction
+from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import Figure, KeyFigure, Section, summary_table, write_report
@@ -453,17 +453,8 @@ def run(options: Options) -> int:
     if settings.layers is not None:
         device = replace(device, layers=settings.layers)
     settings = settings.about(device, None if built is None else built.angle_rad)
-    view = settings.view
-    pixels = (
-        len(view.depths_um)
-        * len(view.angles_rad)
-        * settings.samples
-        * settings.samples_y
-    )
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
-    with options.claim(
-        target, companions=ends, room=transaction.ROOM + 4 * pixels
-    ) as draft:
+    with options.claim(target, companions=ends) as draft:
         computed = _compute(options.lens, settings, device, built)
         _write(draft.path, computed, page=options.report)
     failures = [
@@ -497,11 +488,7 @@ def _run_far_field(options: Options) -> int:
     device = lens.load(options.lens)
     request = far_field.far_field_request(options, device)
     inputs = {options.lens.name: store.sha256(options.lens)}
-    with options.claim(
-        target,
-        companions=("_far.png", ".html"),
-        room=transaction.ROOM + 4 * request.samples**2,
-    ) as draft:
+    with options.claim(target, companions=("_far.png", ".html")) as draft:
         fields = far_field.compute_far_fields(device, request)
         far_field.save_far_fields(
             draft.path, request, fields, inputs=inputs, page=options.report

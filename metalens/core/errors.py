@@ -33,8 +33,8 @@ class StoreError(MetalensError):
 
 
 class OutputError(MetalensError):
-    """An output cannot be written where it is asked for: taken, an input too, no room,
-    or being written by another.
+    """An output cannot be written where it is asked for: taken, an input too, or
+    being written by another.
     """
 
 

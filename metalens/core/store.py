@@ -33,7 +33,6 @@ COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
 # HDF5 versions (least, most): every block of metadata carries a checksum
 _FORMAT = ("v110", "v110")
 _UNITS = "um, rad"
-_MOST_BYTES = 1 << 36  # of all arrays of a file together
 # largest array in bytes that is stored in its header, under the header's checksum
 _SMALL = 4096
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
@@ -411,8 +410,13 @@ def _read(
             f"{path} holds {stored_kind!r} version {number}, need {kind!r} version {version}; "
             "make it again with this release or give another file"
         )
-    data_sets = _list_data_sets(path, file)
-    arrays = {name: item[...] for name, item in data_sets if name not in without}
+    names: list[str] = []
+    file.visit(names.append)
+    items = {name: file[name] for name in names}
+    sets = {n: item for n, item in items.items() if isinstance(item, h5py.Dataset)}
+    for name, item in sets.items():  # before any is read
+        check_claim(path, item, name)
+    arrays = {name: item[...] for name, item in sets.items() if name not in without}
     stated = file["provenance"].attrs
     inputs, versions = (
         {name: str(_plain(text)) for name, text in file[part].attrs.items()}
@@ -423,28 +427,6 @@ def _read(
     )
     entries = _Entries(path, arrays), _Entries(path, header)
     return StoredArtefact(stored_kind, number, *entries, provenance)
-
-
-def _list_data_sets(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
-    """(name, data set) of all data sets of a file.
-
-    All are checked before any is read: none may claim more than the file can hold.
-
-    Raises:
-        StoreError: sizes that cannot be, or arrays above 64 GiB together.
-    """
-    names: list[str] = []
-    file.visit(names.append)
-    items = ((name, file[name]) for name in names)
-    data_sets = [pair for pair in items if isinstance(pair[1], h5py.Dataset)]
-    for name, item in data_sets:
-        check_claim(path, item, name)
-    claimed = sum(item.nbytes for _, item in data_sets)
-    if claimed > _MOST_BYTES:
-        raise StoreError(
-            f"{path}: its arrays take {claimed / 1e9:.3g} GB, more than {_MOST_BYTES / 1e9:.3g} GB"
-        )
-    return data_sets
 
 
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:

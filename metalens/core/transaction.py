@@ -14,7 +14,6 @@ from typing import Any
 from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
 
-ROOM = 1 << 22  # bytes that every output may need
 # endings of the names that an interruption leaves for the next run
 UNFINISHED, JOURNAL = ".unfinished", ".resume"
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
@@ -41,13 +40,11 @@ class ClaimTerms:
 
     force: whether an existing output may be replaced; of folders only ours.
     inputs: files and folders that are read.
-    room: bytes that the output needs.
     parents: whether missing folders above it are created.
     """
 
     force: bool = False
     inputs: Sequence[Path] = ()
-    room: int = ROOM
     parents: bool = False
 
 
@@ -146,7 +143,6 @@ def claim_long_work(
         work = unfinished_path(target)
         if not (resume or grow):
             _refuse(target, (), terms, is_folder=True)
-        check_room(target, terms.room)
         resumed = _open_work(scratch, target, terms, resume=resume or grow, grow=grow)
         try:
             yield OutputDraft(work, target, resumed=resumed)
@@ -172,23 +168,6 @@ def unfinished_path(target: Path) -> Path:
     """
     target = _resolve_link(target)
     return target.with_name(target.name + UNFINISHED)
-
-
-def check_room(target: Path, room: int) -> None:
-    """Refuse an output that its disk has no room for; for sizes known after the claim.
-
-    Args:
-        target: the output.
-        room: bytes that it needs.
-
-    Raises:
-        OutputError: naming the free and the needed bytes.
-    """
-    free = shutil.disk_usage(target.parent).free
-    if free < room:
-        raise OutputError(
-            f"{target}: {free / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
-        )
 
 
 def _resolve_link(target: Path) -> Path:
@@ -258,8 +237,8 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
 def _refuse(
     target: Path, companions: Iterable[str], terms: ClaimTerms, *, is_folder: bool
 ) -> None:
-    """Refuse an output that is an input, exists without --force, is a folder of others,
-    or finds no room.
+    """Refuse an output that is an input, exists without --force, or is a folder of
+    others.
 
     Args:
         target: the output.
@@ -284,10 +263,6 @@ def _refuse(
             raise OutputError(
                 f"{target} holds the input {path}: it would be replaced; give another name"
             )
-    if os.path.ismount(target):
-        raise OutputError(
-            f"{target} is a mount point, which cannot be replaced whole; give another name"
-        )
     if target.exists() and target.is_dir() != is_folder:
         present, needed = ("folder", "file") if target.is_dir() else ("file", "folder")
         raise OutputError(f"{target} is a {present}; need the name of a {needed}")
@@ -300,7 +275,6 @@ def _refuse(
             raise OutputError(
                 f"{path} {reason}: not overwritten, not even with --force; move it or give another name"
             )
-    check_room(target, terms.room)
 
 
 def _is_taken(path: Path) -> bool:

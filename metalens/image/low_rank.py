@@ -1,5 +1,6 @@
 """Field-varying PSFs as one low-rank sum over the whole field and all depths."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -279,7 +280,7 @@ def low_rank_psfs(
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
     # in double precision: rounding must not decide where the iterations end
     sources = values.detach().movedim(-1, 0).double()
-    targets = torch.ones_like(sources[0].movedim(-1, 0))  # of full coverage
+    planes = targets = torch.ones_like(sources[0].movedim(-1, 0))  # of full coverage
     if illuminated:
         planes = plane_images(field.light.detach(), maps).to(sources)
         targets = smooth_planes(planes, psf.shape, min(SMOOTH, basis.error / 3))
@@ -291,7 +292,9 @@ def low_rank_psfs(
     values = values * torch.stack(factors, -1)[..., None].to(values)
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
-    return LowRankPsfs(kernels, transfer, shape, table, vergence, max(errors))
+    rings = float((targets - planes).norm() / planes.norm())
+    error = math.hypot(max(errors), rings)
+    return LowRankPsfs(kernels, transfer, shape, table, vergence, error)
 
 
 def depth_table(depths_um: Tensor) -> Tensor:
