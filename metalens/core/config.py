@@ -187,7 +187,7 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
         values[key] = _convert(value, hints[key], where, prefix + key)
         _check_range(fields[key], values[key], where, prefix + key)
     for name, entry in fields.items():
-        if _required(entry) and name not in values:
+        if is_required(entry) and name not in values:
             raise ConfigError(
                 f"{where}: missing key {prefix + name!r} in {record.__name__}"
             )
@@ -202,7 +202,8 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     return built
 
 
-def _required(field: dataclasses.Field[Any]) -> bool:
+def is_required(field: dataclasses.Field[Any]) -> bool:
+    """Whether a ``field`` of a record has no default."""
     return (
         field.default is dataclasses.MISSING
         and field.default_factory is dataclasses.MISSING

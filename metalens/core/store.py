@@ -634,7 +634,7 @@ def build_record(
                 if is_settings
                 else value
             )
-        elif name in arrays or _is_required(entry):
+        elif name in arrays or config.is_required(entry):
             value = arrays[name]  # where it is missing, a refusal that names it
             is_tuple = typing.get_origin(kind) is tuple
             given[entry.name] = _to_tuple(value.tolist()) if is_tuple else value
@@ -656,11 +656,6 @@ def _without_none(hint: Any) -> Any:
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint
     return next(kind for kind in typing.get_args(hint) if kind is not type(None))
-
-
-def _is_required(field: dataclasses.Field[Any]) -> bool:
-    missing = dataclasses.MISSING
-    return field.default is missing and field.default_factory is missing
 
 
 def _to_tuple(value: Any) -> Any:

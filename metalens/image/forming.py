@@ -21,7 +21,7 @@ from metalens.image.low_rank import (
 )
 from metalens.image.plan import KERNELS, Grid, ImagingPlan
 from metalens.image.points import Window
-from metalens.image.scene import Frames, has_no_gradient, to_device
+from metalens.image.scene import DeviceRecord, Frames, has_no_gradient
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import StrayLight, add_stray
 
@@ -32,7 +32,7 @@ COVER_SHARE, COVER_FEWEST = 0.3, 12
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Imager:
+class Imager(DeviceRecord):
     """A lens ready to image frames of one grid.
 
     grid, plan: samples of the scene, and nodes of the PSFs. A uniform imager has one
@@ -193,10 +193,6 @@ class Imager:
         """This imager with ``factor`` times the light, but the same stray light."""
         light = replace(self.light, table=self.light.table * factor)
         return replace(self, energy=self.energy * factor, light=light)
-
-    def to(self, device: torch.device | str) -> "Imager":
-        """This imager on a device, for frames on it; grid and plan are not moved."""
-        return to_device(self, device)
 
 
 def build_imager(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
-from metalens.image.scene import to_device
+from metalens.image.scene import DeviceRecord
 from metalens.image.splines import (
     TAPS,
     depth_position,
@@ -52,7 +52,7 @@ class PsfField:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class KernelBasis:
+class KernelBasis(DeviceRecord):
     """How kernels are mixed of the PSFs of a field, and what they weigh at its nodes.
 
     mixture: (rank, sampled) of the PSFs of the nodes ``sampled`` (flat numbers).
@@ -69,10 +69,6 @@ class KernelBasis:
         """(rank, h, w) leading kernels mixed of PSFs (rows, columns, depths, h, w)."""
         some = psf.flatten(0, 2)[self.sampled]
         return torch.einsum("rn,nyx->ryx", self.mixture[:rank].to(some), some)
-
-    def to(self, device: torch.device | str) -> "KernelBasis":
-        """The same on a device."""
-        return to_device(self, device)
 
 
 def principal_kernels(
@@ -154,7 +150,7 @@ def _derivative_error(features: Tensor, axes: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LowRankPsfs:
+class LowRankPsfs(DeviceRecord):
     """PSFs Σ_r w_r(x, z) K_r(δ) of the samples of a frame.
 
     kernels: (rank, h, w).
@@ -173,10 +169,6 @@ class LowRankPsfs:
     table: Tensor
     vergence: tuple[float, float]
     plane_error: float = 0.0
-
-    def to(self, device: torch.device | str) -> "LowRankPsfs":
-        """The same on a device."""
-        return to_device(self, device)
 
     @property
     def uniform(self) -> bool:

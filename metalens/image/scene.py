@@ -1,7 +1,7 @@
 """Scenes of two sheets, each a surface of varying depth (paper Sec. 3.1)."""
 
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -9,11 +9,21 @@ from torch.autograd import forward_ad
 
 from metalens.core.errors import SceneError
 
-Record = TypeVar("Record", bound=Any)  # a dataclass
+
+class DeviceRecord:
+    """A dataclass of tensors and of such records."""
+
+    __slots__ = ()
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same with its tensors on a device."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        moved = {k: v.to(device) for k, v in values.items() if hasattr(v, "to")}
+        return replace(self, **moved)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Frames:
+class Frames(DeviceRecord):
     """Rendered sheets, index 0 near and 1 far along the axis of sheets.
 
     radiance: (frames, 2, y, x), already multiplied by the coverage.
@@ -41,19 +51,6 @@ class Frames:
             raise SceneError(
                 f"radiance, coverage, depth have shapes {shapes}, need the same (frames, 2, y, x)"
             )
-
-    def to(self, device: torch.device | str) -> "Frames":
-        """The same on a device."""
-        return to_device(self, device)
-
-
-def to_device(record: Record, device: torch.device | str) -> Record:
-    """A dataclass ``record`` with its tensors, and the fields that have a method
-    ``to``, on a ``device``; other fields stay.
-    """
-    values = {name: getattr(record, name) for name in record.__dataclass_fields__}
-    moved = {k: v.to(device) for k, v in values.items() if hasattr(v, "to")}
-    return replace(record, **moved)
 
 
 def is_plain_value(a: Tensor) -> bool:

@@ -14,14 +14,14 @@ from torch import Tensor
 from metalens.core.arrays import Array
 from metalens.image.plan import Grid
 from metalens.image.points import Optics
-from metalens.image.scene import to_device
+from metalens.image.scene import DeviceRecord
 from metalens.image.waves import PillarWave
 
 ORDERS = (-1, 0, 2, 3)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class StrayLight:
+class StrayLight(DeviceRecord):
     """Discs of other orders about every source.
 
     shares: of the light on the aperture in each order.
@@ -39,10 +39,6 @@ class StrayLight:
     illumination: Tensor
     rows: Tensor | None = None
     columns: Tensor | None = None
-
-    def to(self, device: torch.device | str) -> "StrayLight":
-        """The same on a device."""
-        return to_device(self, device)
 
 
 class _Footprint(NamedTuple):
