@@ -2,17 +2,15 @@
 rays pass it.
 """
 
-import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
+from scipy.special import fresnel
 
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.core.threads import run_split
 from metalens.optics import interpolant, media
 from metalens.optics.media import Media
 
@@ -228,76 +226,17 @@ def illuminated_radius_um(
     return stop.radius_um / (1 - between.reduced_um / before.reduced_um)
 
 
-LONGEST, STEPS = 8, 1024  # of the table, and in a unit of w
-
-
-@functools.cache
-def _edge_wave_table() -> Array:
-    """(w,) complex table of A for E(w), at steps of 1 / ``STEPS``.
-
-    A(w) = -e^(iπ/4) ∫ exp(-π t²/2 + iπ e^(iπ/4) w t) dt from 0, by Gauss's rule over t
-    up to 5.
-    """
-    node, weight = np.polynomial.legendre.leggauss(80)
-    t = 2.5 * (node + 1)
-    rotation = np.exp(0.25j * np.pi)
-    w = np.arange(LONGEST * STEPS + 2) / STEPS
-    exponent = -np.pi / 2 * t * t + 1j * np.pi * rotation * np.outer(w, t)
-    return np.asarray(-rotation * np.exp(exponent) @ (2.5 * weight))
-
-
-@numba.njit(cache=True, inline="always")
-def _wave(w, table):  # type: ignore[no-untyped-def]
+def _edge_wave(w: Array) -> tuple[Array, Array]:
     """Fresnel edge field E(w), and its integral w E(w) + i/π e^(-iπ/4)/√2 e^(iπw²/2).
 
-    E is the complex Fresnel integral from -∞ to w, of limit 1: ±A(|w|) times the edge
-    wave e^(iπw²/2) e^(-iπ/4)/√2, plus 1 for w >= 0. A is interpolated in ``table``, and
-    beyond ``LONGEST`` its asymptotic series.
+    E = 1/2 + e^(-iπ/4)/√2 (C(w) + i S(w)) is the complex Fresnel integral from -∞ to w,
+    of limit 1.
     """
-    a = abs(w)
-    turns = a * a / 4 - 0.125
-    angle = 2 * np.pi * (turns - np.rint(turns))
-    wave = complex(np.cos(angle), np.sin(angle)) * np.sqrt(0.5)
-    if a < LONGEST:
-        i = int(a * STEPS)
-        amplitude = table[i] + (a * STEPS - i) * (table[i + 1] - table[i])
-    else:
-        part = complex(0.0, -1 / (np.pi * a * a))  # 1 / (iπw²)
-        amplitude = a * part * (1 + part * (1 + 3 * part * (1 + 5 * part)))
-    field = 1 + wave * amplitude if w >= 0 else -wave * amplitude
-    return field, w * field + complex(0.0, 1 / np.pi) * wave
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_edge_factor(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyped-def]
-    """Write S of :func:`edge_diffraction_factor` at places (x, y) into ``out``.
-
-    The edge at the nearest point of the rim is straight, with its curvature to first
-    order.
-
-    Args:
-        x, y, width: (n,) places and widths, um.
-        ray: unit vector of the plane of incidence.
-        lengths: Fresnel lengths in that plane and across it, um.
-        hole: radius of the stop and wavelength, um.
-        table: of :func:`_edge_wave_table`.
-        out: (n,) complex.
-    """
-    along, across = lengths
-    radius, wavelength = hole
-    for i in range(len(out)):
-        r = max(np.hypot(x[i], y[i]), 1e-12)
-        cosine = (x[i] * ray[0] + y[i] * ray[1]) / r
-        normal = across + (along - across) * cosine * cosine
-        scale = np.sqrt(2 / (wavelength * normal))
-        middle = (radius - r) * scale
-        half = width[i] * scale / 2
-        upper = _wave(middle + half, table)
-        lower = _wave(middle - half, table)
-        curvature = complex(
-            0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i])
-        )
-        out[i] = (upper[1] - lower[1]) / (2 * half) - curvature * (upper[0] - lower[0])
+    sine, cosine = fresnel(w)
+    rotation = (1 - 1j) / 2
+    field = 0.5 + rotation * (cosine + 1j * sine)
+    wave = rotation * np.exp(0.5j * np.pi * w * w)
+    return field, w * field + 1j / np.pi * wave
 
 
 def edge_diffraction_factor(
@@ -321,24 +260,14 @@ def edge_diffraction_factor(
         radius_um: of the stop.
         wavelength_um: in vacuum.
     """
-    shape = np.shape(at_um[0])
-    x, y, width = (
-        np.ascontiguousarray(np.broadcast_to(a, shape), float).ravel()
-        for a in (*at_um, width_um)
-    )
-    out = np.empty(len(x), complex)
-
-    def work(a: int, b: int) -> None:
-        _fill_edge_factor(
-            x[a:b],
-            y[a:b],
-            width[a:b],
-            ray,
-            lengths_um,
-            (radius_um, wavelength_um),
-            _edge_wave_table(),
-            out[a:b],
-        )
-
-    run_split(len(x), work)
-    return out.reshape(shape)
+    x, y = at_um
+    along, across = lengths_um
+    r = np.maximum(np.hypot(x, y), 1e-12)
+    normal = across + (along - across) * ((x * ray[0] + y * ray[1]) / r) ** 2
+    scale = np.sqrt(2 / (wavelength_um * normal))
+    middle, half = (radius_um - r) * scale, width_um * scale / 2
+    outer, outer_integral = _edge_wave(middle - half)
+    inner, inner_integral = _edge_wave(middle + half)
+    curvature = along * across / (normal * 4 * np.pi * radius_um * width_um)
+    mean = (inner_integral - outer_integral) / (2 * half)
+    return np.asarray(mean - 1j * wavelength_um * curvature * (inner - outer))
