@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import j0, jv
 
 from metalens.cell import Cell, Layer, materials
@@ -254,13 +255,6 @@ def _nearest(
         px, py: (...) points in the middle rectangle, um.
     """
     sites = _sites(cell)
-    parts = [part for outline in outlines for part in outline.parts]
-    if all(isinstance(p, EllipseArc) and p.half_x_um == p.half_y_um for p in parts):
-        radii = np.repeat([part.half_x_um for part in parts], len(sites))  # type: ignore[union-attr]
-        centres = [part.centre_um + sites for part in parts]  # type: ignore[union-attr]
-        return _nearest_circle(np.concatenate(centres), radii, px, py)
-    from scipy.spatial import cKDTree
-
     step_um = min(cell.lattice.periods_um(cell.pitch_um)) / 200
     boundaries = [outline.boundary(step_um) for outline in outlines]
     points, normals = (
@@ -273,37 +267,6 @@ def _nearest(
     tie = distances[..., 1] - distances[..., 0] < _TIE * cell.pitch_um
     mean = np.where(tie, products.mean(axis=-1), products[..., 0])
     return mean, np.asarray(distances[..., 0])
-
-
-def _nearest_circle(
-    centres: Array, radii: Array, px: Array, py: Array
-) -> tuple[Array, Array]:
-    """As :func:`_nearest`, for circles, whose normals are radial.
-
-    Circles at equal distance count with their mean. At a centre the products are those
-    of a random direction.
-
-    Args:
-        centres: (k, 2), um. radii: (k,), um.
-        px, py: (...) points, um.
-    """
-    least_distance = np.full(px.shape, np.inf)
-    products_sum, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
-    for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True):
-        dx, dy = px - x, py - y
-        square = dx**2 + dy**2
-        distance = np.abs(np.sqrt(square) - radius)
-        nearer = distance < least_distance - _TIE * radius
-        nearest = distance < least_distance + _TIE * radius
-        products_sum = np.where(nearer, 0.0, products_sum)
-        count = np.where(nearer, 0.0, count)
-        at_centre = square < (_TIE * radius) ** 2  # no direction is preferred there
-        scale = np.where(at_centre, 1.0, square)
-        products = np.stack([dx * dx, dy * dy, dx * dy]) / scale
-        products[:2, at_centre] = 0.5
-        products_sum, count = products_sum + nearest * products, count + nearest
-        least_distance = np.minimum(least_distance, distance)
-    return products_sum / count, least_distance
 
 
 def _sites(cell: Cell) -> Array:
