@@ -51,7 +51,7 @@ class Material:
         return max(low for low, _ in ranges), min(high for _, high in ranges)
 
 
-_DATA = Path(__file__).parents[1] / "data"
+_DATA = Path(__file__).parent.parent / "data"
 _TABLES = {"a-Si": "a-Si.csv", "Si": "Si.csv"}
 _FORMULAS = {
     "air": Material(

@@ -17,6 +17,7 @@ from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import figure_png, make_figure
+from metalens.core.units import nm
 from metalens.library import workers
 from metalens.rcwa import FieldGrid, NearField, near_fields
 
@@ -24,7 +25,6 @@ CUTS = ("xz", "yz", "xy")
 SOUGHT = 0.1  # relative error of a field that is aimed at without a tolerance
 UNKNOWN = 0.5  # largest relative error of a field, and largest tolerance
 MOST_SAMPLES = 400  # along the pitch
-NM = 1e3  # nm in a um
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def near_field_request(options: Options) -> NearFieldRequest:
     wavelength = (
         settings.sweep.wavelengths_um[0]
         if options.wavelength_nm is None
-        else options.wavelength_nm / NM
+        else options.wavelength_nm / 1e3
     )
     around = wavelength / 2 if options.around_um is None else options.around_um
     quarters = tuple(part * cell.height_um for part in (0.25, 0.5, 0.75))
@@ -205,7 +205,7 @@ def run(options: Options) -> int:
     failed = any(cut.error > (options.tolerance or UNKNOWN) for cut in fields)
     return options.console.report(
         f"{options.output}: field of {request.cell.described}, "
-        f"{NM * request.wavelength_um:g} nm",
+        f"{request.wavelength_um / nm:g} nm",
         {
             "orders": fields[0].orders,
             "tolerance": request.tolerance,

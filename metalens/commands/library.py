@@ -32,7 +32,6 @@ from metalens.library import (
 from metalens.library import fit as proxy_fit
 
 LEAST_USABLE = 0.5  # least share of usable pairs of sizes in a library
-NM = 1e3
 MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
 

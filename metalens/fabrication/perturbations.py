@@ -13,8 +13,10 @@ import numpy as np
 from metalens.cell import Cell, Index, index
 from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.core.arrays import Array
+from metalens.core.units import deg
 
 Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
+LEAST_TRANSMISSION = 1e-3  # of |t| that is extrapolated along a tangent
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +264,6 @@ def _unstated(
     name: str,
     meaning: str,
     acts: ResponseError,
-    *,
     scale: float,
     sigma: float,
     bound: float,
@@ -291,9 +292,6 @@ def _unstated(
     )
 
 
-_SIDE = {"scale": 1.0, "sigma": 2.0, "bound": 12.0}
-_FILM = {"scale": 2.0, "sigma": 5.0, "bound": 30.0}
-DEG = math.pi / 180
 USUAL_UM = 0.85  # wavelength of the lenses that the sizes in nm below are of
 PERTURBATIONS: tuple[Perturbation, ...] = (
     _cd_error(
@@ -392,7 +390,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         -1.6,
         1.6,
         ResponseError(_sidewall_rate, _cell_number("sidewall_rad")),
-        DEG,
+        deg,
         free=False,
         drawn=DrawnPerturbation("sidewall_deg", 0.5),
         plausible=2.0,
@@ -404,13 +402,17 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         "width_nm",
         "side of a rectangle or ellipse along its x, minus design and bias",
         ResponseError(_side_rate, _width_numbers),
-        **_SIDE,
+        1.0,
+        2.0,
+        12.0,
     ),
     _unstated(
         "length_nm",
         "side of a rectangle or ellipse along its y, minus design and bias",
         ResponseError(_side_rate, _length_numbers),
-        **_SIDE,
+        1.0,
+        2.0,
+        12.0,
     ),
     Perturbation(
         "turn_deg",
@@ -420,7 +422,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         -3.0,
         3.0,
         ResponseError(_zero_rate, _turn_numbers),
-        DEG,
+        deg,
         free=False,
         drawn=DrawnPerturbation("turn_deg", 0.0),
     ),
@@ -428,13 +430,17 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         "pedestal_nm",
         "height of the films under a layered pillar's own material, minus design",
         ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=True)),
-        **_FILM,
+        2.0,
+        5.0,
+        30.0,
     ),
     _unstated(
         "cap_nm",
         "height of the films on it (a residual mask), minus design",
         ResponseError(_zero_rate, lambda cell, size_um: _films(cell, under=False)),
-        **_FILM,
+        2.0,
+        5.0,
+        30.0,
     ),
     _zernike("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _zernike("oblique_astigmatism", 6, ((2, 1, 1),)),

@@ -12,16 +12,20 @@ from metalens.cell import Cell, index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.fabrication.perturbations import (
+    LEAST_TRANSMISSION,
     WaveguideModel,
     response_errors,
     with_missing,
 )
-from metalens.fabrication.solved_rates import ResponseRates, own_rates
+from metalens.fabrication.solved_rates import (
+    ResponseRates,
+    largest_row_error,
+    own_rates,
+)
 from metalens.lens import Lens
 from metalens.library import Proxy
 
 _END = 64  # the tangent at an end of a proxy: over 1/64 of its wavelength range
-_DARKEST = 1e-3  # least |T| of a tangent beyond the domain of a proxy
 _NODES = 9  # Chebyshev sizes at which pillars of own shape are solved
 _DEGREE = 5  # of the polynomials through these
 
@@ -216,16 +220,14 @@ def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
     solved = own_rates(lens, center + offset)
     rows = np.vstack([solved.rates, solved.edges])
     series = polynomial.polyfit(offset, rows.T, _DEGREE)
-    residual = np.linalg.norm(polynomial.polyval(offset, series) - rows, axis=1)
-    fit_error = residual / np.maximum(np.linalg.norm(rows, axis=1), 1e-9)
-    nonzero = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
+    fit_error = largest_row_error(polynomial.polyval(offset, series), rows)
     return Sensitivity(
         series.T[:-1],
         center,
-        solved.error + float((fit_error * nonzero).max()),
+        solved.error + fit_error,
         low,
         high,
-        edges=series.T[-1:] if nonzero[-1] else None,
+        edges=series.T[-1:] if solved.edges.any() else None,
     )
 
 
@@ -300,7 +302,7 @@ def designed_transmission(
         phase_in, level_in = _phase_and_level(proxy, d_um, inside - step, angle_rad)
         phase = phase + (phase - phase_in) * (beyond / step)
         level = level + (level - level_in) * (beyond / step)
-    return np.asarray(np.clip(level, _DARKEST, 1) * np.exp(1j * phase))
+    return np.asarray(np.clip(level, LEAST_TRANSMISSION, 1) * np.exp(1j * phase))
 
 
 def _phase_and_level(

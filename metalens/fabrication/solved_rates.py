@@ -164,12 +164,17 @@ def _with_error(sizes_um: Array, coarse: Array, fine: Array) -> ResponseRates:
         sizes_um: (n, 1) sizes.
         coarse, fine: (causes + 1, n) rates, the last row by the edges.
     """
-    change = np.linalg.norm(fine - coarse, axis=1)
-    relative = change / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
+    edges = fine[-1] * (np.abs(fine[-1]).max() > 1e-6 * np.abs(fine).max())
+    return ResponseRates(sizes_um, fine[:-1], largest_row_error(coarse, fine), edges)
+
+
+def largest_row_error(estimate: Array, rows: Array) -> float:
+    """Largest relative error (rms over a row) of estimates of ``rows``, (causes, n)."""
+    norm = np.linalg.norm(rows, axis=1)
     # rates that a mirror of the cell forbids (a turn) are rounding errors
-    nonzero = np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()
-    error = float((relative * nonzero).max())
-    return ResponseRates(sizes_um, fine[:-1], error, fine[-1])
+    nonzero = norm > 1e-6 * norm.max()
+    error = np.linalg.norm(estimate - rows, axis=1)[nonzero] / norm[nonzero]
+    return float(error.max(initial=0.0))
 
 
 def polarization_weights(lens: "Lens") -> Array:

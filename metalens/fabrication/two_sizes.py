@@ -9,11 +9,15 @@ from scipy.interpolate import RectBivariateSpline
 
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.solved_rates import ResponseRates, pair_rates
+from metalens.fabrication.perturbations import LEAST_TRANSMISSION
+from metalens.fabrication.solved_rates import (
+    ResponseRates,
+    largest_row_error,
+    pair_rates,
+)
 from metalens.lens import DiameterMap, Lens
 
 _PAIRS = 24  # pairs of sizes that are solved
-_DARKEST = 1e-3  # least |t| of a tangent beyond a table
 _ENTRY_UM = 5e-5  # resolution of sizes; equal rounded sizes are one kind
 
 
@@ -75,7 +79,7 @@ class PairTable:
         change = by_width + (length_um - y) * self._spline(x, y, dy=1)
         level = np.abs(value) + (change * value.conj()).real / np.abs(value)
         phase = np.angle(value) + (change / value).imag
-        return np.asarray(np.clip(level, _DARKEST, 1.0) * np.exp(1j * phase))
+        return np.asarray(np.clip(level, LEAST_TRANSMISSION, 1.0) * np.exp(1j * phase))
 
     def _spline(self, x_um: Array, y_um: Array, *, dx: int = 0, dy: int = 0) -> Array:
         """(*shape) complex t, or its derivative of order dx, dy, from both splines."""
@@ -209,8 +213,5 @@ def _held_out_error(solved: ResponseRates) -> float:
     if half == len(sizes):
         return 0.0
     first = replace(solved, sizes_um=sizes[:half], rates=rates[:, :half])
-    judged = rates[:, half:]
-    residual = np.linalg.norm(first.at(*sizes[half:].T)[: len(rates)] - judged, axis=1)
-    relative = residual / np.maximum(np.linalg.norm(judged, axis=1), 1e-9)
-    nonzero = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
-    return float((relative * nonzero).max())
+    predicted = first.at(*sizes[half:].T)[: len(rates)]
+    return largest_row_error(predicted, rates[:, half:])

@@ -28,9 +28,8 @@ from metalens.library.workers import SweepJournal, SweepTask
 
 KIND = "axes-library"
 FIT_SHARE = 0.1  # residual of the rational fits, as a share of the tolerance
-
-
-FIRST, MOST = 7, 19  # nodes along an axis: at the start, and at most
+# nodes along an axis: Chebyshev points of degree 6, which both others hold, 12 and 18
+LEVELS = 7, 13, 19
 SOLVER_SHARE = 0.6  # share of the tolerance left to the solver's truncation error
 
 
@@ -148,9 +147,7 @@ def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
             pillars that touch; and as :func:`metalens.library.check_sweep`.
     """
     spans = size_ranges(sweep)
-    if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
-        cell.shape, "ratio", 1.0
-    ):
+    if cell_of_sizes(cell, 1.0, 1.0) != cell:
         raise CellError(
             "cell.shape.ratio: both sizes are swept (diameters_um, lengths_um); leave ratio out"
         )
@@ -494,50 +491,21 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
 
 
 def _choose_lines(nodes: _Nodes, sweep: Sweep) -> tuple[Array, Array]:
-    """(x, y) nodes: seven Chebyshev points each, and lines added between them where the
-    interpolations disagree most.
-
-    Stops at 19 nodes, or when at most 3 % of the pairs exceed the interpolation's share
-    of the tolerance.
+    """(x, y) nodes: Chebyshev points of the least of ``LEVELS`` at which at most 3 % of
+    the pairs exceed the interpolation's share of the tolerance, else of the last.
     """
     spans = size_ranges(sweep)
-    angle = np.pi * np.arange(FIRST) / (FIRST - 1)
-    lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
     grid = np.linspace(*spans[0], 61), np.linspace(*spans[1], 61)
-    for line, span in zip(lines, spans, strict=True):
-        line[[0, -1]] = span
-    while True:
-        x, y = lines
+    for count in LEVELS:
+        unit = -np.cos(np.pi * np.arange(count) / (count - 1))
+        # rounded, so that nodes of two levels are equal
+        x, y = (np.round(low + (high - low) * (unit + 1) / 2, 9) for low, high in spans)
         values, _ = nodes.grid(x, y)
         doubt = interpolate_table((x, y), values, grid, tolerance=sweep.bar).doubt
-        share_above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
         # a few pairs in a hundred may lie near resonances
-        if share_above <= 0.03 or len(x) >= MOST:
-            return x, y
-        # capped, so that one resonance does not take all lines
-        capped = np.minimum(doubt, 10 * sweep.bar)
-        profiles = [capped.mean(axis=1), capped.mean(axis=0)]
-        if nodes.swaps:
-            profiles = [profiles[0] + profiles[1]] * 2
-        lines = [_add_lines(*pair) for pair in zip(lines, grid, profiles, strict=True)]
-
-
-def _add_lines(lines: Array, sizes: Array, profile: Array) -> Array:
-    """Nodes with two more, each halving the gap over which the doubt sums to most.
-
-    Args:
-        lines: (m,) nodes, um.
-        sizes: (p,) um.
-        profile: (p,) doubt at these sizes.
-    """
-    for _ in range(2):
-        gaps = [
-            float(profile[(sizes > low) & (sizes < high)].sum())
-            for low, high in itertools.pairwise(lines)
-        ]
-        worst = int(np.argmax(gaps))
-        lines = np.insert(lines, worst + 1, (lines[worst] + lines[worst + 1]) / 2)
-    return lines
+        if (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean() <= 0.03:
+            break
+    return x, y
 
 
 def _held_out(

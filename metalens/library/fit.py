@@ -21,7 +21,6 @@ from metalens.library import polynomial
 from metalens.library.proxy import MOST_ERROR, Proxy
 from metalens.library.record import PillarLibrary
 
-TURN = 2 * math.pi
 LEAST_ENTRIES = 12  # diameters in a domain
 REACH = 2.0  # half-widths on either side of a narrow resonance that are excluded
 UNKNOWN = 0.5  # largest error bar of a usable entry, as a share of |t|
@@ -121,7 +120,7 @@ class MonotonicBranch:
         """
         if not self.monotonic:
             return math.nan
-        return float(abs(self.phase[..., -1] - self.phase[..., 0]).min() / TURN)
+        return float(abs(self.phase[..., -1] - self.phase[..., 0]).min() / math.tau)
 
 
 def longest_monotonic_branch(

@@ -8,10 +8,9 @@ import numpy as np
 
 from metalens.core import report, store
 from metalens.core.store import write_bytes
+from metalens.core.units import nm
 from metalens.library.record import PillarLibrary
 from metalens.library.study import CellStudy, CellVerdict
-
-NM = 1e3
 
 
 def write_study(folder: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
@@ -52,10 +51,10 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
         )
         for i, j in np.ndindex(*turns.shape):
             panel.text(j, i, f"{turns[i, j]:.2f}", ha="center", va="center", fontsize=7)
-        panel.set_xticks(range(len(pitches)), [f"{NM * p:g}" for p in pitches])
-        panel.set_yticks(range(len(heights)), [f"{NM * h:g}" for h in heights])
+        panel.set_xticks(range(len(pitches)), [f"{p / nm:g}" for p in pitches])
+        panel.set_yticks(range(len(heights)), [f"{h / nm:g}" for h in heights])
         panel.set(
-            title=f"{NM * wavelength:g} nm",
+            title=f"{wavelength / nm:g} nm",
             xlabel="pitch (nm)",
             ylabel="pillar height (nm)",
         )
@@ -73,10 +72,10 @@ def library_figure(path: Path, library: PillarLibrary) -> None:
         library: the swept cell.
     """
     figure, (phase, level) = report.make_figure(2, 1, size=(7.5, 5), sharex=True)
-    size_nm = NM * library.diameter_um
+    size_nm = library.diameter_um / nm
     for i, j, k in np.ndindex(*library.t.shape[:3]):
         t = library.t[i, j, k]
-        label = f"{NM * library.wavelength_um[k]:g} nm"
+        label = f"{library.wavelength_um[k] / nm:g} nm"
         if len(library.angle_rad) > 1:
             angle_deg = np.degrees(library.angle_rad[j])
             label += f", {angle_deg:.3g}° {library.polarization[i]}"
@@ -88,5 +87,5 @@ def library_figure(path: Path, library: PillarLibrary) -> None:
     level.set(xlabel="diameter (nm)", ylabel="|t|", ylim=(0, 1.05))
     if library.proxy is not None:
         for panel in (phase, level):
-            panel.axvspan(*np.multiply(NM, library.proxy.domain_um), color="0.92")
+            panel.axvspan(*np.divide(library.proxy.domain_um, nm), color="0.92")
     write_bytes(path, report.figure_png(figure))

@@ -21,7 +21,6 @@ Intervals = tuple[tuple[float, float], ...]
 CHUNK = 65536  # pillars per pass: its work arrays stay in the cache
 EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
 TABLE = 4096  # entries of the table from which Newton's steps start
-TURN = 2 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,20 +299,20 @@ def invert_phase(
     if phases[-1] < phases[0]:
         d, phases = d[::-1], phases[::-1]
     start, cover = float(phases[0]), float(phases[-1] - phases[0])
-    if gap == "refuse" and cover < TURN:
-        missing = (values.astype(float) - start) % TURN > cover + 1e-6
+    if gap == "refuse" and cover < math.tau:
+        missing = (values.astype(float) - start) % math.tau > cover + 1e-6
         if missing.any():
             raise DomainError(
                 f"no pillar between {low:.4g} and {high:.4g} um has the phase at index {_first(missing)}: "
-                f"they cover {cover / TURN:.3f} of a turn ({int(missing.sum())} sites); "
+                f"they cover {cover / math.tau:.3f} of a turn ({int(missing.sum())} sites); "
                 "widen the diameters, change the cell, or take the nearest with gap='nearest'"
             )
     table = np.interp(np.linspace(start, start + cover, TABLE), phases, d)
 
     def invert(chunk: Array) -> Array:
-        target = (chunk.astype(float) - start) % TURN
+        target = (chunk.astype(float) - start) % math.tau
         beyond = target > cover
-        nearest = target - cover <= TURN - target
+        nearest = target - cover <= math.tau - target
         target[beyond] = np.where(nearest[beyond], cover, 0.0)
         diameter = _newton(p, start + target, target * ((TABLE - 1) / cover), table)
         for least, most in excluded_um:

@@ -19,8 +19,6 @@ from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
 from metalens.library.workers import SweepJournal, SweepTask, fit_curve
 
-TURN = 2 * math.pi
-
 
 @dataclass(frozen=True, slots=True)
 class CellStudy:
@@ -228,7 +226,7 @@ def judge_cell(
         cell.pitch_um,
         cell.height_um,
         wavelength_um,
-        float(phase[stop - 1] - phase[start]) / TURN if stop > start else 0.0,
+        float(phase[stop - 1] - phase[start]) / math.tau if stop > start else 0.0,
         float(d[start]),
         float(d[max(start, stop - 1)]),
         float(level[run].min(initial=1.0)),

@@ -13,13 +13,17 @@ from metalens.core.arrays import Array
 
 Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
 Operation = tuple[int, int, Sign]  # (x, y) -> (sx x, sy y)
-IDENTITY: Operation = (1, 1, (1, 1, 1, 1))
-# a field along x (or y) that a mirror leaves as it is has Ex (or Ey) even
-FLIP_X = {"x": (-1, 1, (1, -1, -1, 1)), "y": (-1, 1, (-1, 1, 1, -1))}
-FLIP_Y = {"x": (1, -1, (1, -1, 1, -1)), "y": (1, -1, (-1, 1, -1, 1))}
-HALF_TURN: Operation = (-1, -1, (1, 1, -1, -1))
 EX, EY, EZ, MIXED = range(4)  # places in ReducedOrders.links
 _STRAIGHT = 1e-12  # a component of k this small is 0 but for rounding
+
+
+def symmetry_operation(sx: int, sy: int, ex: int = 1) -> Operation:
+    """The map (x, y) -> (sx x, sy y), under which Ex has the sign ``ex``.
+
+    A mirror keeps E along it and reverses it across: Ey has sx sy times that sign, Ez
+    sx times, and Hz, as curl E, sy times.
+    """
+    return sx, sy, (ex, ex * sx * sy, ex * sx, ex * sy)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,16 +22,13 @@ from metalens.cell.shapes import Outline
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa.basis import (
-    FLIP_X,
-    FLIP_Y,
-    HALF_TURN,
-    IDENTITY,
     Operation,
     TangentialWave,
     count_orders,
     lattice_frame,
     plane_waves,
     reduced_orders,
+    symmetry_operation,
     tangential_wave,
 )
 from metalens.rcwa.permittivity import PillarSection, pillar_section, section_modes
@@ -234,18 +231,22 @@ def symmetry_classes(
         cell, size_um: the pillar, whose mirrors count. light: its direction.
     """
     outline = cell.outline(max(size_um, _ROUNDING))
-    flip_x = light.kx == 0 and outline.keeps(-1, 1)
-    flip_y = light.ky == 0 and outline.keeps(1, -1)
-    if flip_x and flip_y:
-        return tuple(
-            (IDENTITY, FLIP_X[axis], FLIP_Y[axis], HALF_TURN) for axis in ("x", "y")
+    identity, half_turn = symmetry_operation(1, 1), symmetry_operation(-1, -1)
+    mirrors = []
+    if light.kx == 0 and outline.keeps(-1, 1):
+        mirrors.append((-1, 1))
+    if light.ky == 0 and outline.keeps(1, -1):
+        mirrors.append((1, -1))
+    if mirrors:  # light along x has Ex even, light along y odd
+        product = (half_turn,) * (len(mirrors) - 1)
+        along_x, along_y = (
+            tuple(symmetry_operation(*mirror, ex) for mirror in mirrors)
+            for ex in (1, -1)
         )
-    if flip_x or flip_y:
-        table = FLIP_X if flip_x else FLIP_Y
-        return tuple((IDENTITY, table[axis]) for axis in ("x", "y"))
+        return (identity, *along_x, *product), (identity, *along_y, *product)
     if light.normal and outline.keeps(-1, -1):
-        return ((IDENTITY, HALF_TURN),)
-    return ((IDENTITY,),)
+        return ((identity, half_turn),)
+    return ((identity,),)
 
 
 def polarization_column(light: Incidence) -> int:
@@ -645,7 +646,7 @@ def _film_response(problem: CellProblem) -> TruncatedSolution:
     """Exact t and r with each section replaced by a film of its surroundings."""
     cell, light = problem.cell, problem.light
     sized = dataclasses.replace(problem, size_um=problem.size_um or cell.pitch_um / 2)
-    space = reduced_orders(0, lattice_frame(cell, (IDENTITY,)))
+    space = reduced_orders(0, lattice_frame(cell, (symmetry_operation(1, 1),)))
     waves = plane_waves(space, cell, light)
     films = [
         film_modes(waves, complex(np.sqrt(section.outside)), height)

@@ -15,12 +15,11 @@ from metalens.cell.shapes.outline import EllipseArc
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa.basis import (
-    FLIP_Y,
-    IDENTITY,
     lattice_frame,
     normal_component,
     plane_waves,
     reduced_orders,
+    symmetry_operation,
     tangential_wave,
 )
 from metalens.rcwa.permittivity import PillarSection, section_operators
@@ -135,7 +134,8 @@ def solve_row(
     )
     slab = PillarSection((Outline(tuple(discs)),), (inside,), outside)
     light = tangential_wave(wavelength_um, 0.0, 0.0)
-    operations = (IDENTITY, FLIP_Y[polarization])
+    mirror = symmetry_operation(1, -1, 1 if polarization == "x" else -1)
+    operations = (symmetry_operation(1, 1), mirror)
     radius = (2 * harmonics + 1) / math.sqrt(math.pi)
     space = reduced_orders(
         radius * math.sqrt(blocks) * block.width_um / cell.pitch_um,
