@@ -17,7 +17,7 @@ from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal import solve
 from metalens.modal.case import case_of
-from metalens.modal.engine import cached_basis, small_cached_basis, solve_on_mesh
+from metalens.modal.engine import homogeneous_basis, solve_on_mesh
 from metalens.modal.mesh import assemble_disc
 from metalens.modal.solver import LEVELS
 
@@ -67,7 +67,7 @@ def references(angle_deg: float) -> dict[tuple[float, str], complex]:
 
 def forget() -> None:
     """Whatever earlier solves left."""
-    for held in (assemble_disc, cached_basis, small_cached_basis, solve_on_mesh):
+    for held in (assemble_disc, homogeneous_basis, solve_on_mesh):
         held.cache_clear()
 
 

@@ -169,7 +169,9 @@ def _with_error(sizes_um: Array, coarse: Array, fine: Array) -> ResponseRates:
 
 
 def largest_row_error(estimate: Array, rows: Array) -> float:
-    """Largest relative error (rms over a row) of estimates of ``rows``, (causes, n)."""
+    """Largest relative error, rms over a row, of an ``estimate`` of ``rows``, both
+    (causes, n).
+    """
     norm = np.linalg.norm(rows, axis=1)
     # rates that a mirror of the cell forbids (a turn) are rounding errors
     nonzero = norm > 1e-6 * norm.max()

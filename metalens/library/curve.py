@@ -2,7 +2,7 @@
 dozen exact solves.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,22 +39,37 @@ class SolvedNodes:
     converged: bool = True
 
     def to_json(self) -> list[Any]:
-        """Lists of numbers from which :meth:`from_json` restores the nodes exactly."""
+        """Rows of numbers from which :meth:`from_json` restores the nodes exactly."""
         columns = self.diameter_um, self.response.view(float), self.error
-        return [*(column.tolist() for column in columns), self.converged]
+        return [np.column_stack(columns).tolist(), self.converged]
 
     @classmethod
     def from_json(cls, row: list[Any]) -> "SolvedNodes":
         """Inverse of :meth:`to_json`.
 
         Raises:
-            ValueError: columns of different lengths.
+            ValueError: rows that are not six numbers.
         """
-        diameters, parts, errors, converged = row
-        if not len(diameters) == len(parts) == len(errors):
-            raise ValueError("columns of different lengths")
-        response = np.array(parts).view(complex)
-        return cls(np.array(diameters), response, np.array(errors), converged)
+        rows, converged = row
+        diameter, *parts, error = np.array(rows, float).reshape(-1, 6).T
+        return cls(diameter, np.stack(parts, 1).view(complex), error, converged)
+
+    @classmethod
+    def of(
+        cls,
+        diameter_um: Sequence[float],
+        responses: list[Response],
+        converged: bool = True,
+    ) -> "SolvedNodes":
+        """Nodes from the responses at diameters, um.
+
+        Args:
+            diameter_um, responses: as they were solved.
+            converged: see the class.
+        """
+        pairs = np.array([(response.t, response.r) for response in responses])
+        error = np.array([response.t_error for response in responses])
+        return cls(np.array(diameter_um), pairs, error, converged)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -200,8 +215,9 @@ def sample_adaptively(
     earlier_fits: list[RationalFunction] = []
     predicted = 0
     while predicted < CALM and len(x) < most:
-        fit, simpler = _fits(np.array(x), _responses(responses), tolerance)
-        place, doubt = _most_doubtful(fit, [simpler, *earlier_fits[-2:]], np.array(x))
+        nodes = SolvedNodes.of(x, responses)
+        fit, simpler = _fits(nodes.diameter_um, nodes.response, tolerance)
+        place, doubt = _most_doubtful(fit, [simpler, *earlier_fits[-2:]], nodes)
         meets_data = simpler.residual <= FIT_SHARE * tolerance
         has_spare_pole = len(fit.support) > len(simpler.support)
         agreed = meets_data and has_spare_pole and doubt < tolerance / 2
@@ -215,8 +231,7 @@ def sample_adaptively(
         responses.append(response)
         earlier_fits.append(fit)
         predicted = predicted + 1 if agreed and error < tolerance else 0
-    errors = np.array([solved.t_error for solved in responses])
-    return SolvedNodes(np.array(x), _responses(responses), errors, predicted == CALM)
+    return SolvedNodes.of(x, responses, converged=predicted == CALM)
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:
@@ -243,14 +258,12 @@ def _fits(
     data, best has one pole more.
     """
     simpler = rational.fit_rational_aaa(x, y, tolerance=FIT_SHARE * tolerance)
-    best = rational.fit_rational_aaa(
-        x, y, tolerance=0.0, terms=len(simpler.support) + 1, start=simpler.support
-    )
-    return best, simpler
+    terms = len(simpler.support) + 1
+    return rational.fit_rational_aaa(x, y, tolerance=0.0, terms=terms), simpler
 
 
 def _most_doubtful(
-    fit: RationalFunction, rivals: list[RationalFunction], x: Array
+    fit: RationalFunction, rivals: list[RationalFunction], nodes: SolvedNodes
 ) -> tuple[float, float]:
     """(diameter in um, disagreement): the best next diameter, and the largest
     disagreement of t between the fits.
@@ -261,8 +274,9 @@ def _most_doubtful(
     Args:
         fit: the present fit.
         rivals: fits that it is compared with.
-        x: (n,) diameters of the nodes, um.
+        nodes: that are solved.
     """
+    x = nodes.diameter_um
     low, high = x.min(), x.max()
     poles = fit.poles()
     poles = poles[
@@ -291,8 +305,3 @@ def _most_doubtful(
 def _distance(places: Array, x: Array) -> Array:
     """(n,) distance of each place from the closest node."""
     return np.asarray(np.abs(places[:, None] - x).min(axis=1, initial=np.inf))
-
-
-def _responses(responses: list[Response]) -> Array:
-    """(n, 2) complex t and r."""
-    return np.array([(response.t, response.r) for response in responses])

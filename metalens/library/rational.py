@@ -53,20 +53,12 @@ class RationalFunction:
         pencil[1:, 1:] = np.diag(self.support)
         mass = np.eye(m + 1)
         mass[0, 0] = 0
-        alpha, beta = scipy.linalg.eig(
-            pencil, mass, right=False, homogeneous_eigvals=True
-        )
-        finite = np.abs(beta) > 1e-10 * np.abs(alpha)
-        return np.asarray(alpha[finite] / beta[finite])
+        poles = scipy.linalg.eigvals(pencil, mass)
+        return np.asarray(poles[np.isfinite(poles)])
 
 
 def fit_rational_aaa(
-    x: Array,
-    y: Array,
-    *,
-    tolerance: float,
-    terms: int | None = None,
-    start: Array | None = None,
+    x: Array, y: Array, *, tolerance: float, terms: int | None = None
 ) -> RationalFunction:
     """Rational function of least degree that meets the data within ``tolerance``, by
     the AAA algorithm.
@@ -81,17 +73,9 @@ def fit_rational_aaa(
         tolerance: largest deviation that is accepted; below the noise of the data poles
             without meaning appear.
         terms: most support points; n // 2 + 1 without it, where all data can be met.
-        start: support points to begin with (of an earlier fit), taken where they are
-            among ``x``.
     """
     limit = min(terms or len(x), len(x) // 2 + 1)
-    support = (
-        [int(i) for i in np.flatnonzero(np.isin(x, start))[:limit]]
-        if start is not None
-        else []
-    )
-    if not support:
-        support = [int(np.argmax(np.abs(y - y.mean(0)).max(1)))]
+    support = [int(np.argmax(np.abs(y - y.mean(0)).max(1)))]
     while True:
         weights, error = _weights(x, y, support)
         worst = int(np.argmax(error))

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
 from scipy.ndimage import maximum_filter1d
 
 from metalens.cell import Cell, Incidence, Polarization
@@ -350,16 +351,10 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
 
 
 def _lagrange_weights(nodes: Array, x: float) -> Array:
-    """(m,) Lagrange weights at ``x``: w_i = product over j != i of (x - x_j) / (x_i -
-    x_j).
+    """(m,) Lagrange weights at ``x``: values of the polynomials that are 1 at one node
+    and 0 at the others.
     """
-    others = [np.delete(nodes, i) for i in range(len(nodes))]
-    return np.array(
-        [
-            np.prod((x - other) / (node - other))
-            for node, other in zip(nodes, others, strict=True)
-        ]
-    )
+    return np.asarray(BarycentricInterpolator(nodes, np.eye(len(nodes)))(x))
 
 
 def with_rotations(library: PillarLibrary) -> PillarLibrary:

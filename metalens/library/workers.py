@@ -60,10 +60,7 @@ def run_task(task: SweepTask) -> SolvedNodes:
         solve = engines.solve_to_tolerance(
             cell, light, tolerance=task.tolerance, engine=task.engine
         )
-        responses = [solve(d) for d in task.sizes_um]
-        response = np.array([(item.t, item.r) for item in responses])
-        error = np.array([item.t_error for item in responses])
-        return SolvedNodes(np.array(task.sizes_um), response, error)
+        return SolvedNodes.of(task.sizes_um, [solve(d) for d in task.sizes_um])
     low, high = task.sizes_um
     solve = engines.solver_at_common_discretization(
         cell,

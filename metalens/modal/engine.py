@@ -12,9 +12,7 @@ from metalens.modal.case import ModalCase
 from metalens.modal.layer import few_modes, is_lossless, layer_modes, layer_pencil
 from metalens.modal.match import half_space, scattering_matrix, zero_order
 from metalens.modal.mesh import MeshPlan, assemble_disc
-from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes, symmetry_class
-
-SMALL = 500  # unknowns of a symmetry class: more of the bases up to it are cached
+from metalens.modal.spaces import HomogeneousBasis, homogeneous_modes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,6 +32,7 @@ class MeshSolution:
     loss: float
 
 
+@lru_cache(maxsize=8)
 def homogeneous_basis(
     rho: float, plan: MeshPlan, electric: bool, bloch: float
 ) -> HomogeneousBasis:
@@ -44,26 +43,9 @@ def homogeneous_basis(
         rho: diameter over pitch. plan: of the mesh.
         electric: whether the y walls are electric. bloch: half the Bloch phase.
     """
-    space = symmetry_class(plan, electric, bloch or None)
-    small = space.gradient.shape[0] <= SMALL
-    return (small_cached_basis if small else cached_basis)(rho, plan, electric, bloch)
-
-
-# both classes of three diameters: the probes of a curve, for either polarisation
-@lru_cache(maxsize=6)
-def cached_basis(
-    rho: float, plan: MeshPlan, electric: bool, bloch: float
-) -> HomogeneousBasis:
-    """See :func:`homogeneous_basis`, which has the same ``rho``, ``plan``, ``electric``
-    and ``bloch``.
-    """
     return homogeneous_modes(
         assemble_disc(rho, plan), plan, electric=electric, half_phase_rad=bloch or None
     )
-
-
-# what one polarisation adds to a curve, 5 MB each
-small_cached_basis = lru_cache(maxsize=48)(cached_basis.__wrapped__)
 
 
 def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ _STRAIGHT = 1e-12  # a component of k this small is 0 but for rounding
 
 
 def symmetry_operation(sx: int, sy: int, ex: int = 1) -> Operation:
-    """The map (x, y) -> (sx x, sy y), under which Ex has the sign ``ex``.
+    """The map (x, y) -> (``sx`` x, ``sy`` y), under which Ex has the sign ``ex``.
 
     A mirror keeps E along it and reverses it across: Ey has sx sy times that sign, Ez
     sx times, and Hz, as curl E, sy times.
