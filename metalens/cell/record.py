@@ -12,7 +12,7 @@ from metalens.cell.shapes.round import Circle
 from metalens.core.errors import CellError
 
 # of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
-_CLEARANCE = 0.02
+NARROWEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,13 +293,16 @@ class Cell:
         _, most_widening = self.widening_um
         widening = most_widening if most_widening > 0 else -math.inf
         if self.round:
-            return self.pitch_um - max(gap_um, _CLEARANCE * self.pitch_um + widening)
+            return self.pitch_um - max(
+                gap_um, NARROWEST_SHARE * self.pitch_um + widening
+            )
         low, high = 0.0, 4 * self.pitch_um
         while high - low > 1e-4 * self.pitch_um:
             middle = (low + high) / 2
             is_clear = self.gap_um(middle) > gap_um and (
                 widening < 0
-                or self.gap_um(middle, grow_um=widening) > _CLEARANCE * self.pitch_um
+                or self.gap_um(middle, grow_um=widening)
+                > NARROWEST_SHARE * self.pitch_um
             )
             low, high = (middle, high) if is_clear else (low, middle)
         return round(low, 4)
@@ -314,7 +317,9 @@ class Cell:
         least_widening, _ = self.widening_um
         width_um = max(
             width_um,
-            _CLEARANCE * self.pitch_um - least_widening if least_widening < 0 else 0.0,
+            NARROWEST_SHARE * self.pitch_um - least_widening
+            if least_widening < 0
+            else 0.0,
         )
         if self.round:
             return width_um

@@ -32,8 +32,6 @@ TAKES = (
     "samples",
     *("lens", "output", "far_field", "report", "quiet", "json", "force"),
 )
-SAMPLES = 401
-PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are reported
 CAPTION = "Light far behind the lens over direction cosines, +x right and +y down."
 
 
@@ -73,7 +71,7 @@ def far_field_request(options: Any, built_lens: lens.Lens) -> FarFieldRequest:
     waves = settings.wavelengths_nm or (1e3 * built_lens.wavelength_um,)
     along_x = settings.angles_deg or (0.0,)
     along_y = settings.angles_y_deg or (0.0,) * len(along_x)
-    samples = SAMPLES if options.samples is None else options.samples
+    samples = 401 if options.samples is None else options.samples
     if len(sources) > 1 or len(waves) > 1 or not 3 <= samples <= 4001:
         raise ConfigError(
             f"sources_mm = {sources}, wavelengths_nm = {waves}, samples = {samples}: a "
@@ -176,7 +174,7 @@ def far_field_values(
             "beyond": field.beyond,
             "within_deg": {
                 f"{part:g}": math.degrees(math.asin(min(field.within_sine(part), 1.0)))
-                for part in PARTS
+                for part in (0.5, 0.8, 0.95)
             },
             "beams": [
                 dataclasses.asdict(beam)

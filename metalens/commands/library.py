@@ -31,8 +31,7 @@ from metalens.library import (
 )
 from metalens.library import fit as proxy_fit
 
-LEAST_USABLE = 0.5  # least share of usable pairs of sizes in a library
-MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
+MOST_UNKNOWN = 0.5  # share of the entries that may be known too little
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,10 +373,10 @@ def two_size_failures(pillars: axes.AxesLibrary) -> list[str]:
         pillars: the library.
     """
     failures = []
-    share = float(pillars.usable.mean())
-    if share < LEAST_USABLE:
+    unknown = 1 - float(pillars.usable.mean())
+    if unknown > MOST_UNKNOWN:
         failures.append(
-            f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {pillars.sweep.bar:g} "
+            f"error bars of {unknown:.0%} of the pairs of sizes are above the tolerance {pillars.sweep.bar:g} "
             f"(median {np.median(pillars.t_error):.2g}): allow a larger tolerance or take narrower ranges"
         )
     if pillars.missed:

@@ -30,7 +30,6 @@ from metalens.fabrication.perturbations import (
     response_errors,
 )
 
-DIAMETER_STEP_NM = 2  # one class of pillars each
 DRAWN: dict[str, DrawnPerturbation] = {
     row.drawn.name: row.drawn for row in PERTURBATIONS if row.drawn
 }  # by entry, in the table's order
@@ -214,7 +213,7 @@ class PrintedProcess:
 
     bias: Bias = field(default_factory=Bias)
     spread: Spread = field(default_factory=Spread)
-    diameter_step_nm: float = DIAMETER_STEP_NM
+    diameter_step_nm: float = 2.0  # one class of pillars each
 
 
 def of_process(path: str | Path) -> PrintedProcess:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
+from numpy.polynomial.chebyshev import chebpts1
 
 from metalens.cell import Cell, index
 from metalens.core.arrays import Array
@@ -26,8 +27,7 @@ from metalens.lens import Lens
 from metalens.library import Proxy
 
 _END = 64  # the tangent at an end of a proxy: over 1/64 of its wavelength range
-_NODES = 9  # Chebyshev sizes at which pillars of own shape are solved
-_DEGREE = 5  # of the polynomials through these
+_DEGREE = 5  # of polynomials over the diameter
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,13 +210,13 @@ def proxy_sensitivity(lens: Lens) -> Sensitivity:
 def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
     """Derivatives of ln t of a lens's own pillar shape, as polynomials of degree 5.
 
-    RCWA rates (:func:`metalens.fabrication.solved_rates.own_rates`) at the 9 Chebyshev sizes of
-    the proxy's domain are fitted by least squares. ``error``: truncation of the solver
+    RCWA rates (:func:`metalens.fabrication.solved_rates.own_rates`) at the nine
+    Chebyshev sizes of the proxy's domain are fitted by least squares. ``error``: truncation of the solver
     plus the largest relative residual of the fit.
     """
     low, high = lens.proxy.domain_um
     center = (low + high) / 2
-    offset = (high - low) / 2 * np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    offset = (high - low) / 2 * chebpts1(2 * _DEGREE - 1)
     solved = own_rates(lens, center + offset)
     rows = np.vstack([solved.rates, solved.edges])
     series = polynomial.polyfit(offset, rows.T, _DEGREE)

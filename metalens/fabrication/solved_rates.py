@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 _TRUNCATIONS = (6, 8)  # harmonics of the coarser and the finer solution
 _STEP = 1e-3  # um, rad or 1 of a number of the pillar, to either side
 _WALL_STEP_RAD = 5e-3  # 0.7 um of height then moves foot and top by 3.5 nm
-_HANDS = {"left": -1.0, "right": 1.0}
 _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 
 
@@ -190,7 +189,7 @@ def polarization_weights(lens: "Lens") -> Array:
         lens: the lens.
     """
     if lens.hand:
-        incident = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)
+        incident = np.array([1.0, 1j if lens.hand == "right" else -1j]) / np.sqrt(2)
         return np.outer(incident, incident)
     along_x = lens.one_light and lens.proxy.max_angle_rad == 0
     return _ALONG_X if along_x else (_ALONG_X + _ALONG_Y) / 2

@@ -17,7 +17,6 @@ from metalens.fabrication.solved_rates import (
 )
 from metalens.lens import DiameterMap, Lens
 
-_PAIRS = 24  # pairs of sizes that are solved
 _ENTRY_UM = 5e-5  # resolution of sizes; equal rounded sizes are one kind
 
 
@@ -157,7 +156,7 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
     return np.where(width > 0, (width << 32) + length, 0)
 
 
-def pair_sensitivities(lens: Lens, *, count: int = _PAIRS) -> dict[str, ResponseRates]:
+def pair_sensitivities(lens: Lens, *, count: int = 24) -> dict[str, ResponseRates]:
     """Derivatives of ln t at size pairs of the lens, for light along "x" and along "y".
 
     Up to ``count`` pairs far from one another are solved by RCWA, by central

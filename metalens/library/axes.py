@@ -21,16 +21,14 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance, typed_reader
-from metalens.library import rational
+from metalens.library import curve, rational
 from metalens.library.curve import SolvedNodes
 from metalens.library.record import Sweep, check_light
-from metalens.library.workers import SweepJournal, SweepTask
+from metalens.library.workers import FIT_SHARE, SOLVE_SHARE, SweepJournal, SweepTask
 
 KIND = "axes-library"
-FIT_SHARE = 0.1  # residual of the rational fits, as a share of the tolerance
 # nodes along an axis: Chebyshev points of degree 6, which both others hold, 12 and 18
 LEVELS = 7, 13, 19
-SOLVER_SHARE = 0.6  # share of the tolerance left to the solver's truncation error
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -297,7 +295,7 @@ def _interpolate_in_turn(
         at_y: (q,) places.
         tolerance: of t.
     """
-    residual = FIT_SHARE * tolerance
+    residual = curve.FIT_SHARE * FIT_SHARE * tolerance
     fits = [
         rational.fit_rational_aaa(x, values[:, k], tolerance=residual)(at_x)
         for k in range(len(y))
@@ -479,7 +477,7 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in probes]
     most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
     for harmonics in range(min(5, most), most):
-        target = SOLVER_SHARE * sweep.bar
+        target = SOLVE_SHARE * sweep.bar
         options = {"tolerance": target, "harmonics": harmonics}
         if all(
             jones(cell_of_sizes(cell, x, y), x, wavelength, **options).converged  # type: ignore[arg-type]
@@ -503,7 +501,7 @@ def _choose_lines(nodes: _Nodes, sweep: Sweep) -> tuple[Array, Array]:
         values, _ = nodes.grid(x, y)
         doubt = interpolate_table((x, y), values, grid, tolerance=sweep.bar).doubt
         # a few pairs in a hundred may lie near resonances
-        if (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean() <= 0.03:
+        if (doubt > FIT_SHARE * sweep.bar).mean() <= 0.03:
             break
     return x, y
 

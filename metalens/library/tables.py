@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.constants import c
 from scipy.interpolate import CubicSpline
 
 from metalens.cell import Cell
@@ -14,13 +15,14 @@ from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 from metalens.core.foreign_arrays import read_matlab, read_npz
 from metalens.core.reading import read_text
+from metalens.core.units import deg
+from metalens.library.fit import LEAST_ENTRIES
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PillarLibrary, Sweep
 
-LIGHT_UM_THZ = 299.792458  # speed of light: wavelength in um times frequency in THz
 LENGTHS = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6}
-ANGLES = {"deg": math.pi / 180, "degrees": math.pi / 180, "rad": 1.0}
-PHASES = ANGLES | {"turns": 2 * math.pi, "waves": 2 * math.pi, "cycles": 2 * math.pi}
+ANGLES = {"deg": deg, "degrees": deg, "rad": 1.0}
+PHASES = ANGLES | dict.fromkeys(("turns", "waves", "cycles"), math.tau)
 KINDS: tuple[tuple[str, dict[str, float], str], ...] = (
     # quantity; its units in um, THz or rad; names of its column without unit
     ("size", LENGTHS, "diameter d size width"),
@@ -36,7 +38,6 @@ KINDS: tuple[tuple[str, dict[str, float], str], ...] = (
     ("error", {}, "t_error error sigma"),
 )
 NAMES = {name: kind[:2] for kind in KINDS for name in kind[2].split()}
-LEAST_SIZES = 12  # that a smooth proxy needs
 
 
 def from_table(
@@ -92,7 +93,7 @@ def from_table(
         )
     t, notes = _amplitudes(quantities, where)
     if "frequency" in quantities:
-        quantities["wavelength"] = LIGHT_UM_THZ / quantities["frequency"]
+        quantities["wavelength"] = 1e-6 * c / quantities["frequency"]  # THz
     elif wavelength_um is not None:
         quantities.setdefault("wavelength", np.full(len(t), wavelength_um))
     if "wavelength" not in quantities:
@@ -325,8 +326,8 @@ def _grid(
         np.unique(np.round(quantities[name], 9), return_inverse=True)
         for name in ("angle", "wavelength", "size")
     )
-    if len(sizes) < LEAST_SIZES:
-        raise DomainError(f"{where}: {len(sizes)} sizes; need {LEAST_SIZES} at least")
+    if len(sizes) < LEAST_ENTRIES:
+        raise DomainError(f"{where}: {len(sizes)} sizes; need {LEAST_ENTRIES} at least")
     row_of = np.full((len(angles), len(wavelengths), len(sizes)), -1)
     row_of[i, j, k] = np.arange(len(k))
     missing = np.argwhere(row_of < 0)

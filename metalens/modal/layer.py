@@ -116,7 +116,6 @@ def layer_modes(
 
 LOW = 32.0  # times the contrast: levels above are not diagonalised
 SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
-ROUNDS = 6  # of enlarging the trial space, at most
 STEPS = 80  # of the fixed point, at most
 # accuracy of a root in single precision, whose errors matter ten times less, and in
 # double
@@ -233,9 +232,7 @@ def carrying_modes(
     te_high, tm_high = (~low & (np.arange(n) < a)), (~low & (np.arange(n) >= a))
     if (sign[te_high] < 0).any() or (sign[tm_high] > 0).any():
         return None
-    for _ in range(ROUNDS):
-        if trial.shape[1] > 0.6 * n:
-            return None
+    while trial.shape[1] <= 0.6 * n:
         image = square @ trial
         growth = np.sign(sign @ trial**2)
         small = growth[:, None] * (trial.T @ (sign[:, None] * image))

@@ -2,6 +2,7 @@
 of its outlines, and a field of unit normals from its boundary.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,9 +26,7 @@ from metalens.rcwa.basis import (
 )
 from metalens.rcwa.smatrix import FourierModes, film_modes, solve_eigenmodes
 
-FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _GRID = 192  # points along the pitch on which normals are sampled
-_KEPT = 32  # coefficients of normals are cached for a multiple of this many orders
 # distance to a boundary at which the weight w falls to 1/2, over the largest distance
 _FAR = 0.5
 _TIE = 1e-9  # relative difference of distances that are equal
@@ -122,7 +121,8 @@ def normal_tables(
     radius_um = _disc_radius_um(outlines, cell)
     if radius_um:
         return _disc_normal_tables(radius_um / cell.pitch_um, reach)
-    sampled_reach = tuple(_KEPT * math.ceil(2 * r / _KEPT) for r in reach)
+    # all that the samples give, so that truncations share them
+    sampled_reach = tuple(max(2 * r, _GRID // 2 - 1) for r in reach)
     rows, columns = (
         slice(m - 2 * r, m + 2 * r + 1)
         for m, r in zip(sampled_reach, reach, strict=True)
@@ -199,7 +199,7 @@ def _radial_field(largest_order: int) -> tuple[Array, Array]:
     return even, -(mixed + mixed.T)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _sampled_normals(
     outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]
 ) -> tuple[Array, Array, Array]:
@@ -227,7 +227,9 @@ def _sampled_normals(
     products, distance = _nearest(outlines, cell, px, py)
     weight = 1 / (1 + (distance / (_FAR * distance.max())) ** 4)
     mirrors = [
-        flip for flip in FLIPS if all(outline.keeps(*flip) for outline in outlines)
+        flip
+        for flip in itertools.product((1, -1), repeat=2)
+        if all(outline.keeps(*flip) for outline in outlines)
     ]
 
     def table(values: Array, *, odd: bool = False) -> Array:

@@ -18,6 +18,7 @@ from metalens.cell import (
     check_tolerance,
     materials,
 )
+from metalens.cell.record import NARROWEST_SHARE
 from metalens.cell.shapes import Outline
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
@@ -43,7 +44,6 @@ _LAST = {4: 15, 2: 11, 1: 9}  # by the number of symmetry operations: about a se
 _LAST_TILTED = {4: 10, 2: 7, 1: 6}  # some thirty layers in place of one
 _COMPARED, MOST_COMPARED = 4, 6
 _OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow width
-NARROWEST = 0.02  # of the pitch: widths and gaps below it no truncation resolves
 _TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
 SAFETY = 7.0
 STEPS = (4, 6, 8, 12, 16, 24)  # of the staircases from which a wall is extrapolated
@@ -452,16 +452,16 @@ def truncation_sequence(
     else:
         gap = cell.gap_um(size_um)
         spans = np.array(cell.outline(size_um).spans_um) / pitch
-    # errors oscillate once in 1 / width orders; below NARROWEST a factor stands for it
-    widths = np.array([gap / pitch, *np.maximum(spans, NARROWEST)])
-    oscillation = _OSCILLATION / widths[widths >= NARROWEST].min()
+    # errors oscillate once in 1 / width orders; below NARROWEST_SHARE a factor stands for it
+    widths = np.array([gap / pitch, *np.maximum(spans, NARROWEST_SHARE)])
+    oscillation = _OSCILLATION / widths[widths >= NARROWEST_SHARE].min()
     compared = int(np.clip(math.ceil(oscillation), _COMPARED, MOST_COMPARED))
     last = (
         _largest_truncation(cell, problem.classes) if harmonics is None else harmonics
     )
     first = _FIRST + _COMPARED if harmonics is None else harmonics
-    thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST)
-    touching = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST * pitch))
+    thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST_SHARE)
+    touching = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST_SHARE * pitch))
     return TruncationSequence(
         range(max(1, first - compared), last + 1), compared, max(thin, touching)
     )

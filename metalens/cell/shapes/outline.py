@@ -16,9 +16,6 @@ _INSET = 1e-4  # of an edge, from its end
 _PROBES = np.array(
     [[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]]
 )  # over the radius, none equal
-_DIRECTIONS = np.stack(
-    [np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,11 +294,13 @@ def rotate_corners(corners: Array, angle_rad: float) -> Array:
 
 
 def _least_width(corners: Array) -> float:
-    """Least width of a polygon: distance of the closest parallel lines around it."""
-    edge = np.roll(corners, -1, axis=0) - corners
-    normals = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-    reach = corners @ np.concatenate([normals, _DIRECTIONS]).T
-    return float(np.ptp(reach, axis=0).min())
+    """Least width of a polygon: distance of the closest parallel lines around it, one of
+    which lies on an edge of the convex hull.
+    """
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(corners)
+    return float(np.ptp(corners @ hull.equations[:, :2].T, axis=0).min())
 
 
 def _is_concave(corners: Array) -> bool:
