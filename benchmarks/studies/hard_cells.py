@@ -22,7 +22,7 @@ from benchmarks import Row
 from metalens import modal, rcwa
 from metalens.cell import Cell, Incidence, Index
 from metalens.core.errors import CellError
-from metalens.modal import LEVELS, case_of, solve_level
+from metalens.modal import LEVELS, case_of, refine_case
 from metalens.modal.case import ModalCase
 
 COUNT = 1000
@@ -124,7 +124,7 @@ def referee(case: ModalCase, bar: float) -> tuple[tuple[complex, complex], float
     is far below the bar.
     """
     for level in range(FINER, len(LEVELS)):
-        found = solve_level(case, level, SHARE * bar)
+        found = refine_case(case, SHARE * bar, range(level, level + 1))
         if found.converged:
             break
     return (found.t, found.r), found.t_error

@@ -4,7 +4,7 @@ diameter.
 
 import functools
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -80,22 +80,27 @@ def solver_at_common_discretization(
         tolerance: error of t that is asked for.
         engine: rcwa or modal.
     """
-    modal = engine == "modal"
-    if cell.height_um == 0 or (modal and cell.sidewall_rad):
+    if cell.height_um == 0 or (engine == "modal" and cell.sidewall_rad):
         return functools.cache(
             solve_to_tolerance(cell, light, tolerance=tolerance, engine=engine)
         )
-    levels = (
-        _modal_levels(cell, light, tolerance)
-        if modal
-        else _rcwa_levels(cell, light, span_um[1], tolerance)
-    )
-    levels = [functools.cache(solve) for solve in levels]
     probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
-    for index, solve in enumerate(levels[:-1]):
-        if sum(not solve(probe).converged for probe in probes) <= modal:
-            return _first_converged(levels[index : index + (MESHES if modal else 1)])
-    return levels[-1]
+    if engine == "modal":
+        from metalens.modal import LEVELS, case_of, refine_case
+
+        def on_meshes(levels: range) -> Callable[[float], Response]:
+            return lambda d: refine_case(case_of(cell, d, light), tolerance, levels)
+
+        levels = range(1, len(LEVELS))
+        for level in levels:
+            on_mesh = on_meshes(range(level, level + 1))
+            if sum(not on_mesh(probe).converged for probe in probes) <= 1:
+                break
+        return functools.cache(on_meshes(levels[level - 1 : level - 1 + MESHES]))
+    for solve in map(functools.cache, _rcwa_levels(cell, light, span_um[1], tolerance)):
+        if all(solve(probe).converged for probe in probes):
+            break
+    return solve
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
@@ -108,37 +113,6 @@ def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> 
         tolerance: error of t that is asked for.
     """
     return not cell.round and bool(errors[PROBES].max() > tolerance)
-
-
-def _first_converged(
-    meshes: Sequence[Callable[[float], Response]],
-) -> Callable[[float], Response]:
-    """Solver by the first mesh that meets the tolerance at a diameter, else by the one
-    of least error; responses are cached.
-    """
-
-    @functools.cache
-    def at(diameter_um: float) -> Response:
-        responses = []
-        for mesh in meshes:
-            responses.append(mesh(diameter_um))
-            if responses[-1].converged:
-                break
-        return min(responses, key=lambda response: response.t_error)
-
-    return at
-
-
-def _modal_levels(
-    cell: Cell, light: Incidence, tolerance: float
-) -> list[Callable[[float], Response]]:
-    """Solvers of the modal method on its meshes, coarsest first."""
-    from metalens.modal import LEVELS, case_of, solve_level
-
-    def respond(level: int, diameter_um: float) -> Response:
-        return solve_level(case_of(cell, diameter_um, light), level, tolerance)
-
-    return [functools.partial(respond, level) for level in range(1, len(LEVELS))]
 
 
 def _rcwa_levels(

@@ -18,7 +18,7 @@ from numpy.polynomial import chebyshev
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 from metalens.library import polynomial
-from metalens.library.proxy import MOST_ERROR, Proxy
+from metalens.library.proxy import MOST_ERROR, Proxy, map_to_unit
 from metalens.library.record import PillarLibrary
 
 LEAST_ENTRIES = 12  # diameters in a domain
@@ -540,19 +540,10 @@ def _axes(branch: MonotonicBranch, power: int) -> tuple[Array, Array, Array]:
     """
     sine_squared = np.sin(branch.angle_rad) ** 2
     return (
-        _map_to_unit(sine_squared, 0.0),
-        _map_to_unit(branch.wavelength_um, branch.wavelength_um[0]),
-        _map_to_unit(branch.diameter_um**power, branch.diameter_um[0] ** power),
+        map_to_unit(sine_squared, 0.0, sine_squared[-1]),
+        map_to_unit(branch.wavelength_um, *branch.wavelength_um[[0, -1]]),
+        map_to_unit(branch.diameter_um**power, *branch.diameter_um[[0, -1]] ** power),
     )
-
-
-def _map_to_unit(values: Array, least: float) -> Array:
-    """Rising values mapped linearly from [least, largest] to [-1, 1]; 0 where there is
-    one value alone.
-    """
-    if len(values) == 1:
-        return np.zeros(1)
-    return np.asarray((2 * values - least - values[-1]) / (values[-1] - least))
 
 
 def _fit_chebyshev(

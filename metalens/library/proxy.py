@@ -4,7 +4,7 @@ transmission (paper Eq. 2).
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -17,6 +17,13 @@ from metalens.library.polynomial import Values
 # largest error of t: the tolerance of a library, and for the pillars of a lens the
 # root mean square of their error bars over |t|
 MOST_ERROR = 0.1
+
+
+def map_to_unit(values: Any, low: float, high: float) -> Any:
+    """``values`` mapped linearly from [``low``, ``high``] to [-1, 1]; 0 where the ends
+    are equal.
+    """
+    return (2 * values - low - high) / (high - low) if high > low else 0 * values
 
 
 def height_hint(height_um: float, turns: float) -> str:
@@ -268,11 +275,8 @@ class Proxy:
                 f"wavelength {wavelength_um:.7g} um, but the proxy holds from {low:.7g} to {high:.7g} um: sweep a "
                 "library over the wavelengths ([sweep] wavelengths_um)"
             )
-        wavelength_unit = (
-            0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
-        )
         diameter_coefficients = np.asarray(
-            chebyshev.chebval(wavelength_unit, coefficients)
+            chebyshev.chebval(map_to_unit(wavelength_um, low, high), coefficients)
         )
         return polynomial.chebyshev_curve(
             diameter_coefficients, self.domain_um, self.power, ceiling
@@ -284,6 +288,5 @@ class Proxy:
             raise DomainError(
                 f"angle {angle_rad} rad, but the proxy holds up to {self.max_angle_rad} rad"
             )
-        return min(
-            1.0, 2 * (math.sin(angle_rad) / math.sin(self.max_angle_rad)) ** 2 - 1
-        )
+        sines = math.sin(angle_rad) ** 2, math.sin(self.max_angle_rad) ** 2
+        return min(1.0, map_to_unit(sines[0], 0.0, sines[1]))

@@ -3,7 +3,6 @@ tolerance.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -79,12 +78,14 @@ def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
     return Response(t, r, error, finer.unknowns, finer.energy, "modal", met, reason)
 
 
-def refine_case(case: ModalCase, tolerance: float) -> Response:
-    """Response to a ``case`` of the lowest level that meets the ``tolerance``, else of
-    the level with the least estimate.
+def refine_case(
+    case: ModalCase, tolerance: float, levels: range = range(1, len(LEVELS))
+) -> Response:
+    """Response to a ``case`` of the lowest of the ``levels`` that meets the
+    ``tolerance``, else of the level with the least estimate.
     """
     tried = []
-    for level in range(1, len(LEVELS)):
+    for level in levels:
         tried.append(solve_level(case, level, tolerance))
         if tried[-1].converged:
             break
@@ -128,21 +129,21 @@ def solve(
     light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
-    direction: dict[str, Any] = {
-        "angle_rad": angle_rad,
-        "azimuth_rad": azimuth_rad,
-        "polarization": polarization,
-    }
     if cell.round and cell.height_um == 0:
-        return rcwa.solve(cell, diameter_um, wavelength_um, **direction)
+        return rcwa.solve(
+            cell,
+            diameter_um,
+            wavelength_um,
+            angle_rad=angle_rad,
+            azimuth_rad=azimuth_rad,
+            polarization=polarization,
+        )
     if cell.round and cell.sidewall_rad:
         return solve_tilted(
             cell,
             float(diameter_um),
             light,
-            lambda plain, d, tol: solve(
-                plain, d, wavelength_um, tolerance=tol, **direction
-            ),
+            lambda plain, d, tol: refine_case(case_of(plain, d, light), tol),
             tolerance=tolerance,
         )
     return refine_case(case_of(cell, diameter_um, light), tolerance)
