@@ -124,7 +124,7 @@ def referee(case: ModalCase, bar: float) -> tuple[tuple[complex, complex], float
     is far below the bar.
     """
     for level in range(FINER, len(LEVELS)):
-        found = refine_case(case, SHARE * bar, range(level, level + 1))
+        found = refine_case(case, SHARE * bar, (level,))
         if found.converged:
             break
     return (found.t, found.r), found.t_error

@@ -23,7 +23,7 @@ from metalens.fabrication import (
     wavelength_scale,
 )
 from metalens.lens import Lens
-from metalens.library import curve, engines
+from metalens.library import curve, workers
 
 # of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter
 # waves
@@ -116,7 +116,7 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     All solves share one mesh, so that the curve is smooth.
     """
     span = float(diameters[0]), float(diameters[-1])
-    solve = engines.solver_at_common_discretization(
+    solve = workers.solver_at_common_discretization(
         cell, Incidence(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
     )
     nodes = curve.sample_adaptively(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)

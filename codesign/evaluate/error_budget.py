@@ -24,7 +24,7 @@ from metalens.design import neighbours as supercell
 from metalens.fabrication import PrintedProcess, State, draw_lenses
 from metalens.image import Imager, Optics, node_light, normalise_psfs, with_psfs
 from metalens.lens import Lens, NeighbourRows
-from metalens.library import PillarLibrary, engines
+from metalens.library import PillarLibrary, workers
 from metalens.psf import neighbour_coupling
 
 NONE = math.nan
@@ -426,8 +426,8 @@ class ErrorBudget:
         library = self.given.library
         diameters_um = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
         tolerance = (library.sweep.bar if library else self.given.tolerance) / FINER
-        engine = engines.choose_engine(lens.cell)
-        solve = engines.solve_to_tolerance(
+        engine = workers.choose_engine(lens.cell)
+        solve = workers.solve_to_tolerance(
             lens.cell, Incidence(lens.wavelength_um), tolerance=tolerance, engine=engine
         )
         precise = np.array([solve(diameter_um).t for diameter_um in diameters_um])

@@ -219,6 +219,23 @@ class Cell:
         return (Layer(self.height_um),)
 
     @property
+    def width_slope(self) -> float:
+        """Change of width for each um of height, of tilted walls."""
+        return -2 * math.tan(self.sidewall_rad)
+
+    @property
+    def tilted_sections(self) -> list[tuple[Layer, float]]:
+        """Sections, foot first, with the widening at the middle of each by the tilted
+        wall, um.
+        """
+        sections, foot = [], -self.height_um / 2
+        for layer in self.sections:
+            growth = self.width_slope * (foot + layer.height_um / 2)
+            sections.append((layer, growth))
+            foot += layer.height_um
+        return sections
+
+    @property
     def height_shares(self) -> tuple[float, ...]:
         """Share of each section in a change of the height.
 
@@ -271,18 +288,13 @@ class Cell:
         """(least, most) that a section is wider than the size says: ends of a tilted
         wall, layers, their coats.
         """
-        slope = -2 * math.tan(self.sidewall_rad)
-        foot = -self.height_um / 2
-        bare, coated = ([0.0], [0.0]) if not self.sections else ([], [])
-        for layer in self.sections:
-            ends = [
-                layer.grow_um + slope * height
-                for height in (foot, foot + layer.height_um)
-            ]
-            foot += layer.height_um
-            bare += ends
-            coated += [wide + 2 * layer.coat_um for wide in ends]
-        return min(bare), max(coated)
+        least, most = [], []
+        for layer, growth in self.tilted_sections:
+            width = layer.grow_um + growth
+            half_um = abs(self.width_slope) * layer.height_um / 2
+            least.append(width - half_um)
+            most.append(width + half_um + 2 * layer.coat_um)
+        return min(least, default=0.0), max(most, default=0.0)
 
     def widest_um(self, gap_um: float) -> float:
         """Largest size (um) that leaves this gap between neighbours; 0 if none does.

@@ -35,9 +35,9 @@ from .response import effective_indices as effective_indices
 from .response import perturbed_transmission as perturbed_transmission
 from .response import prepare_response as prepare_response
 from .response import proxy_sensitivity as proxy_sensitivity
+from .solved_rates import PairTable as PairTable
+from .solved_rates import PillarKinds as PillarKinds
 from .solved_rates import ResponseRates as ResponseRates
 from .solved_rates import own_rates as own_rates
 from .solved_rates import pair_rates as pair_rates
-from .two_sizes import PairTable as PairTable
-from .two_sizes import PillarKinds as PillarKinds
-from .two_sizes import pair_sensitivities as pair_sensitivities
+from .solved_rates import pair_sensitivities as pair_sensitivities

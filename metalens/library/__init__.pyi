@@ -1,9 +1,7 @@
 from . import axes as axes
 from . import curve as curve
-from . import engines as engines
 from . import fit as fit
 from . import plots as plots
-from . import rational as rational
 from . import record as record
 from . import study as study
 from . import workers as workers

@@ -21,7 +21,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance, typed_reader
-from metalens.library import curve, rational
+from metalens.library import curve
 from metalens.library.curve import SolvedNodes
 from metalens.library.record import Sweep, check_light
 from metalens.library.workers import FIT_SHARE, SOLVE_SHARE, SweepJournal, SweepTask
@@ -297,15 +297,12 @@ def _interpolate_in_turn(
     """
     residual = curve.FIT_SHARE * FIT_SHARE * tolerance
     fits = [
-        rational.fit_rational_aaa(x, values[:, k], tolerance=residual)(at_x)
+        curve.fit_rational_aaa(x, values[:, k], tolerance=residual)(at_x)
         for k in range(len(y))
     ]
     columns = np.stack(fits, axis=1)
     return np.stack(
-        [
-            rational.fit_rational_aaa(y, line, tolerance=residual)(at_y)
-            for line in columns
-        ]
+        [curve.fit_rational_aaa(y, line, tolerance=residual)(at_y) for line in columns]
     )
 
 

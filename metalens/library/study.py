@@ -12,12 +12,11 @@ from metalens.cell import Cell, Incidence, Material, index
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import CommandConsole
-from metalens.library import engines
 from metalens.library.curve import ResponseCurve
 from metalens.library.fit import find_faults, find_runs
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
-from metalens.library.workers import SweepJournal, SweepTask, fit_curve
+from metalens.library.workers import SweepJournal, SweepTask, choose_engine, fit_curve
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +154,7 @@ def run_study(
             Incidence(wavelength),
             _span(study, cell),
             study.tolerance,
-            engines.choose_engine(cell),
+            choose_engine(cell),
         )
         for cell, wavelength in cases
     ]

@@ -15,7 +15,7 @@ from metalens.core import config
 from metalens.core.arrays import Array
 from metalens.core.report import CommandConsole
 from metalens.core.store import Provenance
-from metalens.library import engines, workers
+from metalens.library import workers
 from metalens.library.curve import ResponseCurve
 from metalens.library.geometric_phase import solve_rotations
 from metalens.library.record import PillarLibrary, Sweep, check_sweep
@@ -70,7 +70,7 @@ class _SweepRun:
         self.sweep = sweep
         self.span = sweep.span_um(cell)
         self.console = console or CommandConsole(quiet=True)
-        self.engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
+        self.engine = workers.choose_engine(cell, sweep.engine)
         self.journal = SweepJournal(checkpoint, cell, sweep)
         self.curves: dict[Incidence, ResponseCurve] = {}
 
@@ -185,7 +185,7 @@ class _SweepRun:
             bar = self.sweep.bar
             misses = row[2].real > bar
             curve = self.curves.get(light)
-            if curve and engines.is_at_finest_discretization(
+            if curve and workers.is_at_finest_discretization(
                 self.cell, curve.nodes.error, bar * workers.SOLVE_SHARE
             ):
                 misses &= curve.solver_error(diameters) <= bar

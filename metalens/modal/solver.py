@@ -3,6 +3,7 @@ tolerance.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
 
 
 def refine_case(
-    case: ModalCase, tolerance: float, levels: range = range(1, len(LEVELS))
+    case: ModalCase, tolerance: float, levels: Sequence[int] = range(1, len(LEVELS))
 ) -> Response:
     """Response to a ``case`` of the lowest of the ``levels`` that meets the
     ``tolerance``, else of the level with the least estimate.

@@ -3,9 +3,9 @@ from .fields import FieldGrid as FieldGrid
 from .fields import NearField as NearField
 from .fields import near_field as near_field
 from .fields import near_fields as near_fields
+from .permittivity import staircase_layers as staircase_layers
 from .reference import OrderResponse as OrderResponse
 from .reference import solve_textbook_rcwa as solve_textbook_rcwa
-from .sidewall import staircase_layers as staircase_layers
 from .solver import SAFETY as SAFETY
 from .solver import CellProblem as CellProblem
 from .solver import JonesResponse as JonesResponse

@@ -4,7 +4,7 @@ of its outlines, and a field of unit normals from its boundary.
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -76,6 +76,21 @@ def pillar_section(
     coated = cell.outline(size_um, grow_um=width + side * layer.coat_um)
     outlines = (coated, wall) if cell.shape.hole else (wall, coated)
     return PillarSection(outlines, (pillar, eps(layer.coat)), around)
+
+
+def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
+    """Staircase approximation: the sections of a ``cell``, each of a tilted wall cut
+    into ``steps`` upright ones of equal height.
+    """
+    count = steps if cell.sidewall_rad else 1
+    layers = []
+    for layer, growth in cell.tilted_sections:
+        step_um = layer.height_um / count
+        for i in range(count):
+            step_growth = (i + 0.5 - count / 2) * step_um * cell.width_slope
+            width = layer.grow_um + growth + step_growth
+            layers.append(replace(layer, height_um=step_um, grow_um=width))
+    return layers
 
 
 def permittivity_coefficients(

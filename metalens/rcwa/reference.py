@@ -7,8 +7,7 @@ import numpy as np
 
 from metalens.cell import Cell, index
 from metalens.core.arrays import Array
-from metalens.rcwa.permittivity import PillarSection, pillar_section
-from metalens.rcwa.sidewall import staircase_layers
+from metalens.rcwa.permittivity import PillarSection, pillar_section, staircase_layers
 
 
 @dataclass(frozen=True, eq=False, slots=True)

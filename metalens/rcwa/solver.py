@@ -32,8 +32,12 @@ from metalens.rcwa.basis import (
     symmetry_operation,
     tangential_wave,
 )
-from metalens.rcwa.permittivity import PillarSection, pillar_section, section_modes
-from metalens.rcwa.sidewall import sections_with_growth, staircase_layers, width_slope
+from metalens.rcwa.permittivity import (
+    PillarSection,
+    pillar_section,
+    section_modes,
+    staircase_layers,
+)
 from metalens.rcwa.smatrix import film_modes, scatter_zero_order
 
 _ROUNDING = 1e-13
@@ -199,9 +203,9 @@ def check_size(cell: Cell, size_um: float) -> None:
         raise CellError(f"size = {size_um} um: need a finite length {least}")
     if size_um == 0:
         return
-    for layer, grow in sections_with_growth(cell):
+    for layer, grow in cell.tilted_sections:
         for end, share in (("foot", -0.5), ("top", 0.5)):
-            width = layer.grow_um + grow + share * width_slope(cell) * layer.height_um
+            width = layer.grow_um + grow + share * cell.width_slope * layer.height_um
             if cell.round and size_um + width < -_ROUNDING:
                 raise CellError(
                     f"diameter {size_um:g} um: the wall of {cell.sidewall_rad:.4g} rad "

@@ -14,7 +14,7 @@ from codesign.optics import stack as optics
 from codesign.optics.lens_errors import DrawnLensErrors
 from metalens.cell import Incidence, Index
 from metalens.image.pupil import coordinates
-from metalens.library import DEFAULT_CELL, engines
+from metalens.library import DEFAULT_CELL, workers
 
 SETTINGS = optics.OpticsConfig()
 BARE, NONE = dataclasses.replace(SETTINGS, polynomials=0), torch.zeros(0)
@@ -140,7 +140,7 @@ def test_the_phases_that_training_takes_are_those_of_the_solver():
     at, both ends among them.
     """
     low, high = SETTINGS.proxy.domain_um
-    solve = engines.solver_at_common_discretization(
+    solve = workers.solver_at_common_discretization(
         DEFAULT_CELL, Incidence(0.85), (low, high), tolerance=1e-3, engine="modal"
     )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])

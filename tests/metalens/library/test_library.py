@@ -18,7 +18,7 @@ from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
 from metalens.core.errors import CellError, ConfigError, DomainError, MaterialError
 from metalens.core.report import CommandConsole
-from metalens.library import engines
+from metalens.library import workers
 from metalens.library.record import DEFAULT_CELL, PillarLibrary, Sweep
 
 COARSE = Sweep(wavelengths_um=(0.84, 0.86), samples=40, tolerance=2e-2)
@@ -136,16 +136,16 @@ def test_loading_a_library_needs_neither_torch_nor_matplotlib():
 
 def test_films_go_to_the_modal_solver_and_other_shapes_to_rcwa():
     coated = dataclasses.replace(DEFAULT_CELL, over=(Film(Index(1.45), 0.1),))
-    assert engines.choose_engine(coated) == "modal"
+    assert workers.choose_engine(coated) == "modal"
     assert (
-        engines.solve_to_tolerance(
+        workers.solve_to_tolerance(
             coated, Incidence(0.85), tolerance=5e-2, engine="modal"
         )(0.1).engine
         == "modal"
     )
     square = dataclasses.replace(DEFAULT_CELL, shape=Square())
     small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12), engine="modal")
-    assert engines.choose_engine(square) == "rcwa"
+    assert workers.choose_engine(square) == "rcwa"
     with pytest.raises(
         CellError, match="round pillars on a square lattice, not square on a square"
     ):
