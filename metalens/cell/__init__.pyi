@@ -12,6 +12,7 @@ from .orders import describe_order_loss as describe_order_loss
 from .orders import named_orders as named_orders
 from .orders import no_resonance_um as no_resonance_um
 from .orders import substrate_orders as substrate_orders
+from .record import NARROWEST_SHARE as NARROWEST_SHARE
 from .record import Blend as Blend
 from .record import Cell as Cell
 from .record import Film as Film

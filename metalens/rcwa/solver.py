@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from metalens.cell import (
+    NARROWEST_SHARE,
     Cell,
     Film,
     Incidence,
@@ -18,7 +19,6 @@ from metalens.cell import (
     check_tolerance,
     materials,
 )
-from metalens.cell.record import NARROWEST_SHARE
 from metalens.cell.shapes import Outline
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
