@@ -1,8 +1,5 @@
-"""Refractive index of the materials of a cell: published ones with source and range,
-own CSV or YAML, plain numbers.
-
-YAML files are pages of refractiveindex.info (:mod:`metalens.cell.dispersion`).
-Time factor exp(-iwt): an absorbing material has k > 0. Nothing is extrapolated.
+"""Refractive index of materials, exp(-iwt): published ones, own CSV or YAML files
+(:mod:`metalens.cell.dispersion`), plain numbers. Nothing is extrapolated.
 """
 
 import cmath

@@ -1,5 +1,5 @@
-"""A process: how much of each perturbation a fabricated lens has, what a process leaves
-uncertain, lenses drawn from it, and what PROCESS.toml says of the fabricated lens.
+"""State and spread of the perturbations of a process, lenses drawn from it, and its part
+of PROCESS.toml.
 """
 
 import dataclasses

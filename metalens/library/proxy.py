@@ -289,4 +289,4 @@ class Proxy:
                 f"angle {angle_rad} rad, but the proxy holds up to {self.max_angle_rad} rad"
             )
         sines = math.sin(angle_rad) ** 2, math.sin(self.max_angle_rad) ** 2
-        return min(1.0, map_to_unit(sines[0], 0.0, sines[1]))
+        return float(min(1.0, map_to_unit(sines[0], 0.0, sines[1])))
