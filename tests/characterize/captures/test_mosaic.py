@@ -1,6 +1,5 @@
 """Raw colour mosaics taken apart, and values of TIFF files that are not light."""
 
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -9,11 +8,8 @@ import pytest
 import tifffile
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import bench_lens as b
 
 from characterize.captures import capture
-from characterize.inference import prepare
-from characterize.model.detector import DetectorGrid, detector_transfers
 from metalens.core.errors import CaptureError
 
 RAW = np.random.default_rng(31).integers(40, 900, (3, 11, 14)).astype(np.uint16)
@@ -50,17 +46,6 @@ def test_the_lit_colour_of_a_mosaic_is_taken_at_twice_the_pitch(
     assert np.array_equal(found.dark, RAW[:2, row::2, column::2] // 9)
     assert (found.pixel_um, found.fill) == (3.4, 0.5)
     assert any("one pixel in four" in words for words in found.corrections)
-
-
-def test_an_error_of_the_pitch_is_the_same_share_of_a_mosaic(tmp_path):
-    """0.034 of 1.7 um: 2 %, at either pitch."""
-    found = capture.load(
-        folder(tmp_path, 'channel = "green"\nmosaic = "GBRG"\nwavelength_um = 0.85')
-    )
-    known = {k.name: k for k in prepare.stated_priors(found, b.row())}
-    assert known["pixel_percent"].sigma == pytest.approx(2.0)
-    placed = dataclasses.replace(found, position_um=np.array([400.0, 500.0, 600.0]))
-    assert prepare.setting_of(placed, 48)[0].fill == 0.5
 
 
 @pytest.mark.parametrize(
@@ -106,25 +91,3 @@ def test_places_in_a_table_of_colours_are_no_light(tmp_path):
     )
     with pytest.raises(CaptureError, match="table of colours"):
         capture.load(tmp_path / "f.tif")
-
-
-def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
-    """Every second of small pixels: the same numbers as those of the whole sensor, half
-    a pixel off, to rounding.
-    """
-    light = np.random.default_rng(5).normal(size=(2, 2 * 4 * (9 + 4), 2 * 4 * (7 + 4)))
-    whole = DetectorGrid(18, 14, 1.7, 4, margin=4)
-    part = DetectorGrid(9, 7, 3.4, 8, margin=2, fill=0.5)
-    for blur, size in ((0.3, 0.0), (0.3, 2.1)):
-        sizes = np.full(2, size)
-        every = whole.sample(
-            np.roll(light, (2, 2), (1, 2)),
-            detector_transfers(whole, blur, sizes, np.ones(2))[0],
-        )
-        some = part.sample(light, detector_transfers(part, blur, sizes, np.ones(2))[0])
-        assert _nearest(some, every) < 1e-9
-
-
-def _nearest(some, every):
-    """Largest difference to every second pixel, whichever these are."""
-    return min(abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1))

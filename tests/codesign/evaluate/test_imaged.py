@@ -22,7 +22,7 @@ from metalens.optics import Layers
 from tests.codesign import made_lens as m
 from tests.command_line import call
 
-CAMERA = PinholeCamera(24, 3.0)
+CAMERA = PinholeCamera(20, 4.8)
 RIG = replace(CameraRig(), elevation_rad=0.6)
 LENS = design.make(
     design.phase_of(None, Focus(0.85, 300.0, 3000.0), radius_um=25.0),
@@ -75,13 +75,13 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
         seen.append(rig.sensor_distance_um)
         return render(states, rig=rig, camera=camera)
 
-    made = scene_image.image_first_frames(behind, PinholeCamera(16, 4.0), RIG, rendered)
+    made = scene_image.image_first_frames(behind, PinholeCamera(16, 8.0), RIG, rendered)
     assert seen == [pytest.approx(280.0)]
-    beside = 36  # samples of 4 um: half a window of 288 um
-    rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 4.0 / 280.0))
+    beside = 18  # samples of 8 um: half a window of 288 um
+    rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 8.0 / 280.0))
     assert made.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert made.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
-    assert made.psf.shape[3:] == (73, 73)
+    assert made.psf.shape[3:] == (37, 37)
 
 
 def test_what_is_written_is_what_is_shown(found, tmp_path):
@@ -97,7 +97,7 @@ def test_what_is_written_is_what_is_shown(found, tmp_path):
 
 def test_the_command_images_through_a_lens_file(tmp_path, capsys):
     lens.save(tmp_path / "lens.h5", LENS)
-    (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 4.0\n")
+    (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 8.0\n")
     words = f"scene {tmp_path}/scene.toml -o {tmp_path}/out"
     assert call(f"{words} --fwhm-nm 20") == 2
     assert "need 0 or more, and --lens" in capsys.readouterr().err

@@ -124,21 +124,6 @@ def test_a_rim_hides_what_is_behind_it_and_stands_nearer():
     assert 49.5 < float(out.labels.centroid_px[0, 0]) < 54.5 - 1
 
 
-def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
-    """The renderer leaves the depth of the eye at 0 where skin hides it: most of the
-    frame here.
-    """
-    made = scene(opening=(28, 34))
-    made.frames.depth_um[:, 1, :28] = 0
-    made.frames.depth_um[:, 1, 34:] = 0
-    out = put_on(made, rim=0.1)
-    there = out.frames.depth_um[0, 0] != made.frames.depth_um[0, 0]
-    assert bool(there.any())
-    assert out.frames.depth_um[0, 0][there].unique().tolist() == pytest.approx(
-        [0.7 * 20e3]
-    )
-
-
 def test_dressed_frames_have_a_depth_wherever_they_are_seen():
     made = SCENES.rendered(4, 8)  # a rim is among them
     flat = flatten_layers(made.frames, torch.ones(8))

@@ -122,35 +122,6 @@ def test_read_noise_of_an_area_falls_as_the_inverse_of_the_pitch(exact):
     assert float(slope) == pytest.approx(-2 * 900 / 8.0, rel=0.06)
 
 
-def test_frames_for_a_coarser_grid_are_the_same_and_know_only_the_reads():
-    light = _wave(24.0)[None].float()
-    quiet = Sensor(8.0, 8.0, 500.0, 0.0, 1e5, 0.0)
-    found = {}
-    for resized in (False, True):
-        pitch = _pitch(8.0)
-        generator = torch.Generator().manual_seed(1)
-        frames = read_out(
-            light,
-            SAMPLE_UM,
-            pitch,
-            quiet,
-            generator=generator,
-            exact=False,
-            resized=resized,
-        )
-        weights = (
-            torch.arange(frames.numel(), dtype=torch.float32)
-            .reshape(frames.shape)
-            .cos()
-        )
-        (slope,) = torch.autograd.grad((frames * weights).sum(), pitch)
-        found[resized] = frames.detach(), float(slope)
-    torch.testing.assert_close(found[True][0], found[False][0], rtol=1e-5, atol=1e-5)
-    # no read noise, so nothing that a coarser grid would see
-    assert found[True][1] == 0.0
-    assert found[False][1] != 0.0
-
-
 def test_a_network_sees_frames_of_mean_0_and_deviation_1_and_dark_ones_as_nothing():
     """Numpy's deviation of a sample; a frame without any contrast is not blown up by
     its rounding.

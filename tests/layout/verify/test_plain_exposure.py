@@ -89,9 +89,7 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
 @pytest.mark.parametrize(
     ("alpha_um", "beta_um", "eta", "thinnest_um"),
     [
-        pytest.param(0.017, 11.3, 0.7, 0.11, marks=pytest.mark.slow),
         (0.008, 3.7, 0.9, 0.11),
-        pytest.param(0.025, 4.3, 0.6, 0.11, marks=pytest.mark.slow),
         pytest.param(0.041, 3.1, 0.8, 0.11, marks=pytest.mark.slow),
         pytest.param(0.06, 2.9, 0.7, 0.25, marks=pytest.mark.slow),
     ],

@@ -77,18 +77,6 @@ def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():
     assert flat.steepest == (0.5, 0.3)
 
 
-def test_the_share_left_in_the_focus_is_the_square_of_the_mean_amplitude():
-    """A ring that turns by 0.31 and one, twice as large, by 0.44."""
-    made = rows()
-    ring = [
-        np.mean([power(s, d, f) for d in (0, 1) for f in (0, 1)]) for s in (0.31, 0.44)
-    ]
-    want = abs(ring[0] / 3 + 2 * ring[1] / 3) ** 2
-    assert made.share(
-        np.array([0.31, 0.44]), np.array([1 / 3, 2 / 3])
-    ) == pytest.approx(want, rel=1e-12)
-
-
 def test_a_lens_file_carries_its_rows(tmp_path):
     proxy = proxy_of([6.0, 10.0], [0.9, -0.03], (0.08, 0.32), (0.5, 0.6), 1e-6)
     cell = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))

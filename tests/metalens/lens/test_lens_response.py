@@ -3,14 +3,12 @@ numpy.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
 from metalens.cell import Cell, Index
-from metalens.core.errors import DomainError
 from metalens.lens import DiameterMap, Lens, response
 from metalens.library import Proxy
 
@@ -67,18 +65,3 @@ def test_phase_and_transmission_are_the_series_wrapped(dtype, most):
     assert np.abs(level - series(LEVEL, d))[lit].max() < most
     assert not phase[~lit].any()
     assert not level[~lit].any()
-
-
-def test_what_a_proxy_does_not_know_is_refused_by_name():
-    made, out = lens(2, 3), [np.empty((2, 3)) for _ in range(2)]
-    for at, word in (((0.79, TILT), "wavelength"), ((WAVE, 0.41), "angle")):
-        with pytest.raises(DomainError, match=word):
-            response.fill_response(made, at, *out)
-    thin = made.diameters.diameter_um.copy()
-    thin[1, 2] = 0.085
-    with pytest.raises(DomainError, match=r"diameters run from 0\.085"):
-        response.fill_response(
-            replace(made, diameters=replace(made.diameters, diameter_um=thin)),
-            (WAVE, TILT),
-            *out,
-        )
