@@ -94,7 +94,7 @@ def hexagonal():
 CASES = [
     (hook, 0.0, 0.0, (6, 6)),
     (hook, 0.17, 0.9, (6, 6)),
-    (layered, 0.3, 0.35, (6, 6)),
+    pytest.param(layered, 0.3, 0.35, (6, 6), marks=pytest.mark.slow),
     (hexagonal, 0.12, 0.8, (4, 7)),
 ]
 

@@ -110,7 +110,8 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
 
 
 @pytest.mark.parametrize(
-    ("height_um", "pitch_um", "wavelength_nm"), [(None, None, 850.0), (1.1, 0.4, 940.0)]
+    ("height_um", "pitch_um", "wavelength_nm"),
+    [(None, None, 850.0), pytest.param(1.1, 0.4, 940.0, marks=pytest.mark.slow)],
 )
 def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have(
     height_um, pitch_um, wavelength_nm

@@ -196,7 +196,8 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     assert going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS
 
 
-@pytest.mark.parametrize("pitch_um", [18.3, pytest.param(21.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("pitch_um", [18.3, 21.1])
 def test_no_network_that_is_found_takes_more_than_its_budget(
     settings, tmp_path, pitch_um
 ):

@@ -265,6 +265,7 @@ def test_a_turned_lens_has_its_study(monkeypatch):
     assert "walls" not in made[1].text
 
 
+@pytest.mark.slow
 def test_sensitivities_agree_with_an_independent_solver():
     cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
     narrow = dataclasses.replace(PROXY, domain_um=(0.13, 0.16))

@@ -146,7 +146,11 @@ def _eye(seed):
 
 
 @pytest.mark.parametrize(
-    ("case", "tolerance"), [("axis, film and stop", 0.1), ("25 degrees", 0.01)]
+    ("case", "tolerance"),
+    [
+        pytest.param("axis, film and stop", 0.1, marks=pytest.mark.slow),
+        ("25 degrees", 0.01),
+    ],
 )
 def test_eye_like_frames_and_planes_err_by_no_more_than_is_stated(case, tolerance):
     """The direct sum interpolates nothing: each source has the PSF of its depth."""
@@ -174,6 +178,7 @@ def test_eye_like_frames_and_planes_err_by_no_more_than_is_stated(case, toleranc
         assert float((got - want).norm() / want.norm()) < made.error
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_psfs_and_by_depth_are_those_of_the_direct_sum():
     """All PSFs moved by a sample, and the depth of a tilted plane, by differences."""
     made = _made("axis", 0.1)
@@ -252,7 +257,10 @@ def _behind_edge(near, far, edge, finer, rows):
     return light
 
 
-@pytest.mark.parametrize(("near", "far", "edge"), [(3e3, 12e3, 11), (3.5e3, 6e3, 9)])
+@pytest.mark.parametrize(
+    ("near", "far", "edge"),
+    [(3e3, 12e3, 11), pytest.param(3.5e3, 6e3, 9, marks=pytest.mark.slow)],
+)
 def test_occlusion_is_that_of_every_point_through_its_part_of_the_aperture(
     near, far, edge
 ):
