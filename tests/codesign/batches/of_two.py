@@ -22,8 +22,6 @@ from metalens.core.errors import TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
-SHAPES = ((2, 3), (4,), (), (3, 1, 2))
-KINDS = (torch.float32, torch.float64, torch.float32, torch.float32)
 ITEMS = [3, 4, 5, 6, 7]
 
 
@@ -83,29 +81,6 @@ def searched():
     return evolution.state_to_json(evolution.EvolutionState(history)), len(judged)
 
 
-def gradients(rank):
-    """Of a process, of shapes and dtypes of their own."""
-    draw = torch.Generator().manual_seed(3 + rank)
-    return [
-        torch.randn(s, generator=draw, dtype=kind)
-        for s, kind in zip(SHAPES, KINDS, strict=True)
-    ]
-
-
-def averaged():
-    """Gradients after they were averaged, between two parameters that have none."""
-    parameters = [
-        torch.nn.Parameter(g.clone())
-        for g in (torch.zeros(7), *gradients(0), torch.zeros(2))
-    ]
-    for parameter, grad in zip(
-        parameters[1:-1], gradients(parallel.process_rank()), strict=True
-    ):
-        parameter.grad = grad
-    parallel.average_gradients(parameters)
-    return [parameter.grad for parameter in parameters]
-
-
 def batch(count):
     """Frames with their pose, no two numbers alike."""
     draw = torch.Generator().manual_seed(9)
@@ -117,29 +92,6 @@ def batch(count):
         torch.rand(count, 3, generator=draw),
         pose,
     )
-
-
-def normal():
-    """Values, weights and biases to normalise, and the weights of a loss of the result."""
-    draw = torch.Generator().manual_seed(0)
-    x, loss = (
-        torch.randn(4, 3, 5, 6, generator=draw, dtype=torch.float64) for _ in range(2)
-    )
-    weight, bias = (
-        torch.rand(3, generator=draw, dtype=torch.float64) + more for more in (0.5, 0.0)
-    )
-    return x, weight, bias, loss
-
-
-def normalised():
-    """This process's half of the values, normalised, and the gradient of the whole loss
-    to them.
-    """
-    x, weight, bias, loss = normal()
-    half = slice(2 * parallel.process_rank(), 2 * parallel.process_rank() + 2)
-    mine = x[half].requires_grad_()
-    out = parallel.batch_norm(mine, weight, bias)
-    return out.detach(), torch.autograd.grad((out * loss[half]).sum(), mine)[0]
 
 
 def refused():
@@ -158,9 +110,7 @@ def main(folder: Path) -> None:
     found = {
         "trained": trained(),
         "searched": searched(),
-        "averaged": averaged(),
         "part": parallel.batch_share(batch(6)),
-        "normalised": normalised(),
         "refused": refused(),
         "mean": parallel.mean_of([1.5 + rank, -2.0 * rank]),
         "each": parallel.share_work(

@@ -61,19 +61,6 @@ def test_processes_share_the_candidates_of_a_search_and_find_the_same(two):
     assert [each["searched"] for each in two] == [(history, judged / 2)] * 2
 
 
-def test_gradients_are_means_over_processes_each_in_its_place(two):
-    """Shapes and dtypes of their own, and parameters without a gradient before and
-    after.
-    """
-    want = [
-        (a + b) / 2
-        for a, b in zip(of_two.gradients(0), of_two.gradients(1), strict=True)
-    ]
-    for found in (each["averaged"] for each in two):
-        assert found[0] is found[-1] is None
-        torch.testing.assert_close(found[1:-1], want)
-
-
 def test_every_process_takes_its_frames_with_their_pose_and_its_share_of_the_work(two):
     whole = of_two.batch(6)
     for rank, found in enumerate(two):
@@ -92,19 +79,6 @@ def test_every_process_takes_its_frames_with_their_pose_and_its_share_of_the_wor
         assert found["each"] == [10.0 * item for item in of_two.ITEMS]
         assert found["done"] == of_two.ITEMS[rank::2]
         assert found["refused"].startswith("a batch of 5 frames on 2 processes")
-
-
-def test_normalisation_over_processes_is_that_of_torch_in_one(two):
-    """Values and gradients: every process's loss depends on every process's values."""
-    x, weight, bias, loss = of_two.normal()
-    want = torch.nn.functional.batch_norm(
-        x.requires_grad_(), None, None, weight, bias, training=True
-    )
-    (slope,) = torch.autograd.grad((want * loss).sum(), x)
-    for at, expected in ((0, want.detach()), (1, slope)):
-        torch.testing.assert_close(
-            torch.cat([each["normalised"][at] for each in two]), expected
-        )
 
 
 def test_a_lost_process_is_named_with_the_way_on(two):
