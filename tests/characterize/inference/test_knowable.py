@@ -20,13 +20,6 @@ SCALE = np.array([PARAMETERS[PLACE[name]].scale for name in NAMES])
 TURN = np.linalg.qr(np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.2, 1.0]]))[0]
 
 
-def test_directions_are_in_typical_units():
-    information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
-    values, vectors = identifiability.information_eigenvectors(NAMES, information)
-    assert values == pytest.approx([4.0, 90.0, 700.0])
-    assert np.abs((vectors * TURN).sum(0)) == pytest.approx(np.ones(3))
-
-
 def test_a_combination_is_told_where_frames_halve_what_was_known():
     """Values 4, 90 and 700 are known to 0.5, 0.105 and 0.038; a prior of 0.24 alone is
     halved by the latter two.

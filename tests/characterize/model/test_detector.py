@@ -57,19 +57,6 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
 
 
 @pytest.mark.parametrize("over", [1, 2, 3, 4])
-def test_fine_samples_share_each_pixel_evenly(over):
-    grid = DetectorGrid(5, 8, 2.4, over, margin=3)
-    for axis, pixels in zip(grid.axes_um(), (5, 8), strict=True):
-        assert len(axis) == (pixels + 6) * over
-        centre = axis.reshape(-1, over).mean(1)
-        assert centre == pytest.approx(
-            (np.arange(pixels + 6) - (pixels - 1) / 2 - 3) * 2.4, abs=1e-12
-        )
-        assert np.diff(axis) == pytest.approx(np.full(len(axis) - 1, 2.4 / over))
-    assert grid.fine_um == pytest.approx(2.4 / over)
-
-
-@pytest.mark.parametrize("over", [1, 2, 3, 4])
 def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over):
     """Waves that close on the grid: the pixel at (r, c) sees cos(2π f·place), turned
     and weakened by the transfer.

@@ -1,14 +1,12 @@
 """Eqs. 4 to 6 in training beside plain sums, and their gradient beside differences."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from codesign.batches import EyeScenes, SceneConfig, sensor_irradiance
-from codesign.eye import moved_states
 from codesign.optics import stack as lens
 from codesign.optics.stack import OpticsConfig
 from codesign.train.separability import (
@@ -63,21 +61,6 @@ def test_the_fisher_matrix_is_the_plain_sum_over_pixels():
     assert float(found.loss.value) == pytest.approx(loss, rel=5e-3)
     cosine = want[0, 3] / math.sqrt(want[0, 0] * want[3, 3])
     assert float(found.angle_rad) == pytest.approx(math.acos(cosine), abs=0.01)
-
-
-def test_motions_are_steps_of_one_coordinate_at_the_anchor_s_exposure():
-    states = SCENES.states(0, 2)
-    _, gaze, *slips = moved_states(states, CONFIG.directions)
-    assert torch.allclose(
-        gaze.gaze_rad - states.gaze_rad,
-        torch.tensor([math.radians(0.2), 0.0], dtype=torch.float64),
-    )
-    for axis, moved in enumerate(slips):
-        step = (moved.slip_um - states.slip_um).numpy()
-        assert step == pytest.approx(np.tile(40.0 * np.eye(3)[axis], (2, 1)))
-    axial = moved_states(states, replace(CONFIG, motions="axial").directions)
-    assert len(axial) == 3
-    assert float((axial[2].slip_um - states.slip_um)[0, 2]) == pytest.approx(40.0)
 
 
 def test_the_loss_has_the_gradient_that_differences_say():
