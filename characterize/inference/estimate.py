@@ -122,7 +122,9 @@ def _fit(
     known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
     sizes = unfitted_sizes(known, lens)
     check_enough(data, multistart.names_of(known, options.free))
-    stated = {*options.free, *(k.name for k in options.known)}
+    # what is as designed needs no slope
+    changed = (k.name for k in options.known if k.value or k.sigma)
+    stated = {*options.free, *changed}
     response = response or log_response_slopes(lens, names=stated)
     model = ForwardModel(lens, setting, response)
     start = parameter_vector({name: k.value for name, k in known.items()})
@@ -158,8 +160,7 @@ def _fit(
             "slopes of the pillars by height and index are known to "
             f"{model.response.error:.0%} only"
         )
-    unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
-    fast = quick_enough(task.model, task.data, unbiased)
+    fast = quick_enough(task.model, task.data, multistart.starting_point(task))
     task = dataclasses.replace(task, model=fast)
     task, ends = multistart.search_modes(task)
     task, ends = multistart.place_windows(task, ends)

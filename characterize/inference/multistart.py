@@ -29,7 +29,6 @@ from characterize.model import (
     parameter_vector,
     usual_parameters,
 )
-from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import wavelength_scale
@@ -42,8 +41,9 @@ _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ASIDE_UM = 50.0  # largest offset of a window
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
-_PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of a prior
+_PLACES = (-1.8, -0.9, 0.9, 1.8)  # of starts, in sigma of a prior
 _ONWARD = SolverSettings(iterations=25, step_tolerance=0.3, near=1.0, finish=False)
+_TRIAL = SolverSettings(iterations=6, step_tolerance=0.5, near=math.inf, finish=False)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 _WORTH = 10.0
 
@@ -121,9 +121,7 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
         return tasks[0]
     few = few_frames(tasks[0].model.setting)
     rough = [task.rough() for task in tasks]
-    tries = [
-        _short(task, few, starting_points(task, biases_nm=(0.0,)))[0] for task in rough
-    ]
+    tries = [_short(task, few, starting_point(task)) for task in rough]
     merits = np.array([trial.merit for trial in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
@@ -149,44 +147,52 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
 def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
-    1. Short fits on a few frames, from the nominal lens, other global biases and
-       astigmatic wave fronts.
-    2. The best of these to the end.
-    3. Other promising ones, and mirrored starts, to the end.
+    Short fits to a few frames from the nominal lens and from astigmatic ones place the
+    windows; the best of them is fitted to all frames, and :func:`find_other_modes`
+    starts from its end and from the promising others.
 
     Returns:
         (the task with its windows fixed at the light, modes).
     """
     few = few_frames(task.model.setting)
-    plain = starting_points(task)
-    starts = [*plain, *_leaning(plain[0])]
-    first = _short(task.rough(), few, starts)
-    task = hold_windows(task, first[0].value)
-    best = refine_fit(task, first[0].value)
-    floor = first[0].merit + _PROMISING
-    promising = [trial.value for trial in first[1:] if trial.merit < floor]
-    others = follow_starts(task, best, promising[: 2 * _MOST])
-    return task, add_mirrored_starts(task, distinct_modes([best, *others]))
+    plain = starting_point(task)
+    # about its focus a lens with the opposite even aberrations gives nearly the same
+    # images, and the nominal one lies between
+    leaning = [
+        with_values(plain, {name: size})
+        for name in _EVEN[:2]
+        for size in (_LEANING_RAD, -_LEANING_RAD)
+    ]
+    trials = [_short(task.rough(), few, x) for x in (plain, *leaning)]
+    first, *others = sorted(trials, key=lambda trial: trial.merit)
+    task = hold_windows(task, first.value)
+    promising = [t.value for t in others if t.merit < first.merit + _PROMISING]
+    best = refine_fit(task, first.value)
+    return task, find_other_modes(task, [best], promising)
 
 
-def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
-    """The modes, and fits from the mirrored starts (:func:`mirrored_starts`) of the
-    best.
+def find_other_modes(
+    task: SearchTask, ends: list[FitSolution], begins: Sequence[Array] = ()
+) -> list[FitSolution]:
+    """The modes, and those that other starts lead to, until the best stays.
+
+    Starts are ``begins``, mirror images of the best (:func:`mirrored_starts`), and
+    places along the bias (:func:`starts_along`).
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        ends: fits of the modes so far.
+        ends: fits of the modes so far, best first.
+        begins: (p,) further starts.
     """
     for _ in range(_AGAIN):
         best = ends[0]
-        begins = [
-            b
-            for b in mirrored_starts(task, best)
-            if all(_sigma_distance(b, end) > 2.0 for end in ends)
-        ]
-        ends = distinct_modes([*ends, *follow_starts(task, best, begins)])
+        starts = [*begins, *mirrored_starts(task, best)]
+        if "bias_nm" in task.names:
+            starts += starts_along(task, best, "bias_nm")
+        ends = distinct_modes([*ends, *follow_starts(task, ends, starts)])
         if ends[0].merit > best.merit - 1:
             break
+        begins = ()
     return ends
 
 
@@ -209,31 +215,31 @@ def starts_along(task: SearchTask, best: FitSolution, name: str) -> list[Array]:
 
 
 def follow_starts(
-    task: SearchTask, best: FitSolution, begins: Sequence[Array]
+    task: SearchTask, ends: Sequence[FitSolution], begins: Sequence[Array]
 ) -> list[FitSolution]:
-    """Modes that some starts lead to: short fits, then full ones.
+    """Modes that some starts lead to: short fits, the best of these to the end.
 
-    At most ``_MOST``, none equal to the best or to another.
+    At most ``_MOST``, none equal to one of ``ends`` or to another.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        best: the best fit so far.
+        ends: the fits so far, best first.
         begins: (p,) starts.
     """
-    settings = SolverSettings(iterations=6, step_tolerance=0.5, near=1.0, finish=False)
-    ends: list[FitSolution] = []
+    problem, trials = task.posed(), list[FitSolution]()
     for begin in begins:
-        if len(ends) == _MOST:
-            break
-        if any(_sigma_distance(begin, end) < 2.0 for end in [best, *ends]):
-            continue
-        with contextlib.suppress(FitError):  # starts outside the model's range
-            trial = task.posed().fit(begin, settings)
-            if trial.merit < best.merit + MODES_WITHIN + _WORTH and all(
-                _sigma_distance(trial.value, e) > 2.0 for e in [best, *ends]
-            ):
-                ends.append(refine_fit(task, trial.value, trial.slopes))
-    return ends
+        if all(_sigma_distance(begin, end) > 2.0 for end in ends):
+            with contextlib.suppress(FitError):  # starts outside the model's range
+                trials.append(problem.fit(begin, _TRIAL))
+    modes = list(ends)
+    for trial in sorted(trials, key=lambda trial: trial.merit):
+        if (
+            len(modes) < len(ends) + _MOST
+            and trial.merit < ends[0].merit + MODES_WITHIN + _WORTH
+            and all(_sigma_distance(trial.value, mode) > 2.0 for mode in modes)
+        ):
+            modes.append(refine_fit(task, trial.value, trial.slopes))
+    return modes[len(ends) :]
 
 
 def mirrored_starts(task: SearchTask, best: FitSolution) -> list[Array]:
@@ -315,7 +321,7 @@ def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
     """
     try:
         best = refine_fit(task, _opened(task, begin))
-        return add_mirrored_starts(task, [best])
+        return find_other_modes(task, [best])
     except FitError:
         return []
 
@@ -358,8 +364,8 @@ def _sigma_distance(value: Array, end: FitSolution) -> float:
     return float(math.sqrt(max(square, 0.0)))
 
 
-def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSolution]:
-    """Short fits on few frames from several starts, best first.
+def _short(task: SearchTask, few: Array, begin: Array) -> FitSolution:
+    """Short fit on few frames from all parameters ``begin``.
 
     The prior keeps wave-front errors near 0.
     """
@@ -369,13 +375,10 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
         waves, np.minimum(problem.prior.sigma, WAVES_RAD / 2), problem.prior.sigma
     )
     prior = dataclasses.replace(problem.prior, sigma=sigma)
-    problem = dataclasses.replace(problem, prior=prior)
     short = SolverSettings(
         iterations=4, step_tolerance=1.0, near=math.inf, finish=False
     )
-
-    fits = threads.run_each(lambda x: problem.fit(_opened(task, x), short), begins)
-    return sorted(fits, key=lambda t: t.merit)
+    return dataclasses.replace(problem, prior=prior).fit(_opened(task, begin), short)
 
 
 def refine_fit(
@@ -469,24 +472,20 @@ def window_um(
     return x, y
 
 
-def starting_points(
-    task: SearchTask, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)
-) -> list[Array]:
-    """Starts: the nominal lens and other global biases, placed by the frames.
+def starting_point(task: SearchTask) -> Array:
+    """All parameters of the nominal lens, placed by the frames.
 
     Stage zero, distance, decentre, background and gain are estimated from the frames.
 
     Args:
         task: model, frames, priors and arrangement of the search.
-        biases_nm: bias of each start, nm at 0.85 um.
     """
-    model = task.model
-    data = task.data
-    arrangement = task.arrangement
+    model, data, arrangement = task.model, task.data, task.arrangement
     if arrangement is None:
         raise FitError("a search begins where the frames lie; arrange them first")
     place = window_um(arrangement, model)
-    level = float(np.median((data.electrons / model.setting.glow)[data.usable]))
+    glow = model.setting.glow
+    level = float(np.median((data.electrons / glow)[data.usable]))
     values = {
         "stage_zero_um": arrangement.stage_zero_um,
         "distance_um": arrangement.distance_um,
@@ -494,30 +493,10 @@ def starting_points(
         "decentre_x_um": place[0],
         "decentre_y_um": place[1],
     }
-    base = with_values(task.start, values)
-    out = []
-    for bias in biases_nm:
-        bias_nm = bias * wavelength_scale(model.lens.wavelength_um)
-        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias_nm})
-        light = model.images(with_values(x, {"background_e": 0.0}))[0]
-        keep = data.usable & ~data.saturated
-        # least-squares brightness of the design over the frames
-        gain = float(
-            (light * (data.electrons - level * model.setting.glow))[keep].sum()
-            / (light[keep] ** 2).sum()
-        )
-        out.append(with_values(x, {"log_gain": math.log(max(gain, 1e-12))}))
-    return out
-
-
-def _leaning(plain: Array) -> list[Array]:
-    """About its focus a lens with the opposite even aberrations gives nearly the same
-    images.
-
-    The plain start lies between the two: either sign of both astigmatisms.
-    """
-    return [
-        with_values(plain, {name: size})
-        for name in _EVEN[:2]
-        for size in (_LEANING_RAD, -_LEANING_RAD)
-    ]
+    x = with_values(task.start, values)
+    light = model.images(with_values(x, {"background_e": 0.0}))[0]
+    keep = data.usable & ~data.saturated
+    # least-squares brightness of the design over the frames
+    gain = (light * (data.electrons - level * glow))[keep].sum()
+    gain /= (light[keep] ** 2).sum()
+    return with_values(x, {"log_gain": math.log(max(float(gain), 1e-12))})

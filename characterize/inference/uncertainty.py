@@ -16,14 +16,7 @@ from characterize.inference.leastsquares import (
     gaussian_draws,
     pixel_weights,
 )
-from characterize.inference.multistart import (
-    SearchTask,
-    add_mirrored_starts,
-    distinct_modes,
-    follow_starts,
-    refine_fit,
-    starts_along,
-)
+from characterize.inference.multistart import SearchTask, distinct_modes, refine_fit
 from metalens.core import threads
 from metalens.core.arrays import Array
 
@@ -96,11 +89,6 @@ def explore_posterior(
         gain: noise model of the sensor, with the error of its gain.
     """
     modes = list(ends)
-    if "bias_nm" in task.names:
-        starts = starts_along(task, modes[0], "bias_nm")
-        modes = distinct_modes([*modes, *follow_starts(task, modes[0], starts)])
-    if modes[0] is not ends[0]:
-        modes = add_mirrored_starts(task, modes)
     problem = task.posed()
     named = [i for i, n in enumerate(task.names) if not n.startswith(_OF_THE_BENCH)]
     for _ in range(_RESTARTS + 1):
