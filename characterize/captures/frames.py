@@ -131,18 +131,17 @@ class FrameSpectra:
         sides = 2 * frames.shape[1], 2 * frames.shape[2]
         return cls(fft.rfft2(frames, sides), _norm(frames, noise), sides)
 
-    def mean_correlation(self, expected: "FrameSpectra", index: Array) -> float:
+    def mean_correlation(self, expected: "FrameSpectra") -> float:
         """Mean normalised cross-correlation with expected frames, each at its best
         shift.
 
         Args:
             expected: spectra of the expected frames.
-            index: order of these frames.
         """
         correlation = fft.irfft2(
-            self.spectrum[index] * np.conj(expected.spectrum), self.sides
+            self.spectrum * np.conj(expected.spectrum), self.sides
         ).max((1, 2))
-        norm = self.norm[index] * expected.norm
+        norm = self.norm * expected.norm
         return float(
             np.minimum(
                 np.divide(

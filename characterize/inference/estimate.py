@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import Capture, SensorNoise, to_electrons
+from characterize.captures import Capture, SensorNoise, orient_frames, to_electrons
 from characterize.inference import (
     identifiability,
     multistart,
@@ -22,7 +22,6 @@ from characterize.inference.frame_alignment import (
     FrameArrangement,
     arrangement_text,
     find_arrangement,
-    rearrange_frames,
 )
 from characterize.inference.leastsquares import FitSolution, gaussian_draws
 from characterize.inference.multistart import SearchTask, with_values
@@ -57,7 +56,6 @@ from metalens.core.errors import FitRefused
 from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
-LIKENESS = 0.45
 _ROUGH = 0.1  # relative error of the slopes of pillars above which it is said
 # score tests, shifts by unstated effects, and stated values that the frames contradict
 Looked = tuple[list[ScoreTest], UnmodelledShifts, list[ResidualFinding]]
@@ -137,12 +135,6 @@ def _fit(
     arrangement = find_arrangement(
         model, data, scan_um=scan_um, start=start, reach_um=reach_um
     )
-    if arrangement.likeness < LIKENESS:
-        raise FitRefused(
-            "fit refused: the frames look like no image of this lens (best correlation "
-            f"{arrangement.likeness:.2f}); they are of another lens than this {lens.profile} one, far from the "
-            "stated depths, or dark"
-        )
     whole = SearchTask(model, data, start, known, arrangement, options.free, sizes)
     task = multistart.choose_orientation(
         [
@@ -264,7 +256,9 @@ def _arranged(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
     return dataclasses.replace(
         task,
         model=model,
-        data=task.data.arranged(lambda part: rearrange_frames(part, arrangement)),
+        data=task.data.arranged(
+            lambda part: orient_frames(part, arrangement.orientation)
+        ),
         arrangement=arrangement,
     )
 

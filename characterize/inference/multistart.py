@@ -133,7 +133,7 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     turns = {
         relative_orientation(chosen.orientation, other.orientation)
         for other, merit in zip(arrangements, merits, strict=True)
-        if merit < merits[best] + _PROMISING and other.reordered == chosen.reordered
+        if merit < merits[best] + _PROMISING
     }
     turns = {*chosen.equivalent, *turns} - {0}
     return dataclasses.replace(
