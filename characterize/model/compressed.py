@@ -133,7 +133,7 @@ class SmoothKernel:
         near2 = np.asarray(dx**2 + dy**2)
         change2 = X * X + Y * Y + 2 * (X * dx + Y * dy)
         path_um = self.films.path_change(self.distance_um, near2, change2)
-        return np.asarray(path_um), near2 + change2
+        return path_um, near2 + change2
 
     def phase_x(self, p: Any, X: Array) -> Array:
         """k (F_x(p, X) - F_x(a, X)) with F_x(p, X) = F(p, b, X, 0), rad."""

@@ -21,7 +21,6 @@ from characterize.model.compressed import (
 from characterize.model.glass import BenchGeometry, FilmStack, source_paths
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import (
-    ChangeRange,
     PillarResponse,
     incidence_rad,
     of_lens,
@@ -78,12 +77,7 @@ class ForwardModel:
     """
 
     def __init__(
-        self,
-        lens: Lens,
-        setting: FrameSetting,
-        response: Sensitivity,
-        *,
-        span: ChangeRange | None = None,
+        self, lens: Lens, setting: FrameSetting, response: Sensitivity
     ) -> None:
         """Gather the lens for every field angle of the frames.
 
@@ -91,7 +85,6 @@ class ForwardModel:
             lens: the design.
             setting: depths, angles and window of the frames.
             response: slopes of the pillars.
-            span: largest changes of the pillars; the usual ones without it.
         """
         self.lens = lens
         self.setting = s = setting
@@ -103,7 +96,6 @@ class ForwardModel:
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
         self.response = response
-        self._span = span
         self.cut = 0.0
         self._lean_um = 0.0
         self._pillars: dict[float, PillarResponse] = {}  # by angle of incidence
@@ -141,7 +133,7 @@ class ForwardModel:
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
             self._pillars[incidence] = of_lens(
-                self.lens, self.response, span=self._span, angle_rad=incidence
+                self.lens, self.response, angle_rad=incidence
             )
         pillars = self._pillars[incidence]
         reduced = CompressedLens(

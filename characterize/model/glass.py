@@ -12,8 +12,6 @@ from characterize.model.parameters import PLACE
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.optics import Layers, media
-from metalens.optics.interpolant import chebyshev_interpolant
-from metalens.optics.paths import hypot_minus_length, sensor_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
@@ -70,11 +68,6 @@ class FilmStack:
         )
         return cls(front, behind, sides[1].index[0])
 
-    @property
-    def none_behind(self) -> bool:
-        """Whether light goes from the lens to the sensor through air alone."""
-        return not self.behind and self.filling == 1
-
     def pairs(self, distance_um: float) -> Pairs:
         """(index, thickness in um) of the media from lens to sensor, the gap first.
 
@@ -85,8 +78,6 @@ class FilmStack:
 
     def reduced_um(self, distance_um: float) -> float:
         """Distance in air that bends paraxial light as the way from lens to sensor, um."""
-        if self.none_behind:
-            return distance_um
         return sum(t / n for n, t in self.pairs(distance_um))
 
     def apparent_um(self, depth_um: Any) -> Any:
@@ -102,64 +93,37 @@ class FilmStack:
             tangents: (x, y) of the ray in air.
         """
         secant2 = 1 + tangents[0] ** 2 + tangents[1] ** 2
-        sine2 = 1 - 1 / secant2
-        reach_um = distance_um
-        if not self.none_behind:
-            reach_um = media.reach_per_direction(
-                self.pairs(distance_um), sine2
-            ) / math.sqrt(secant2)
+        reach = media.reach_per_direction(self.pairs(distance_um), 1 - 1 / secant2)
+        reach_um = reach / math.sqrt(secant2)
         return reach_um * tangents[0], reach_um * tangents[1]
 
     def drift(self, tangents: tuple[float, float]) -> tuple[float, float]:
         """Change of :meth:`chief_um` by the distance: tangents in the gap."""
         secant2 = 1 + tangents[0] ** 2 + tangents[1] ** 2
-        share = (
-            1.0
-            if self.filling == 1
-            else 1 / math.sqrt((self.filling**2 - 1) * secant2 + 1)
-        )
+        share = 1 / math.sqrt((self.filling**2 - 1) * secant2 + 1)
         return share * tangents[0], share * tangents[1]
-
-    def _chord(self, distance_um: float, reach2_um2: Array) -> Array:
-        """Optical path of rays from lens to sensor of a squared reach, um."""
-        pairs = self.pairs(distance_um)
-        path = chebyshev_interpolant(
-            lambda u: media.whole_path(pairs, media.solve_direction_square(pairs, u)),
-            np.asarray(reach2_um2),
-        )
-        return np.asarray(path)
 
     def path_change(
         self, distance_um: float, reach2_um2: Array, more_um2: Array
-    ) -> Any:
+    ) -> Array:
         """Path from lens to sensor of squared reach ``reach2_um2 + more_um2`` less that
-        of ``reach2_um2``, um, without cancellation in air.
+        of ``reach2_um2``, um, without cancellation.
         """
-        if self.none_behind:
-            ray_um = np.sqrt(reach2_um2 + distance_um**2)
-            return hypot_minus_length(ray_um, more_um2)
-        far, near = (
-            self._chord(distance_um, reach2_um2 + more) for more in (more_um2, 0.0)
-        )
-        return far - near
+        pairs = self.pairs(distance_um)
+        direct = media.solve_direction_square(pairs, reach2_um2)
+        path_um = media.path_difference(pairs, direct, reach2_um2, more_um2)[1]
+        return np.asarray(path_um)
 
     def amplitude(self, distance_um: float, reach2_um2: Array) -> tuple[Array, Array]:
         """(size, path r) of the amplitude size (1/r - ik) exp(ikr) of rays from lens to
         sensor of a squared reach: √(passed / spread) / (2 pi); d / (2 pi r²) in air.
         """
-        if self.none_behind:
-            r2 = reach2_um2 + distance_um**2
-            return distance_um / (2 * np.pi * r2), np.sqrt(r2)
         pairs = self.pairs(distance_um)
-        order = (self.filling, *(n for n, _ in self.behind))
-
-        def size(u: Any) -> Any:
-            w = media.solve_direction_square(pairs, u)
-            spread = media.area_spreading_of_square(pairs, w)
-            return np.sqrt(media.passed_at(order, w) / spread) / (2 * np.pi)
-
-        level = chebyshev_interpolant(size, reach2_um2)
-        return np.asarray(level), self._chord(distance_um, reach2_um2)
+        w = media.solve_direction_square(pairs, reach2_um2)
+        passed = media.passed_at((self.filling, *(n for n, _ in self.behind)), w)
+        spread = media.area_spreading_of_square(pairs, w)
+        size = np.sqrt(passed / spread) / (2 * np.pi)
+        return size, np.asarray(media.whole_path(pairs, w))
 
     def sensor_path(
         self,
@@ -172,11 +136,9 @@ class FilmStack:
 
         Less that from the lens centre.
         """
-        if self.none_behind:
-            return np.asarray(sensor_path(x_um, y_um, centre_um, distance_um))
         axis2 = np.array(centre_um[0] ** 2 + centre_um[1] ** 2)
-        reach2 = np.asarray((x_um - centre_um[0]) ** 2 + (y_um - centre_um[1]) ** 2)
-        return np.asarray(self.path_change(distance_um, axis2, reach2 - axis2))
+        reach2 = (x_um - centre_um[0]) ** 2 + (y_um - centre_um[1]) ** 2
+        return self.path_change(distance_um, axis2, reach2 - axis2)
 
 
 AIR = FilmStack()

@@ -2,7 +2,6 @@
 designed diameter.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import CubicSpline
 
 from characterize.model.parameters import PLACE, process_state_of
-from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
@@ -34,6 +32,7 @@ from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
+_TOLERANCE = 3e-5  # rms error of t in the basis
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(ResponseError)]
@@ -55,34 +54,29 @@ class PillarChange:
 class ChangeRange:
     """Largest change of each kind that a low-rank basis must hold; beyond it the fit is
     refused.
-
-    What is here is of lenses for 0.85 um; see :meth:`of`.
     """
 
-    bias_um: float = 0.03
-    response_amounts: tuple[float, ...] = tuple(
-        _ROOM * max(-row.low, row.high) * row.unit for row in _ROWS
-    )
-    wavelength_um: float = 0.006
+    bias_um: float
+    response_amounts: tuple[float, ...]
+    wavelength_um: float
 
     @classmethod
-    def of(cls, wavelength_um: float) -> "ChangeRange":
-        """The range for a wavelength: lengths grow with it (:func:`wavelength_scale`)."""
-        more = wavelength_scale(wavelength_um)
-        rows = zip(_ROWS, cls().response_amounts, strict=True)
-        response_amounts = tuple(
-            amount * prior_scale(row.name, wavelength_um) for row, amount in rows
-        )
-        return cls(more * cls().bias_um, response_amounts, more * cls().wavelength_um)
+    def of(cls, lens: Lens) -> "ChangeRange":
+        """The bounds of a fit and some room, without what the pillars cannot have.
 
-    def within(self, cell: Cell) -> "ChangeRange":
-        """Without what pillars of this cell cannot have."""
-        absent = inapplicable_names(cell)
-        response_amounts = (
-            0.0 if row.name in absent else amount
-            for row, amount in zip(_ROWS, self.response_amounts, strict=True)
+        Lengths grow with the wavelength (:func:`wavelength_scale`).
+        """
+        more = wavelength_scale(lens.wavelength_um)
+        absent = inapplicable_names(lens.cell)
+        response_amounts = tuple(
+            _ROOM
+            * max(-row.low, row.high)
+            * row.unit
+            * prior_scale(row.name, lens.wavelength_um)
+            * (row.name not in absent)
+            for row in _ROWS
         )
-        return dataclasses.replace(self, response_amounts=tuple(response_amounts))
+        return cls(0.03 * more, response_amounts, 0.006 * more)
 
 
 class PillarResponse:
@@ -100,33 +94,24 @@ class PillarResponse:
     )  # times the usual intervals between bias nodes that are tried
 
     def __init__(
-        self,
-        lens: Lens,
-        response: Sensitivity,
-        *,
-        span: ChangeRange | None = None,
-        tolerance: float = 3e-5,
-        angle_rad: float = 0.0,
+        self, lens: Lens, response: Sensitivity, *, angle_rad: float = 0.0
     ) -> None:
         """Compute the basis, with more bias nodes until the error is below ``_MISSED``.
 
         Args:
             lens: its cell, proxy and diameters.
             response: slopes of ln t by the pillar-response errors.
-            span: largest changes; the usual ones without it.
-            tolerance: rms error of t in the basis.
             angle_rad: of incidence.
         """
-        span = (span or ChangeRange.of(lens.wavelength_um)).within(lens.cell)
+        self.span = span = ChangeRange.of(lens)
         self.lens = lens
         self.response = response
-        self.span = span
         self.angle_rad = angle_rad
         self.diameter_um = self._grid_um()
         step_um = 0.006 * wavelength_scale(lens.wavelength_um)
         b = max(7, 2 * math.ceil(span.bias_um / step_um) + 1)
         for times in self._refinements:  # resonances need more nodes
-            self._set_basis(times * (b - 1) + 1, tolerance)
+            self._set_basis(times * (b - 1) + 1)
             self.error = self._measure()
             if self.error < _MISSED:
                 break
@@ -136,10 +121,10 @@ class PillarResponse:
         built = self.lens.diameters.diameter_um[self.lens.diameters.diameter_um > 0]
         return np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
 
-    def _set_basis(self, count: int, tolerance: float) -> None:
+    def _set_basis(self, count: int) -> None:
         """Set ``count`` bias nodes (Chebyshev) and the low-rank basis of t there.
 
-        Left singular vectors of t over the training changes, to rms ``tolerance``.
+        Left singular vectors of t over the training changes, to rms ``_TOLERANCE``.
         """
         unit = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         self.nodes_um = unit * self.span.bias_um
@@ -154,7 +139,7 @@ class PillarResponse:
         tail = np.sqrt(
             np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um)
         )
-        rank = max(1, int((tail > tolerance).sum()))
+        rank = max(1, int((tail > _TOLERANCE).sum()))
         self.basis = np.ascontiguousarray(u[:, :rank].T.conj())
 
     def _relative_response(
@@ -345,21 +330,16 @@ class PairedPillars(PillarResponse):
 
 
 def of_lens(
-    lens: Lens,
-    response: Sensitivity,
-    *,
-    span: ChangeRange | None = None,
-    angle_rad: float = 0.0,
+    lens: Lens, response: Sensitivity, *, angle_rad: float = 0.0
 ) -> PillarResponse:
     """The pillars of a lens, of one size or of two.
 
     Args:
         response: slopes of the pillars.
-        span: largest changes of the pillars.
         angle_rad: angle of incidence or field angle, rad.
     """
     kind = PillarResponse if lens.pairs is None else PairedPillars
-    return kind(lens, response, span=span, angle_rad=angle_rad)
+    return kind(lens, response, angle_rad=angle_rad)
 
 
 def pillar_change_of(x: Array) -> PillarChange:

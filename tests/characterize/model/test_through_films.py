@@ -97,8 +97,8 @@ def test_a_lens_in_air_has_none():
     assert FilmStack.of(Layers(), WAVELENGTH) is AIR
     found = FilmStack.of(lens(1.31).layers, WAVELENGTH)
     assert (found.front, found.behind, found.filling) == (FRONT, BEHIND, 1.31)
-    # what fills the gap bends light too
-    assert not FilmStack.of(Layers(cover=Index(1.31)), WAVELENGTH).none_behind
+    filled = FilmStack.of(Layers(cover=Index(1.31)), WAVELENGTH)
+    assert filled.filling == 1.31  # what fills the gap bends light too
 
 
 def incident(at, tangents, depth):
