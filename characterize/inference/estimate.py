@@ -18,11 +18,7 @@ from characterize.inference import (
     verdict,
 )
 from characterize.inference.asbuilt import AsBuilt, WithinModel
-from characterize.inference.frame_alignment import (
-    FrameArrangement,
-    arrangement_text,
-    find_arrangement,
-)
+from characterize.inference.frame_alignment import arrangement_text, find_arrangement
 from characterize.inference.leastsquares import FitSolution, gaussian_draws
 from characterize.inference.multistart import SearchTask, with_values
 from characterize.inference.prepare import (
@@ -30,7 +26,6 @@ from characterize.inference.prepare import (
     check_enough,
     data_of,
     merge_exposures,
-    quick_enough,
     setting_of,
     stated_priors,
 )
@@ -135,16 +130,18 @@ def _fit(
     arrangement = find_arrangement(
         model, data, scan_um=scan_um, start=start, reach_um=reach_um
     )
-    whole = SearchTask(model, data, start, known, arrangement, options.free, sizes)
-    task = multistart.choose_orientation(
-        [
-            _arranged(whole, candidate)
-            for candidate in (arrangement, *arrangement.others)
-        ]
+    task = SearchTask(
+        model.about(multistart.window_um(arrangement, model)),
+        data.arranged(lambda part: orient_frames(part, arrangement.orientation)),
+        start,
+        known,
+        arrangement,
+        options.free,
+        sizes,
     )
     cautions = [
         *frames.corrections,
-        *arrangement_text(task.arrangement or arrangement),
+        *arrangement_text(arrangement),
         *verdict.spectrum_text(lens, known),
     ]
     if model.response.error > _ROUGH:
@@ -152,8 +149,6 @@ def _fit(
             "slopes of the pillars by height and index are known to "
             f"{model.response.error:.0%} only"
         )
-    fast = quick_enough(task.model, task.data, multistart.starting_point(task))
-    task = dataclasses.replace(task, model=fast)
     task, ends = multistart.search_modes(task)
     task, ends = multistart.place_windows(task, ends)
     task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
@@ -248,19 +243,6 @@ def _contradicted(
         for fall, test in falls
         if test.stated and fall > largest - multistart.MODES_WITHIN
     ]
-
-
-def _arranged(task: SearchTask, arrangement: FrameArrangement) -> SearchTask:
-    """The task with its frames in an arrangement, and its window fixed at the light."""
-    model = task.model.about(multistart.window_um(arrangement, task.model))
-    return dataclasses.replace(
-        task,
-        model=model,
-        data=task.data.arranged(
-            lambda part: orient_frames(part, arrangement.orientation)
-        ),
-        arrangement=arrangement,
-    )
 
 
 def _result(

@@ -3,7 +3,7 @@ nominal lens.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
@@ -27,8 +27,8 @@ from metalens.core.errors import FitRefused
 _EVERY = range(8)  # orientation
 # likeness by which a lens at another distance must be better
 _CLEARER = 0.05
-# likeness within which orientations remain candidates: ten times what errors of an
-# as-built lens were observed to exchange
+# likeness within which orientations cannot be distinguished: ten times what errors of
+# an as-built lens were observed to exchange
 _NEAR = 0.02
 _DISTINCT = 40.0  # chi-square between two orientations that a fit can distinguish
 _SURE = 0.9  # likeness above which the nominal lens explains the frames
@@ -51,9 +51,8 @@ class FrameArrangement:
     from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames beyond doubt; 0: as stated.
-    equivalent: turns (1 to 7) under which the nominal images do not change: these cannot be
-    distinguished from the chosen one.
-    others: other orientations of nearly equal likeness; fits choose among them.
+    equivalent: turns (1 to 7) that cannot be distinguished from the chosen one: under
+    them the nominal images do not change, or are nearly as similar to the frames.
     """
 
     stage_zero_um: float
@@ -64,7 +63,6 @@ class FrameArrangement:
     order_seen: bool
     orientation: int
     equivalent: tuple[int, ...]
-    others: tuple["FrameArrangement", ...] = ()
 
 
 def few_frames(setting: FrameSetting) -> Array:
@@ -184,11 +182,10 @@ class _Frames:
         grid = np.meshgrid(distances, zeros, indexing="ij")
         places[:, PLACE["distance_um"]] = grid[0].ravel()
         places[:, PLACE["stage_zero_um"]] = grid[1].ravel()
-        rough = self.model.rough()
         turned = self.spectra()
 
         def score(x: Array) -> Array:
-            return _scores(turned, _expected(rough, x, self.clipped))
+            return _scores(turned, _expected(self.model, x, self.clipped))
 
         scores = np.nan_to_num(threads.run_each(score, places), nan=-math.inf)
         of_turn = scores[:, _plainest_turn(scores.max(0))]
@@ -230,30 +227,27 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
         sorted_frames = FrameSpectra.of(light[order], noise[order])
         if _scores([sorted_frames], expected)[0] < score[chosen] - 5e-3:
             order = None
-    chi2 = {k: _chi_square_of_turn(k, expected, light, noise) for k in _EVERY}
-
-    def arranged(turn: int) -> FrameArrangement:
-        pairs = zip(orient_frames(light, turn), expected, noise.tolist(), strict=True)
-        shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
-        y, x_px = np.median(shifts, axis=0).tolist()
-        return FrameArrangement(
-            stage_zero_um=float(x[PLACE["stage_zero_um"]]),
-            distance_um=float(x[PLACE["distance_um"]]),
-            shift_px=(y, x_px),
-            likeness=likeness,
-            order=order,
-            order_seen=order_seen,
-            orientation=turn,
-            equivalent=tuple(k for k in _EVERY if k and chi2[k] < _DISTINCT),
-        )
-
-    others = [
-        arranged(k)
+    near = {
+        relative_orientation(chosen, k)
         for k in _EVERY
-        if chi2[relative_orientation(chosen, k)] >= _DISTINCT
-        and score[k] > score[chosen] - _NEAR
-    ]
-    return replace(arranged(chosen), others=tuple(others))
+        if score[k] > score[chosen] - _NEAR
+    }
+    symmetric = {
+        k for k in _EVERY if _chi_square_of_turn(k, expected, light, noise) < _DISTINCT
+    }
+    pairs = zip(orient_frames(light, chosen), expected, noise.tolist(), strict=True)
+    shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
+    y, x_px = np.median(shifts, axis=0).tolist()
+    return FrameArrangement(
+        stage_zero_um=float(x[PLACE["stage_zero_um"]]),
+        distance_um=float(x[PLACE["distance_um"]]),
+        shift_px=(y, x_px),
+        likeness=likeness,
+        order=order,
+        order_seen=order_seen,
+        orientation=chosen,
+        equivalent=tuple(sorted((near | symmetric) - {0})),
+    )
 
 
 def _chi_square_of_turn(k: int, expected: Array, light: Array, noise: Array) -> float:

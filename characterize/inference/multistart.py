@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from characterize.captures import relative_orientation
 from characterize.inference import leastsquares
 from characterize.inference.frame_alignment import FrameArrangement, few_frames
 from characterize.inference.leastsquares import (
@@ -41,8 +40,7 @@ _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ASIDE_UM = 50.0  # largest offset of a window
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
-_PLACES = (-1.8, -0.9, 0.9, 1.8)  # of starts, in sigma of a prior
-_ONWARD = SolverSettings(iterations=25, step_tolerance=0.3, near=1.0, finish=False)
+_PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of a prior
 _TRIAL = SolverSettings(iterations=6, step_tolerance=0.5, near=math.inf, finish=False)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 _WORTH = 10.0
@@ -83,10 +81,6 @@ class SearchTask:
             model, data = model.only(frames), data.planes(frames)
         return FitProblem(named_images(model, self.names, self.start), data, self.prior)
 
-    def rough(self) -> "SearchTask":
-        """The task with the fastest model, for choosing among starts."""
-        return dataclasses.replace(self, model=self.model.rough())
-
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
         return with_values(
@@ -110,40 +104,6 @@ def named_images(
     return images
 
 
-def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
-    """The likeliest of tasks that differ by the arrangement of the frames.
-
-    By short fits to a few frames. The first is chosen unless another is better by
-    ``_PROMISING``, and still is after longer fits. Orientations within that are marked
-    as indistinguishable.
-    """
-    if len(tasks) == 1:
-        return tasks[0]
-    few = few_frames(tasks[0].model.setting)
-    rough = [task.rough() for task in tasks]
-    tries = [_short(task, few, starting_point(task)) for task in rough]
-    merits = np.array([trial.merit for trial in tries])
-    if merits[0] >= merits.min() + _PROMISING:
-        for k in (0, int(merits.argmin())):
-            merits[k] = rough[k].posed(few).fit(tries[k].value, _ONWARD).merit
-    best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
-    arrangements = [task.arrangement for task in tasks if task.arrangement is not None]
-    chosen = arrangements[best]
-    # turns that cannot be distinguished from the chosen one
-    turns = {
-        relative_orientation(chosen.orientation, other.orientation)
-        for other, merit in zip(arrangements, merits, strict=True)
-        if merit < merits[best] + _PROMISING
-    }
-    turns = {*chosen.equivalent, *turns} - {0}
-    return dataclasses.replace(
-        tasks[best],
-        arrangement=dataclasses.replace(
-            chosen, equivalent=tuple(sorted(turns)), others=()
-        ),
-    )
-
-
 def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
@@ -163,7 +123,7 @@ def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
         for name in _EVEN[:2]
         for size in (_LEANING_RAD, -_LEANING_RAD)
     ]
-    trials = [_short(task.rough(), few, x) for x in (plain, *leaning)]
+    trials = [_short(task, few, x) for x in (plain, *leaning)]
     first, *others = sorted(trials, key=lambda trial: trial.merit)
     task = hold_windows(task, first.value)
     promising = [t.value for t in others if t.merit < first.merit + _PROMISING]
@@ -230,13 +190,13 @@ def follow_starts(
     for begin in begins:
         if all(_sigma_distance(begin, end) > 2.0 for end in ends):
             with contextlib.suppress(FitError):  # starts outside the model's range
-                trials.append(problem.fit(begin, _TRIAL))
+                trials.append(problem.fit(begin, _TRIAL, ends[0].slopes))
     modes = list(ends)
     for trial in sorted(trials, key=lambda trial: trial.merit):
         if (
             len(modes) < len(ends) + _MOST
             and trial.merit < ends[0].merit + MODES_WITHIN + _WORTH
-            and all(_sigma_distance(trial.value, mode) > 2.0 for mode in modes)
+            and all(_sigma_distance(trial.value, mode) > 1.0 for mode in modes)
         ):
             modes.append(refine_fit(task, trial.value, trial.slopes))
     return modes[len(ends) :]

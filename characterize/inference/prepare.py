@@ -1,6 +1,6 @@
-"""From a capture to what a fit needs: brackets merged, the window about the light, what
-the capture itself states, and
-how little of the model is enough."""
+"""From a capture to what a fit needs: brackets merged, the window about the light, and
+what the capture itself states.
+"""
 
 import dataclasses
 import math
@@ -10,13 +10,12 @@ import numpy as np
 
 from characterize.captures import Capture, ElectronFrames, merge_brackets
 from characterize.inference.leastsquares import FitImages
-from characterize.model import ForwardModel, FrameSetting, KnownValue, usual_parameters
+from characterize.model import FrameSetting, KnownValue, usual_parameters
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
-_CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
 def merge_exposures(
@@ -150,26 +149,6 @@ def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
         common_floor=dark,
         common_light=frames.common_light,
     )
-
-
-def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel:
-    """The model with the fewest terms of its fields that does not change the misfit.
-
-    At parameters ``x`` chi-square against all terms rises by less than ``_NOTHING``.
-
-    Args:
-        model: the full model.
-        data: frames and their noise.
-        x: all parameters.
-    """
-    exact = model.images(x)[0]
-    noise = np.sqrt(data.variance(exact))
-    for cut in _CUTS:
-        rough = model.rough(cut)
-        residual = ((rough.images(x)[0] - exact) / noise)[data.usable]
-        if float((residual**2).sum()) < _NOTHING:
-            return rough
-    return model
 
 
 def check_enough(data: FitImages, names: Sequence[str]) -> None:

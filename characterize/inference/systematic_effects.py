@@ -5,12 +5,12 @@ may be where nobody says.
 import contextlib
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
 from scipy import ndimage
 
 from characterize.inference.multistart import SearchTask
@@ -23,13 +23,10 @@ from metalens.lens import Lens
 # amounts by which the causes are probed
 _STOP_UM = 3.0
 _WALL_DEG = 1.5
-_ENOUGH = 4e-3  # relative error of the fields in these differences
 LAMP = "a lamp or exposure that changes from frame to frame"
 WINDOWS = "a window off the chief ray at a field angle"
 # share below which a turn of light is the error of its slopes: that light is round
 _ROUND = 0.02
-_GRID = 41  # places across the lens at which write fields are sampled
-_SMOOTH = 7  # degree of the polynomials that represent displaced write fields
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
@@ -62,20 +59,16 @@ def systematic_changes(
 ) -> Iterator[ImageChange]:
     """Changes of the images by every systematic effect that is not fitted.
 
-    Differences of images with fields to ``_ENOUGH``: the shifts of parameters that are
-    computed from these change by a percent.
-
     Args:
         task: model, frames, priors and arrangement of the search.
         x: all parameters, in the order of ``PARAMETERS``.
         slopes: derivatives of the images by the fitted parameters.
     """
-    rough = task.model.rough(max(task.model.cut, _ENOUGH))
-    task = dataclasses.replace(task, model=rough)
-    image = rough.images(x)[0]
+    model = task.model
+    image = model.images(x)[0]
     yield from _of_model(task, x, image)
-    if "sidewall_deg" not in task.names or rough.lens.cell.sidewall_rad == 0:
-        leaning = rough.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
+    if "sidewall_deg" not in task.names or model.lens.cell.sidewall_rad == 0:
+        leaning = model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
         yield ImageChange(
             "a side wall that leans about half height",
             leaning[None],
@@ -83,7 +76,7 @@ def systematic_changes(
             of_mask=True,
             positive=True,
         )
-    light = image - background_planes(x, rough.setting)
+    light = image - background_planes(x, model.setting)
     yield ImageChange("vibration or blur along one direction", _along_one(light))
     yield ImageChange(
         "pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)",
@@ -93,8 +86,8 @@ def systematic_changes(
         "counts that are not in proportion to the light (a gamma)", _of_gamma(light)
     )
     # derivatives by the place of every pixel, per pixel
-    across = np.asarray(rough.images(x, ("decentre_x_um", "decentre_y_um"))[1])
-    across *= rough.setting.pixel_um
+    across = np.asarray(model.images(x, ("decentre_x_um", "decentre_y_um"))[1])
+    across *= model.setting.pixel_um
     if len(image) > 2:
         yield from _of_frames(light, slopes, across)
     yield from _of_pixels(task, across)
@@ -104,17 +97,16 @@ def systematic_changes(
         frees = tuple(name for name in fixed if not _exactly(task, name))
         yield ImageChange(
             "uneven illumination",
-            np.asarray(rough.images(x, fixed)[1]),
+            np.asarray(model.images(x, fixed)[1]),
             np.array([_size(task, name) for name in fixed]),
             frees or fixed,
             not frees,
         )
-    fields = write_fields(rough.lens)
-    names = [f"residual_{k}" for k in range(fields.shape[1])]
-    by_phase = np.asarray(rough.with_residual(smooth_phases).images(x, names)[1])
+    phases = functools.partial(write_field_phases, model.lens)
+    names = [f"residual_{k}" for k in range(32)]
     yield ImageChange(
         "write fields out of place, or another smooth phase error",
-        np.tensordot(fields, by_phase, 1),
+        np.asarray(model.with_residual(phases).images(x, names)[1]),
         _size(task, "stitching_nm") * 1e-3,
         of_mask=True,
     )
@@ -253,40 +245,23 @@ def _size(task: SearchTask, name: str) -> float:
     return stated.sigma
 
 
-def smooth_phases(u: Array, v: Array) -> Array:
-    """(k, *shape) products of Legendre polynomials in u and v of total degree 1 to
-    ``_SMOOTH``, rad.
-
-    Args:
-        u: x on the lens over its radius.
-        v: y on the lens over its radius.
-    """
-    degree = np.add.outer(range(_SMOOTH + 1), range(_SMOOTH + 1)).ravel()
-    products = legendre.legvander2d(u, v, (_SMOOTH, _SMOOTH))
-    return np.moveaxis(products[..., (degree > 0) & (degree <= _SMOOTH)], -1, 0)
-
-
-def write_fields(lens: Lens) -> Array:
-    """(32, k) coefficients of :func:`smooth_phases` for the phase of one write field
-    that is moved by 1 um along x, then along y, by least squares over the lens.
+def write_field_phases(lens: Lens, u: Array, v: Array) -> Array:
+    """(32, *shape) phases of one write field that is moved by 1 um along x, then along
+    y, at places (u, v) on the lens over its radius, rad.
 
     Four fields across the lens each way. The focusing phase has the slope
     k x (1 / hypot(r, d) + 1 / hypot(r, s)) at place x along the axis, with focal
     distance d and source distance s.
     """
-    t = np.linspace(-1, 1, _GRID)
-    u, v = (w[np.hypot(*np.meshgrid(t, t)) <= 1] for w in np.meshgrid(t, t))
     radius = lens.diameters.radius_um
     r = radius * np.hypot(u, v)
     sine = 1 / np.hypot(r, lens.reduced_um)
     if lens.source_distance_um > 0:
         sine = sine + 1 / np.hypot(r, lens.source_distance_um)
     sine *= 2 * math.pi / lens.wavelength_um * radius
-    row, column = (np.minimum(np.floor(2 * (w + 1)), 3) for w in (v, u))
-    inside = 4 * row + column == np.arange(16)[:, None]
-    moved = np.concatenate([inside * sine * u, inside * sine * v])
-    shapes = np.concatenate([smooth_phases(u, v), np.ones((1, len(u)))])
-    return np.asarray(np.linalg.lstsq(shapes.T, moved.T, rcond=None)[0][:-1].T)
+    row, column = (np.clip(np.floor(2 * (w + 1)), 0, 3) for w in (v, u))
+    inside = 4 * row + column == np.arange(16).reshape(-1, *(1,) * u.ndim)
+    return np.concatenate([inside * sine * u, inside * sine * v])
 
 
 def _each(change: Array) -> Array:

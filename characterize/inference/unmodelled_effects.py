@@ -12,7 +12,7 @@ from scipy import stats
 
 from characterize.captures import shift_frames
 from characterize.inference import systematic_effects
-from characterize.inference.leastsquares import FitSolution
+from characterize.inference.leastsquares import FitSolution, SolverSettings
 from characterize.inference.multistart import SearchTask
 from characterize.inference.systematic_effects import ImageChange
 from characterize.model import PLACE, background_planes
@@ -266,22 +266,8 @@ def expected_shifts(task: SearchTask) -> UnmodelledShifts:
 
     At the task's start, with residuals of 0.
     """
-    image, slopes = task.model.images(task.start, task.names)
-    p = len(task.names)
-    mode = FitSolution(
-        task.start[[PLACE[name] for name in task.names]],
-        np.eye(p),
-        np.eye(p),
-        image,
-        np.zeros_like(image),
-        1.0,
-        0.0,
-        True,
-        "",
-        0,
-        np.zeros(p),
-        np.asarray(slopes),
-    )
+    start = task.start[[PLACE[name] for name in task.names]]
+    mode = task.posed().fit(start, SolverSettings(iterations=0))
     return run_score_tests(task, mode)[1]
 
 

@@ -73,7 +73,6 @@ class ForwardModel:
 
     Accuracy: ``Pillars.error`` in the transmission of pillars, ``setting.tolerance``
     in the field. A test and the benchmark compare both with the sum over all pillars.
-    ``cut``: relative error of the field that :meth:`rough` allows, 0 for none.
     """
 
     def __init__(
@@ -96,7 +95,6 @@ class ForwardModel:
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
         self.response = response
-        self.cut = 0.0
         self._lean_um = 0.0
         self._pillars: dict[float, PillarResponse] = {}  # by angle of incidence
         self.films = FilmStack.of(lens.layers, lens.wavelength_um)
@@ -185,12 +183,6 @@ class ForwardModel:
         if max(abs(v) for v in middle_um) > reach:  # needs more directions
             angles_rad = np.unique(self.setting.angle_rad, axis=0)
             part.groups = [part._group(angle_rad) for angle_rad in angles_rad]
-        return part
-
-    def rough(self, tolerance: float = 2e-2) -> "ForwardModel":
-        """The same model with fields to a relative ``tolerance``, fast enough for scans."""
-        part = copy.copy(self)
-        part.cut = tolerance
         return part
 
     def with_pixel_pitch(self, ratio: float) -> "ForwardModel":
@@ -361,13 +353,12 @@ class ForwardModel:
             lambda: self._pupil(x, group, bool(names)),
         )
         lens_field = pupil[0] * phasor
-        field = operators.envelope(operators.coarse(lens_field, self.cut))
+        field = operators.envelope(operators.coarse(lens_field))
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
         conjugate = field.conj()
         power = np.vdot(lens_field, lens_field).real
-        tolerance = max(self.cut, _SLOPE_TOLERANCE)
         slopes = dict[str, Array]()
         for name in names:
             slope = self._lens_rate(x, group, name, pupil, phasor)
@@ -378,7 +369,7 @@ class ForwardModel:
             slope = slope - along * lens_field
             in_kernel = name in ("distance_um", "wavelength_nm")
             # the slope of the kernel nearly cancels that of the lens
-            cut = self.cut if in_kernel else tolerance
+            cut = 0.0 if in_kernel else _SLOPE_TOLERANCE
             field_slope = operators.coarse(slope, cut)
             if in_kernel:
                 terms = operators.terms
@@ -551,7 +542,7 @@ class ForwardModel:
         step = _KERNEL_STEP * scale
         shift = step * (np.arange(len(x)) == PLACE[name])
         up, down = (
-            self._operators(x + sign * shift, group, terms).coarse(light, self.cut)
+            self._operators(x + sign * shift, group, terms).coarse(light)
             for sign in (1, -1)
         )
         return np.asarray((up - down) * np.float32(0.5 / step))
