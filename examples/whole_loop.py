@@ -23,7 +23,6 @@ from characterize.bench import bench
 from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures import capture as captures
 from characterize.commands import capture as command_capture
-from characterize.inference import asbuilt
 from characterize.inference.estimate import FitOptions, fit
 from characterize.model.parameters import KnownValue
 from codesign.adapt import report as retrain_report
@@ -99,7 +98,7 @@ for name in hidden:
     low, high = made.interval(name)
     print(f"{name:<14} true {hidden[name]:6.2f}   fitted {low:7.2f} to {high:7.2f}")
 print("\n".join(made.degeneracies))
-asbuilt.save(work / "asbuilt.h5", made)
+made.save(work / "asbuilt.h5")
 
 # %% [markdown]
 # ## 5. The network trained on for it

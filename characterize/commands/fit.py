@@ -15,7 +15,7 @@ from characterize.bench import HiddenLens
 from characterize.captures import capture as captures
 from characterize.commands import report
 from characterize.commands.fit_options import Options
-from characterize.inference import AsBuilt, asbuilt, fit
+from characterize.inference import AsBuilt, fit
 from characterize.inference import FitOptions as FitOptions
 from characterize.model import KnownValue
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save_pupil
@@ -94,7 +94,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
         target, companions=report.BESIDE + (NEXT_MASK if options.next_mask else ())
     ) as draft:
         result = dataclasses.replace(fit(capture, lens, choice), provenance=provenance)
-        asbuilt.save(draft.path, result)
+        result.save(draft.path)
         report.asbuilt_report(
             draft.path.with_suffix(".html"), result, truth=true_values
         )

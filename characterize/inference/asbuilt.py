@@ -280,13 +280,23 @@ class AsBuilt:
         return float(np.sqrt(square.max() / draws))
 
     def save(self, path: str | Path) -> None:
-        """Write the file; see :func:`save`."""
-        save(path, self)
+        """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it
+        can be used alone.
+        """
+        arrays, attributes = store.flatten_record(self)
+        arrays["diameter_um"] = np.asarray(self.diameters.diameter_um, float)
+        more: dict[str, Any] = {"attributes": attributes, "provenance": self.provenance}
+        store.save(path, "asbuilt", arrays, **more)
 
     @staticmethod
+    @typed_reader
     def load(path: str | Path) -> "AsBuilt":
-        """Read the file; see :func:`load`."""
-        return load(path)
+        """Read an as-built file.
+
+        Raises:
+            StoreError: not an as-built file.
+        """
+        return store.load_record(path, "asbuilt", AsBuilt)
 
 
 def _ends(
@@ -314,31 +324,3 @@ def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
     return np.asarray(
         np.clip(draws, [row.low for row in rows], [row.high for row in rows])
     )
-
-
-def save(path: str | Path, result: AsBuilt) -> None:
-    """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it can
-    be used alone.
-
-    Args:
-        path: the file to write.
-        result: the as-built lens.
-    """
-    arrays, attributes = store.flatten_record(result)
-    arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
-    store.save(
-        path, "asbuilt", arrays, attributes=attributes, provenance=result.provenance
-    )
-
-
-@typed_reader
-def load(path: str | Path) -> AsBuilt:
-    """Read an as-built file.
-
-    Args:
-        path: the file.
-
-    Raises:
-        StoreError: not an as-built file.
-    """
-    return store.load_record(path, "asbuilt", AsBuilt)

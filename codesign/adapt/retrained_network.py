@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from characterize.bench import HiddenLens
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from codesign.adapt import train as retraining
 from codesign.adapt.source import (
     FinishedRun,
@@ -102,7 +102,7 @@ def load_retrained(path: Path) -> FinishedRun:
     transaction.check_manifest(folder)
     recipe = config.load(folder / RECIPE, RetrainingRecipe)
     run_dir = _unchanged(folder, "run", recipe.weights)
-    built = asbuilt.load(_unchanged(folder, "asbuilt", recipe.asbuilt))
+    built = AsBuilt.load(_unchanged(folder, "asbuilt", recipe.asbuilt))
     truth = None
     if recipe.truth:
         truth = config.load(_unchanged(folder, "truth", recipe.truth), HiddenLens)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from codesign.adapt import source as finished
 from codesign.commands.options.budget import Options
 from codesign.evaluate.error_budget import (
@@ -179,7 +179,7 @@ def _budget_inputs(options: Options) -> BudgetInputs:
         fwhm_nm=options.led_fwhm_nm,
         mask=of_process(options.process) if options.process else None,
         library=library.load(options.library) if options.library else None,
-        asbuilt=asbuilt.load(options.asbuilt) if options.asbuilt else None,
+        asbuilt=AsBuilt.load(options.asbuilt) if options.asbuilt else None,
         run=finished.load_finished_run(options.run) if options.run else None,
         frames=options.frames,
     )

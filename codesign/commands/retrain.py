@@ -9,7 +9,7 @@ from typing import Any
 
 from characterize import next_mask
 from characterize.bench import HiddenLens
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from codesign.adapt import FinishedRun, LensPsfs, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
@@ -35,7 +35,7 @@ LOG = "log.jsonl"
 UNKNOWN = "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
 
 
-Given = tuple[FinishedRun, asbuilt.AsBuilt, lens.Lens, HiddenLens | None, Bias]
+Given = tuple[FinishedRun, AsBuilt, lens.Lens, HiddenLens | None, Bias]
 
 
 def run(options: Options) -> int:
@@ -50,7 +50,7 @@ def run(options: Options) -> int:
         options.run_dir, budget_mmacs=options.settings.budget_mmacs
     )
     place_on_device(source.run.trainer, device_of(options.device))
-    result = asbuilt.load(options.asbuilt)
+    result = AsBuilt.load(options.asbuilt)
     design = lens.load_plain(
         lens_file(options.run_dir, source.settings, source.row["budget_mmacs"])
     )

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from codesign.commands import budget as command_budget
 from codesign.evaluate.error_budget import BudgetEntry
 from codesign.gaze import people_file
@@ -72,7 +72,7 @@ def _psf():
 def _asbuilt():
     one = np.ones(2)
     frames = np.ones((2, 4, 4))
-    return asbuilt.AsBuilt(
+    return AsBuilt(
         design=_lens(), response=RESPONSE, names=("bias_nm", "height_nm"), value=one,
         covariance=np.eye(2), information=np.eye(2),
         held={"index": 0.0}, depth_um=one, angle_rad=np.zeros((2, 2)), pixel_um=3.0, measured=frames, predicted=frames,
@@ -99,7 +99,7 @@ KINDS = {
     "lens": (lambda p: lens.save(p, _lens()), lens.load),
     "library": (lambda p: library.save(p, _library()), library.load),
     "psf": (lambda p: psf.save(p, _psf()), psf.load),
-    "asbuilt": (lambda p: asbuilt.save(p, _asbuilt()), asbuilt.load),
+    "asbuilt": (lambda p: _asbuilt().save(p), AsBuilt.load),
     "budget": (
         lambda p: command_budget.save_budget(p, _budget_rows(), store.Provenance()),
         command_budget.load_budget,

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 import characterize
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from metalens import lens as lenses
 from metalens import psf
 from metalens.core import store
@@ -82,7 +82,7 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert not (bench / "as_bias.toml").exists()
     value, sigma = found["parameters"]["bias_nm"]
     assert abs(value - 3.0) < 4 * sigma
-    assert asbuilt.load(bench / "as.h5").trusted
+    assert AsBuilt.load(bench / "as.h5").trusted
     assert (bench / "as.html").stat().st_size > 20000
     assert (bench / "as_posterior.png").stat().st_size > 10000
     page = (bench / "as.html").read_text(encoding="utf-8")
@@ -109,7 +109,7 @@ def the_psfs_are_those_of_the_made_lens(bench):
         psf.load(bench / f"{name}_psf.h5").intensity for name in ("as", "lens")
     )
     want = (
-        asbuilt.load(bench / "as.h5")
+        AsBuilt.load(bench / "as.h5")
         .psf_stack(psf.View((500.0, 700.0), ((0.0, 0.0),), 24.0, 32), tolerance=1e-3)
         .intensity
     )

@@ -246,8 +246,8 @@ def test_what_cannot_be_told_is_reckoned_with_beside_the_model(fitted):
 
 
 def test_saved_result_comes_back(fitted, tmp_path):
-    asbuilt.save(tmp_path / "a.h5", fitted)
-    again = asbuilt.load(tmp_path / "a.h5")
+    fitted.save(tmp_path / "a.h5")
+    again = AsBuilt.load(tmp_path / "a.h5")
     assert again.names == fitted.names
     assert np.array_equal(again.covariance, fitted.covariance)
     assert again.degeneracies == fitted.degeneracies
@@ -257,7 +257,7 @@ def test_saved_result_comes_back(fitted, tmp_path):
     assert np.array_equal(again.lens_samples(3, seed=1), fitted.lens_samples(3, seed=1))
     assert np.array_equal(again.diameters.diameter_um, fitted.diameters.diameter_um)
     assert again.samples(3, seed=1).shape == (3, len(fitted.names))
-    asbuilt.save(tmp_path / "b.h5", fitted)
+    fitted.save(tmp_path / "b.h5")
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file
 
 from characterize.bench import HiddenLens
-from characterize.inference import asbuilt
+from characterize.inference import AsBuilt
 from codesign.adapt import retrained_network
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.optics import MadeLens, image_formation
@@ -43,8 +43,8 @@ SHORT = ["--steps", "2", "--draws", "2", "--judge", "1", "--test-batches", "1"]
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("command_retrain")
     m.finished_run(path / "run")
-    asbuilt.save(path / "asbuilt.h5", m.asbuilt())
-    asbuilt.save(path / "refused.h5", m.asbuilt(problems=("chi2 is 3",)))
+    m.asbuilt().save(path / "asbuilt.h5")
+    m.asbuilt(problems=("chi2 is 3",)).save(path / "refused.h5")
     (path / "truth.toml").write_text(TRUTH)
     return path
 
@@ -82,7 +82,7 @@ def bowed(folder):
     made = m.asbuilt()
     covariance = made.covariance.copy()
     covariance[made.names.index("bias_r_nm")] *= 2500.0  # on the diagonal alone
-    asbuilt.save(folder / "bowed.h5", dataclasses.replace(made, covariance=covariance))
+    dataclasses.replace(made, covariance=covariance).save(folder / "bowed.h5")
     done = run(*_command(folder, "--json", record="bowed.h5", out="bowed"))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -191,7 +191,7 @@ def test_where_the_map_alone_is_open_the_table_is_written(folder, bowed):
 def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(
     folder, capsys
 ):
-    asbuilt.save(folder / "wide.h5", m.asbuilt(sigma=5.0))
+    m.asbuilt(sigma=5.0).save(folder / "wide.h5")
     assert (
         _retrain(
             folder,
@@ -241,7 +241,7 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
     made = retrained_network.load_retrained(folder / "out")
     plain = retrained_network.load_retrained(folder / "run")
     design = lens.load_plain(folder / "run" / "lens.h5")
-    response = asbuilt.load(folder / "asbuilt.h5").response
+    response = AsBuilt.load(folder / "asbuilt.h5").response
     true = config.load(folder / "truth.toml", HiddenLens)
     wanted = MadeLens(design, made.settings.optics, response=response).stack(
         true.vector()
@@ -277,7 +277,7 @@ def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(
     assert (
         "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err
     )
-    asbuilt.save(tmp_path / "bowed.h5", m.asbuilt(sigma=0.2))
+    m.asbuilt(sigma=0.2).save(tmp_path / "bowed.h5")
     assert _shown(tmp_path, "bowed", out="shown") == 2
     assert "bowed.h5 is not what it was retrained from" in capsys.readouterr().err
     (tmp_path / "run").rename(tmp_path / "away")
