@@ -125,10 +125,7 @@ class CapturePlan:
 
     depth_um, angle_deg, exposure: (n,) of the frames.
     names, sigma: (p,) parameters and their standard errors within the model.
-    even_sigma: (p,) standard errors with as many frames evenly spread over the depths,
-    at the first exposure and angle.
     untold: (p,) standard deviation by causes that nobody states.
-    gain: (n,) criterion after each frame over that after the last.
     warnings: sentences on what these frames leave open.
     """
 
@@ -137,9 +134,7 @@ class CapturePlan:
     exposure: Array
     names: tuple[str, ...]
     sigma: Array
-    even_sigma: Array
     untold: Array
-    gain: Array
     warnings: tuple[str, ...] = ()
 
 
@@ -175,39 +170,24 @@ def plan_captures(
         place=place_of,
     )
     unstated = _unstated_shifts(lens, protocol, response, candidates[chosen])
-    requirements = _remaining_requirements(names, unstated.sigma, protocol.wanted)
-    chosen = chosen[
-        : _sufficient_count(
-            information,
-            prior,
-            chosen,
-            names,
-            requirements,
-            least=_least_count(candidates[chosen]),
-        )
-    ]
-    even = _even_frames(candidates, protocol, len(chosen))
-    values = [
-        design_criterion(
-            prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names
-        )
-        for i in range(len(chosen))
-    ]
-    covariances = [
-        invert_information(prior + information[frames].sum(0))
-        for frames in (chosen, even)
-    ]
-    sigma, even_sigma = (np.sqrt(np.diag(covariance)) for covariance in covariances)
+    count = _sufficient_count(
+        information[chosen],
+        prior,
+        names,
+        protocol.wanted,
+        unstated.sigma,
+        least=_least_count(candidates[chosen]),
+    )
+    chosen = chosen[:count]
+    covariance = invert_information(prior + information[chosen].sum(0))
+    sigma = np.sqrt(np.diag(covariance))
     depth, angle, exposure = candidates[chosen].T
     warnings = (
-        *_missed_requirements(names, sigma, unstated, protocol.wanted, len(chosen)),
+        *_missed_requirements(names, sigma, unstated, protocol.wanted, count),
         *_place_warnings(candidates[chosen]),
         *_focus_warnings(lens, protocol, depth),
     )
-    gain = np.array(values) / values[-1]
-    return CapturePlan(
-        depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, warnings
-    )
+    return CapturePlan(depth, angle, exposure, names, sigma, unstated.sigma, warnings)
 
 
 def _unstated_shifts(
@@ -246,34 +226,6 @@ def _unstated_shifts(
     )
 
 
-def _remaining_requirements(
-    names: tuple[str, ...],
-    unstated_sigma: Array,
-    requirements: Sequence[IntervalRequirement],
-) -> list[IntervalRequirement]:
-    """Required intervals less the unstated causes: sqrt(within² - (REACH sigma)²).
-
-    Unchanged where the unstated causes alone exceed the interval.
-
-    Args:
-        unstated_sigma: (p,) standard deviation by unstated causes.
-    """
-    remaining = []
-    for requirement in requirements:
-        unstated = (
-            REACH * float(unstated_sigma[names.index(requirement.name)])
-            if requirement.name in names
-            else 0.0
-        )
-        variance = requirement.within**2 - unstated**2
-        remaining.append(
-            IntervalRequirement(requirement.name, math.sqrt(variance))
-            if variance > 0
-            else requirement
-        )
-    return remaining
-
-
 def _least_count(frames: Array) -> int:
     """Number of leading frames that lie at ``_LEAST_PLACES`` pairs of depth and angle;
     all frames where there are fewer pairs.
@@ -291,33 +243,35 @@ def _least_count(frames: Array) -> int:
 def _sufficient_count(
     information: Array,
     prior: Array,
-    chosen: list[int],
     names: tuple[str, ...],
     requirements: Sequence[IntervalRequirement],
+    unstated_sigma: Array,
     *,
     least: int,
 ) -> int:
-    """Number of leading chosen frames that reach all required intervals, at least
-    ``least``; all frames where they do not reach them.
+    """Number of leading frames that reach all required intervals with what nobody
+    states, at least ``least``; all frames where they do not reach them.
+
+    A requirement that the unstated causes alone exceed is one on the model's interval.
 
     Args:
-        information: (candidates, p, p) of each frame.
+        information: (frames, p, p) of each chosen frame.
         prior: (p, p) information known beforehand.
+        unstated_sigma: (p,) standard deviation by unstated causes.
     """
-    limits = [
-        (names.index(requirement.name), requirement.within)
-        for requirement in requirements
-        if requirement.name in names
-    ]
-    if not limits:
-        return len(chosen)
-    for count in range(least, len(chosen)):
-        sigma = np.sqrt(
-            np.diag(invert_information(prior + information[chosen[:count]].sum(0)))
-        )
-        if all(REACH * sigma[index] <= within for index, within in limits):
+    limits = {}
+    for requirement in requirements:
+        if requirement.name in names:
+            index = names.index(requirement.name)
+            variance = (requirement.within / REACH) ** 2 - unstated_sigma[index] ** 2
+            limits[index] = (
+                variance if variance > 0 else (requirement.within / REACH) ** 2
+            )
+    for count in range(least, len(information)) if limits else ():
+        covariance = invert_information(prior + information[:count].sum(0))
+        if all(covariance[index, index] <= most for index, most in limits.items()):
             return count
-    return len(chosen)
+    return len(information)
 
 
 def _missed_requirements(
@@ -562,16 +516,3 @@ def _parameters(lens: Lens, protocol: BenchProtocol) -> tuple[tuple[str, ...], A
         for row in usual_parameters(names, lens)
     ]
     return names, np.diag([value**-2.0 for value in sigma])
-
-
-def _even_frames(candidates: Array, protocol: BenchProtocol, count: int) -> list[int]:
-    """Indices of ``count`` candidates evenly spread over the depths, at the first angle
-    and exposure.
-    """
-    plain = np.flatnonzero(
-        (candidates[:, 1] == protocol.angles_deg[0])
-        & (candidates[:, 2] == protocol.exposures[0])
-    )
-    return [
-        int(plain[i]) for i in np.linspace(0, len(plain) - 1, count).round().astype(int)
-    ]

@@ -54,29 +54,21 @@ def _plan(options: Options, path: Path) -> int:
         )
         store.write_text(draft.path, _stage_csv(plan))
     rows = _rows(plan)
-    values = {"file": str(target), "frames": rows, "gain": plan.gain.tolist()}
-    values |= {"sigma": dict(zip(plan.names, plan.sigma.tolist(), strict=True))}
-    values |= {"warnings": list(plan.warnings)}
-    values |= {
-        "even_sigma": dict(zip(plan.names, plan.even_sigma.tolist(), strict=True))
+    values = {
+        "file": str(target),
+        "frames": rows,
+        "sigma": dict(zip(plan.names, plan.sigma.tolist(), strict=True)),
+        "untold_sigma": dict(zip(plan.names, plan.untold.tolist(), strict=True)),
+        "warnings": list(plan.warnings),
     }
-    values |= {"untold_sigma": dict(zip(plan.names, plan.untold.tolist(), strict=True))}
     lines = [
         f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
         for z, angle, time in rows
     ]
-    total_sigma = np.hypot(plan.sigma, plan.untold)
-    lines.append(
-        "  half of a 95 % interval, with what nobody states; within the model; so with frames evenly spread"
-    )
-    columns = (
-        protocol.REACH * part for part in (total_sigma, plan.sigma, plan.even_sigma)
-    )
-    table = zip(plan.names, *columns, strict=True)
-    lines += [
-        f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}"
-        for n, total, own, even in table
-    ]
+    lines.append("  half of a 95 % interval, with what nobody states; within the model")
+    for name, sigma, untold in zip(plan.names, plan.sigma, plan.untold, strict=True):
+        total = protocol.REACH * np.hypot(sigma, untold)
+        lines.append(f"  {name:<24} +- {total:<8.2g} {protocol.REACH * sigma:.2g}")
     lines += [f"  note: {words}" for words in plan.warnings]
     options.console.result(
         values,

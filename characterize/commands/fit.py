@@ -200,11 +200,7 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
 
 def _values(pupil_fit: PupilFit) -> dict[str, object]:
     """Numbers of a pupil fit for JSON: agreement, chi², optics, parameters, cautions."""
-    scores = {
-        "agreement": pupil_fit.agreement,
-        "held_out": pupil_fit.held_out,
-        "spline": pupil_fit.between,
-    }
+    scores = {"agreement": pupil_fit.agreement, "held_out": pupil_fit.held_out}
     return {
         **{
             key: dataclasses.asdict(score)
@@ -233,10 +229,7 @@ def _text(pupil: PupilFit, target: Path) -> str:
         ("all planes fitted", pupil.agreement),
         ("odd planes predicted from even", pupil.held_out),
     )
-    for label, score in (
-        *scores,
-        ("the same by a cubic spline, without physics", pupil.between),
-    ):
+    for label, score in scores:
         if score is not None:
             numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
             lines.append(f"  {label}: {numbers}")

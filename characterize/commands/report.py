@@ -109,10 +109,6 @@ def asbuilt_report(
         "95 % intervals in the typical uncertainty of each parameter, with what these captures cannot tell (thin); "
         "pale: what would be left if all causes that nobody stated were absent; grey: what was known beforehand."
     )
-    correlation = report.Figure(
-        _correlation(result),
-        "Correlation of the parameters: deep colours cannot be told apart.",
-    )
     sections = [
         report.Section("What is known", "\n\n".join(result.verdicts)),
         report.Section(
@@ -129,7 +125,6 @@ def asbuilt_report(
             ],
         ),
         *_curves(pictures, truth),
-        report.Section("What goes together", "", [correlation]),
         report.Section("What the frames fix", "\n\n".join(result.identifiable)),
         report.Section(
             "What they cannot tell, and what to measure next",
@@ -374,20 +369,6 @@ def _intervals(result: AsBuilt) -> bytes:
     )
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
-    return report.figure_png(figure)
-
-
-def _correlation(result: AsBuilt) -> bytes:
-    """PNG of the (p, p) correlation matrix of the parameters."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 5.4))
-    axis = figure.add_subplot()
-    figure.colorbar(
-        axis.imshow(result.correlation, cmap="RdBu_r", vmin=-1, vmax=1), ax=axis
-    )
-    axis.set_xticks(range(len(result.names)), result.names, rotation=90, fontsize=6)
-    axis.set_yticks(range(len(result.names)), result.names, fontsize=6)
     return report.figure_png(figure)
 
 

@@ -20,12 +20,7 @@ from characterize.inference import (
     SolverSettings,
 )
 from characterize.pupil.model import RELATIVE_PRIOR, PupilModel, PupilSpec
-from characterize.pupil.score import (
-    StackAgreement,
-    measure_agreement,
-    predict_by_splines,
-    pupil_problems,
-)
+from characterize.pupil.score import StackAgreement, measure_agreement, pupil_problems
 from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, FitError, FitRefused
@@ -54,7 +49,6 @@ class PupilFit:
     phase_rad, amplitude: (nodes, nodes) pupil maps, nan and 0 outside the aperture.
     agreement: of all planes with their fit. held_out: of planes left out, predicted
     from a fit of the others; None where too few.
-    between: of the same planes by a cubic spline along the stack, without physics.
     optics: (name, value, standard error) of what was freed.
     cautions: degeneracies and corrections in words. problems: failed checks with their
     cause.
@@ -72,7 +66,6 @@ class PupilFit:
     amplitude: Array
     agreement: StackAgreement
     held_out: StackAgreement | None
-    between: StackAgreement | None
     optics: Optics
     chi2_per_dof: float
     converged: bool
@@ -117,9 +110,9 @@ def fit_pupil(
     model, optics = fit_optics(first_model, data, mean, sparse if enough_planes else 1)
     mean = transfer_parameters(mean, first_model, model)
 
-    held_out = between = None
+    held_out = None
     if enough_planes:
-        start, held_out, between = score_held_out(model, data, mean, sparse)
+        start, held_out = score_held_out(model, data, mean, sparse)
     else:
         start = fit_low_orders(model, data, mean)
     solution = maximize_likelihood(model, data, start, mean)
@@ -144,7 +137,6 @@ def fit_pupil(
         amplitude=amplitude,
         agreement=agreement,
         held_out=held_out,
-        between=between,
         optics=optics,
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
@@ -177,7 +169,7 @@ def save_pupil(
         "reason": fit.reason,
     }
     attributes |= {f"fitted_{name}": value for name, value, _ in fit.optics}
-    for label in ("agreement", "held_out", "between"):
+    for label in ("agreement", "held_out"):
         score = getattr(fit, label)
         if score is not None:
             entries = dataclasses.asdict(score).items()
@@ -359,9 +351,8 @@ def fit_optics(
 
 def score_held_out(
     model: PupilModel, data: FitImages, mean: Array, every: int
-) -> tuple[Array, StackAgreement, StackAgreement]:
-    """Agreement of held-out planes with a fit of the others, and with a cubic spline
-    through the others.
+) -> tuple[Array, StackAgreement]:
+    """Agreement of held-out planes with a fit of the others.
 
     The stage is taken as exact here: stage errors of held-out planes are unknown.
 
@@ -372,7 +363,7 @@ def score_held_out(
         every: distance of the fitted planes; the last plane is fitted too.
 
     Returns:
-        (p,) parameters of ``model`` to start from, score of the pupil, of the spline.
+        (p,) parameters of ``model`` to start from, score of the held-out planes.
     """
     planes = np.arange(len(data.electrons))
     fitted = np.union1d(planes[::every], planes[-1])
@@ -384,15 +375,9 @@ def score_held_out(
     start = fit_low_orders(part_model, fitted_data, part_mean)
     solution = maximize_likelihood(part_model, fitted_data, start, part_mean)
     value = transfer_parameters(solution.value, part_model, model)
-    background = model.background(value)[hidden]
-    hidden_data = data.planes(hidden)
-    interpolated = predict_by_splines(model.position_um, data, fitted, hidden)
     predicted = model.images(value, False)[0][hidden]
-    return (
-        value,
-        measure_agreement(predicted, hidden_data, background),
-        measure_agreement(interpolated, hidden_data, background),
-    )
+    background = model.background(value)[hidden]
+    return value, measure_agreement(predicted, data.planes(hidden), background)
 
 
 def fit_low_orders(model: PupilModel, data: FitImages, mean: Array) -> Array:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from characterize.inference import FitImages
 from metalens.core.arrays import Array
@@ -62,25 +61,6 @@ def pixel_noise_e(data: FitImages) -> float:
     """
     step = np.diff(data.electrons, axis=0)[data.usable[1:] & data.usable[:-1]]
     return 1.4826 * float(np.median(np.abs(step - np.median(step)))) / math.sqrt(2)
-
-
-def predict_by_splines(
-    position_um: Array, data: FitImages, fitted: Array, hidden: Array
-) -> Array:
-    """(hidden, y, x) electrons by cubic splines along the stack, pixel by pixel: the
-    prediction without physics to compare with.
-
-    Args:
-        position_um: (n,) stage positions.
-        data: all planes.
-        fitted: indices of the planes that are given.
-        hidden: indices of the planes that are predicted.
-    """
-    order = fitted[np.argsort(position_um[fitted])]
-    middle = np.median(data.electrons[data.usable])
-    light = np.where(data.usable, data.electrons, middle)
-    spline = CubicSpline(position_um[order], light[order])
-    return np.asarray(spline(position_um[hidden]))
 
 
 def pupil_problems(
