@@ -28,7 +28,7 @@ _STEP_TIME = "2000-01-01T00:00:00"  # in the header: the same bytes for the same
 _SUBSTRATE_COLOUR, _PILLAR_COLOUR = (0.75, 0.85, 0.95), (0.25, 0.35, 0.75)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class SolidSection:
     """Outlines of a class of pillars at foot and top, with corresponding parts.
 
@@ -45,7 +45,7 @@ class SolidSection:
         return abs(self.foot.radius_um - self.top.radius_um) < _UPRIGHT_UM
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class SolidTile:
     """Pillars of a part of a lens as fabricated: axis at (0, 0), feet on z = 0.
 
@@ -66,7 +66,7 @@ class SolidTile:
     site_um2: float
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A closed surface.
 
@@ -117,9 +117,7 @@ def cut_tile(
             f"solids of {lens.cell.described}: only pillars that stand are written, "
             "not openings of a film"
         )
-    is_disc = grid.plain and lens.cell.shape.kind == "circle"
-    classify = _discs if is_disc else _shapes
-    sections, kind = classify(lens, process, size_um, (row, column))
+    sections, kind = _sections(lens, process, size_um, (row, column))
     return SolidTile(
         sections,
         grid.x_um[column],
@@ -131,51 +129,6 @@ def cut_tile(
     )
 
 
-def _discs(
-    lens: Lens, process: Process, size_um: Array, _: tuple[Array, Array]
-) -> tuple[tuple[SolidSection, ...], Array]:
-    """Sections of round pillars, tapered by the sidewall angle.
-
-    Args:
-        lens: with its height and pitch.
-        process: bias and sidewalls.
-        size_um: (pillars,) designed diameters.
-
-    Returns:
-        A section of each drawn diameter, and (pillars,) which of them each pillar has.
-
-    Raises:
-        ProcessError: no top is left, or feet as wide as the pitch.
-    """
-    step = process.rules.diameter_step_nm
-    height = lens.cell.height_um
-    drawn_steps = np.rint(process.written_diameter_nm(size_um / nm) / step).astype(
-        np.int64
-    )
-    sizes, kind = np.unique(drawn_steps, return_inverse=True)
-    made_nm = process.made_diameter_nm(sizes * step)
-    top, foot = process.top_foot_nm(made_nm, height / nm)
-    pitch_nm = lens.diameters.pitch_um / nm
-    smallest = min(top.min(), foot.min())
-    largest = max(top.max(), foot.max())
-    if smallest <= 0 or largest >= pitch_nm:
-        raise ProcessError(
-            f"walls of {process.etch.sidewall_deg} degrees over {height} um make "
-            f"diameters from {smallest:.0f} to {largest:.0f} nm on a pitch of "
-            f"{pitch_nm:.0f} nm; need above 0 and below the pitch"
-        )
-    sections = tuple(
-        SolidSection(_label(middle_nm), _circle(foot_nm * nm), _circle(top_nm * nm))
-        for middle_nm, foot_nm, top_nm in zip((top + foot) / 2, foot, top, strict=True)
-    )
-    return sections, kind
-
-
-def _circle(diameter_um: float) -> Outline:
-    """Outline of a circle."""
-    return Outline((EllipseArc(diameter_um / 2, diameter_um / 2),))
-
-
 def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> str:
     """Name of a class without points, which CAD does not take."""
     sizes = [f"{s:.1f}".removesuffix(".0") for s in (width_nm, length_nm) if s]
@@ -183,14 +136,14 @@ def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> st
     return f"pillar_{'x'.join(sizes)}nm{turn}".replace(".", "_")
 
 
-def _shapes(
+def _sections(
     lens: Lens, process: Process, size_um: Array, sites: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of pillars of any shape and rotation.
 
     Args:
         lens: sizes, lengths and rotations.
-        process: bias, steps and sidewalls.
+        process: bias, steps and sidewalls; corners of drawn discs round off.
         size_um: (pillars,) designed sizes.
         sites: rows and columns of the pillars.
 
@@ -200,9 +153,12 @@ def _shapes(
     """
     grid = lens.diameters
     step = process.rules.diameter_step_nm
+    is_disc = grid.plain and lens.cell.shape.kind == "circle"
+    draw = process.written_diameter_nm if is_disc else process.bias.drawn_nm
+    make = process.made_diameter_nm if is_disc else process.bias.fabricated_nm
 
     def drawn_steps(size_um: Array) -> Array:
-        drawn = process.bias.drawn_nm(np.asarray(size_um, float) / nm)
+        drawn = draw(np.asarray(size_um, float) / nm)
         return np.rint(drawn / step).astype(np.int64) * step
 
     keys = np.zeros((len(size_um), 3), np.int64)
@@ -214,29 +170,32 @@ def _shapes(
         turns = round(360 / process.rules.angle_step_deg)
         keys[:, 2] = np.rint(angle).astype(int) % turns
     distinct, kind = np.unique(keys, axis=0, return_inverse=True)
-    sections = tuple(_section(lens.cell, process, *key) for key in distinct.tolist())
+    made_nm = np.where(distinct[:, :2] > 0, make(distinct[:, :2]), 0.0)
+    sections = tuple(
+        _section(lens.cell, process, width, length, turn)
+        for (width, length), turn in zip(
+            made_nm.tolist(), distinct[:, 2].tolist(), strict=True
+        )
+    )
     return sections, kind.reshape(-1)
 
 
 def _section(
-    cell: Cell, process: Process, drawn_nm: int, length_nm: int, turn: int
+    cell: Cell, process: Process, width: float, length: float, turn: int
 ) -> SolidSection:
     """Section of a pillar: outlines at foot and top, from that at half height.
 
     Args:
         cell: shape and height of the pillar.
-        process: bias and sidewall angle.
-        drawn_nm: drawn size.
-        length_nm: drawn length; 0: set by the shape.
+        process: sidewall angle.
+        width: fabricated size, nm.
+        length: fabricated length, nm; 0: set by the shape.
         turn: rotation in steps of the process.
 
     Raises:
         ProcessError: the walls leave no top, close a hole or make the feet touch.
     """
-    bias = process.bias
     angle = turn * process.rules.angle_step_deg
-    width = float(bias.fabricated_nm(np.array(float(drawn_nm))))
-    length = float(bias.fabricated_nm(np.array(float(length_nm)))) if length_nm else 0.0
     shape = cell_of_sizes(cell, width, length) if length else cell
     lean_um = cell.height_um * math.tan(math.radians(process.etch.sidewall_deg))
     is_impossible = True
@@ -318,13 +277,12 @@ def mesh_section(
     return TriangleMesh(np.concatenate(rings), np.concatenate(faces))
 
 
-def write_stl(path: str | Path, pillars: SolidTile, *, sides: int = 8) -> int:
+def write_stl(path: str | Path, pillars: SolidTile) -> int:
     """Write binary STL in um, one closed surface a pillar.
 
     Args:
         path: of the file.
         pillars: of a window.
-        sides: edges of a round pillar.
 
     Returns:
         Number of triangles.
@@ -333,10 +291,7 @@ def write_stl(path: str | Path, pillars: SolidTile, *, sides: int = 8) -> int:
         ProcessError: too many pillars. OSError: the target cannot be written.
     """
     check_count(pillars, "STL")
-    meshes = [
-        mesh_section(section, pillars.height_um, sides=sides)
-        for section in pillars.sections
-    ]
+    meshes = (mesh_section(each, pillars.height_um) for each in pillars.sections)
     facets = np.stack([_facets(mesh) for mesh in meshes])
     triangles = facets.shape[1] * len(pillars.kind)
     header = b"tapered pillars, um, metalens-toolchain".ljust(80)

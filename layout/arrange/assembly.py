@@ -22,7 +22,7 @@ _SAME = 5e-7  # difference of doses that are written as the same number
 _MOST_DATATYPE = 32767
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class PartPlacement:
     """A part and where it stands on the die."""
 
@@ -31,24 +31,25 @@ class PartPlacement:
 
     def copies(self, top: str) -> tuple[CellReference, ...]:
         """As arrays of its cell ``top``, in database units."""
-        return tuple(_copies(top, at) for at in self.at)
+        references = []
+        for at in self.at:
+            step_x, step_y = (round(v * PER_UM) for v in at.step_um or (0, 0))
+            references.append(
+                CellReference(
+                    top,
+                    round(at.x_um * PER_UM),
+                    round(at.y_um * PER_UM),
+                    Orientation(at.turn_deg % 360, at.mirrored),
+                    at.columns,
+                    at.rows,
+                    (step_x, 0),
+                    (0, step_y),
+                )
+            )
+        return tuple(references)
 
 
-def _copies(child: str, at: PartInstances) -> CellReference:
-    """An array of a cell at a place of the die, in database units."""
-    x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
-    step = (
-        (0, 0)
-        if at.step_um is None
-        else tuple(round(side * PER_UM) for side in at.step_um)
-    )
-    turn = Orientation(at.turn_deg % 360, at.mirrored)
-    return CellReference(
-        child, x, y, turn, at.columns, at.rows, (step[0], 0), (0, step[1])
-    )
-
-
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class JobLayers:
     """(layer, datatype) of all parts together: one dose each.
 

@@ -4,17 +4,24 @@ doses, and boxes around its shapes.
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from layout.formats import job_files
-from layout.formats.library import MaskCell, MaskLibrary, flatten_stacks, library_of
-from layout.mask.plan import UNDRAWN, MaskPlan, PillarArray
+from layout.formats.library import (
+    CellPlacements,
+    MaskCell,
+    MaskLibrary,
+    flatten_stacks,
+    library_of,
+)
+from layout.mask.plan import MaskPlan, PillarArray
 from layout.process.process import LayerNumber, Process
-from layout.shapes import polygon, rectilinear, region
+from layout.shapes import region
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -23,7 +30,7 @@ PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
 _TILES = 64  # squares of a lattice, each way
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class DieComponent:
     """A cell with all below it, in nanometres.
 
@@ -37,7 +44,6 @@ class DieComponent:
         and of no others.
     uncorrected: {layer: shapes} exposed with the pillars at a dose that corrects
         nothing.
-    empty: shapes without area that were left out.
     """
 
     name: str
@@ -47,7 +53,6 @@ class DieComponent:
     extent: Array
     corrected: bool = False
     uncorrected: Mapping[LayerNumber, int] = field(default_factory=dict)
-    empty: int = 0
 
 
 def of_plan(
@@ -69,29 +74,13 @@ def of_plan(
         new_names[cell.name]: moved_cell(cell, new_names, {})
         for cell in library.cells.values()
     }
-    boxes = {
-        PILLARS: [
-            box for lattice in plan.lattices for box in _lattice_boxes(plan, lattice)
-        ],
-        APERTURE: [],
-    }
-    all_boxes = list(boxes[PILLARS])
-    for figure in plan.figures:
-        for layer, shapes in figure.polygons.items():
-            boxes_of_shapes = [
-                box
-                for shape in shapes
-                for box in rectilinear.covering_rectangles(shape)
-            ]
-            all_boxes += boxes_of_shapes
-            if figure.name not in UNDRAWN:
-                boxes[_exposure(layer, process)] += boxes_of_shapes
-    boxes_of_exposure = {
-        exposure: _stacked(listed) for exposure, listed in boxes.items()
-    }
     library = dataclasses.replace(library, cells=cells)
-    extent = box_around(_stacked(all_boxes))
-    return DieComponent(name, name, library, boxes_of_exposure, extent, corrected)
+    bare = {key: dataclasses.replace(cell, pillars=None) for key, cell in cells.items()}
+    figures = dataclasses.replace(library, cells=bare)
+    boxes, _ = _shape_boxes(figures, name, process)
+    for lattice in plan.lattices:
+        boxes.setdefault(PILLARS, []).append(_lattice_boxes(plan, lattice))
+    return _component(name, name, library, boxes, corrected=corrected)
 
 
 def of_file(
@@ -124,83 +113,66 @@ def of_file(
         )
     top = cell or content.tops[0]
     library = _in_unit(content.below(top), UNIT_NM, str(path))
-    library, empty = _without_empty(library)
     layers = process.layers
     table = path.with_name("doses.csv")
     table_doses = job_files.read_dose_table(table) if table.is_file() else {}
     used = sorted(library.layers - {layers.outline, layers.fields})
     doses = {layer: table_doses.get(layer, relative_dose) for layer in used}
-    boxes: dict[str, list[Array]] = {}
-    counts: Counter[LayerNumber] = Counter()
-    for stack in flatten_stacks(library, top):
-        counts[stack.layer] += len(stack.outlines) * len(stack.x)
-        pieces = [
-            rectilinear.covering_rectangles(outline) for outline in stack.outlines
-        ]
-        places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
-        placed = (np.concatenate(pieces)[None] + places[:, None]).reshape(-1, 4)
-        boxes.setdefault(_exposure(stack.layer, process, other=True), []).append(placed)
-    boxes_of_exposure = {key: np.concatenate(stacks) for key, stacks in boxes.items()}
-    all_boxes = np.concatenate(
-        [
-            *boxes_of_exposure.values(),
-            *([] if boxes_of_exposure else [np.zeros((1, 4))]),
-        ]
-    )
-    return DieComponent(
+    boxes, counts = _shape_boxes(library, top, process)
+    return _component(
         name,
         top,
         dataclasses.replace(library, doses=doses),
-        {
-            key: stacked
-            for key, stacked in boxes_of_exposure.items()
-            if key in (PILLARS, APERTURE)
-        },
-        box_around(all_boxes),
+        boxes,
         uncorrected={
             layer: counts[layer]
             for layer in used
             if layer not in table_doses and layer[0] != layers.aperture[0]
         },
-        empty=empty,
     )
 
 
-def _without_empty(library: MaskLibrary) -> tuple[MaskLibrary, int]:
-    """Cells without shapes that enclose no area, and how many of these there were."""
-    count = sum(
-        number
-        for kind, number in library.skipped.items()
-        if kind.endswith("without area")
-    )
-    cells = {}
-    for name, cell in library.cells.items():
-        polygons: dict[LayerNumber, list[Array]] = {}
-        for layer, shapes in cell.polygons.items():
-            for shape in shapes:
-                if polygon.twice_area(shape) or region.union_contours([shape]):
-                    polygons.setdefault(layer, []).append(shape)
-                else:
-                    count += 1
-        cells[name] = dataclasses.replace(cell, polygons=polygons)
-    return dataclasses.replace(library, cells=cells), count
+def _shape_boxes(
+    library: MaskLibrary, top: str, process: Process
+) -> tuple[dict[str, list[Array]], Counter[LayerNumber]]:
+    """{exposure: (n, 4) boxes of its shapes} below a cell, and shapes of each layer."""
+    boxes: dict[str, list[Array]] = {}
+    counts: Counter[LayerNumber] = Counter()
+    for stack in flatten_stacks(library, top):
+        counts[stack.layer] += len(stack.outlines) * len(stack.x)
+        pieces = [region.covering_rectangles(outline) for outline in stack.outlines]
+        places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
+        placed = (np.concatenate(pieces)[None] + places[:, None]).reshape(-1, 4)
+        boxes.setdefault(_exposure(stack.layer, process), []).append(placed)
+    return boxes, counts
 
 
-def _exposure(layer: LayerNumber, process: Process, *, other: bool = False) -> str:
+def _component(
+    name: str,
+    top: str,
+    library: MaskLibrary,
+    boxes: dict[str, list[Array]],
+    **more: Any,
+) -> DieComponent:
+    """A part with its boxes of both exposures, within those of all shapes."""
+    joined = {key: np.concatenate(stacks) for key, stacks in boxes.items()}
+    extent = box_around(np.concatenate([np.zeros((0, 4)), *joined.values()]))
+    exposed = {key: joined[key] for key in (PILLARS, APERTURE) if key in joined}
+    return DieComponent(name, top, library, exposed, extent, **more)
+
+
+def _exposure(layer: LayerNumber, process: Process) -> str:
     """Exposure of a layer: pillars or aperture, or its number where it is of neither.
 
     Args:
         layer: number and datatype.
         process: layer numbers.
-        other: whether there are layers of neither.
     """
     layers = process.layers
     if layer[0] == layers.aperture[0]:
         return APERTURE
     ours = layers.pillar, layers.marks, layers.labels, layers.dose, layers.witness
-    if other and layer[0] not in {number for number, _ in ours}:
-        return f"layer {layer[0]}"
-    return PILLARS
+    return PILLARS if layer[0] in {n for n, _ in ours} else f"layer {layer[0]}"
 
 
 def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
@@ -233,15 +205,17 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
         return whole.astype(np.int64)
 
     def rescaled(old: MaskCell) -> MaskCell:
-        placed = old.kept()
-        x, y = (scaled(places).astype(np.int32) for places in (placed.x, placed.y))
         return dataclasses.replace(
             old,
             polygons={
                 k: [scaled(points) for points in shapes]
                 for k, shapes in old.polygons.items()
             },
-            placed=dataclasses.replace(placed, x=x, y=y),
+            references=tuple(
+                dataclasses.replace(one, x=scaled(one.x), y=scaled(one.y))
+                for one in old.references
+                if isinstance(one, CellPlacements)
+            ),
         )
 
     cells = {name: rescaled(cell) for name, cell in library.cells.items()}
@@ -261,7 +235,6 @@ def moved_cell(
     polygons: dict[LayerNumber, list[Array]] = {}
     for layer, shapes in cell.polygons.items():
         polygons.setdefault(layers.get(layer, layer), []).extend(shapes)
-    placed = cell.kept()
     pillars = cell.pillars
     if pillars is not None:
         children = tuple(names.get(child, "") for child in pillars.children)
@@ -270,9 +243,6 @@ def moved_cell(
         cell,
         name=names[cell.name],
         polygons=polygons,
-        placed=dataclasses.replace(
-            placed, children=tuple(names[child] for child in placed.children)
-        ),
         references=tuple(
             dataclasses.replace(one, child=names[one.child]) for one in cell.references
         ),
@@ -280,7 +250,7 @@ def moved_cell(
     )
 
 
-def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
+def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> Array:
     """Boxes around the pillars of tiles of a lattice, at most 64 by 64 tiles.
 
     Args:
@@ -288,7 +258,7 @@ def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
         lattice: of the plan.
 
     Returns:
-        (4,) left, bottom, right, top of each tile that holds pillars, database units.
+        (n, 4) left, bottom, right, top of each tile that holds pillars, database units.
     """
     reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
     rows_per_tile = -(-lattice.rows // _TILES)
@@ -306,11 +276,6 @@ def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
                 boxes.append(
                     np.add([*low, *high_corner], np.array([-1, -1, 1, 1]) * reach)
                 )
-    return boxes
-
-
-def _stacked(boxes: Sequence[Array]) -> Array:
-    """(n, 4) boxes."""
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 

@@ -2,17 +2,17 @@
 other files, a raster of dies.
 """
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from layout.process import names
+from layout.process.process import check_positive
 from metalens.core.errors import ProcessError
 
 MOST_DIES = 1_000_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PartInstances:
     """Where a lens or cell is placed, once or as an array.
 
@@ -32,10 +32,6 @@ class PartInstances:
     step_um: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.x_um + self.y_um + self.turn_deg):
-            raise ProcessError(
-                f"x_um, y_um, turn_deg = {self.x_um}, {self.y_um}, {self.turn_deg}: need finite numbers"
-            )
         if min(self.columns, self.rows) < 1 or self.columns * self.rows > MOST_DIES:
             raise ProcessError(
                 f"columns x rows = {self.columns} x {self.rows}: need from 1 to {MOST_DIES} copies"
@@ -44,13 +40,10 @@ class PartInstances:
             raise ProcessError(
                 f"step_um is missing for {self.columns} columns and {self.rows} rows"
             )
-        if self.step_um is not None and not all(0 < s < math.inf for s in self.step_um):
-            raise ProcessError(
-                f"step_um = {list(self.step_um)}: need two finite lengths above 0"
-            )
+        check_positive(self, "step_um")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LensPart:
     """A lens on the die, drawn, corrected and checked by itself.
 
@@ -70,7 +63,7 @@ class LensPart:
         _named(self.name)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CellPart:
     """A cell of a GDSII or OASIS file made elsewhere.
 
@@ -91,13 +84,9 @@ class CellPart:
 
     def __post_init__(self) -> None:
         _named(self.name)
-        if not 0 < self.relative_dose < 1e6:
-            raise ProcessError(
-                f"relative_dose = {self.relative_dose}: need a finite dose above 0"
-            )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FrameSettings:
     """Marks, label, dose test and witness cells once for all lenses of the die.
 
@@ -109,13 +98,10 @@ class FrameSettings:
     label: str = ""
 
     def __post_init__(self) -> None:
-        if not all(0 < s < math.inf for s in self.size_um):
-            raise ProcessError(
-                f"size_um = {list(self.size_um)}: need two finite lengths above 0"
-            )
+        check_positive(self, "size_um")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WaferMark:
     """Middle of an alignment mark of the wafer.
 
@@ -126,7 +112,7 @@ class WaferMark:
     y_mm: float = field(metadata={"signed": True})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WaferSettings:
     """Dies side by side on a round wafer, its flat or notch at the lowest y.
 
@@ -154,13 +140,11 @@ class WaferSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range, and settings that contradict each other."""
-        _above("pitch_um", *self.pitch_um)
+        check_positive(self, "pitch_um", "diameter_mm", "mark_um", "mark_width_um")
         if any(abs(1e3 * pitch - round(1e3 * pitch)) > 1e-6 for pitch in self.pitch_um):
             raise ProcessError(
                 f"pitch_um = {list(self.pitch_um)}: need whole nanometres, so that all dies are alike"
             )
-        for name in ("diameter_mm", "mark_um", "mark_width_um"):
-            _above(name, getattr(self, name))
         for name in ("edge_exclusion_mm", "flat_mm", "notch_mm"):
             if not 0 <= getattr(self, name) < self.diameter_mm / 2:
                 raise ProcessError(
@@ -176,7 +160,7 @@ class WaferSettings:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DieFloorplan:
     """Lenses and cells on a die, the die alone or on a wafer.
 
@@ -200,7 +184,7 @@ class DieFloorplan:
             raise ProcessError(
                 "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
             )
-        used_names = [self.name, *(part.name for part in self.parts)]
+        used_names = [self.name, "WMARK", *(part.name for part in self.parts)]
         if self.die is not None:
             used_names.append("DIE")
         names.check_distinct_names(used_names)
@@ -221,12 +205,4 @@ def _named(name: str) -> None:
     if len(name) > 12:
         raise ProcessError(
             f"name {name!r}: need at most 12 characters, cells of its parts begin with it"
-        )
-
-
-def _above(name: str, *values: float) -> None:
-    """Refuse lengths that are not finite and above 0."""
-    if not all(0 < value < math.inf for value in values):
-        raise ProcessError(
-            f"{name} = {', '.join(map(str, values))}: need finite lengths above 0"
         )

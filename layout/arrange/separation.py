@@ -11,7 +11,7 @@ import numpy as np
 from layout.arrange.assembly import PER_UM, PartPlacement
 from layout.arrange.parts import APERTURE, DieComponent, box_around
 from layout.drc.report import RuleViolation
-from layout.formats.library import CellReference, Orientation
+from layout.formats.library import Orientation
 from layout.pec import psf
 from layout.process.process import Process
 from layout.shapes.rectilinear import box_distance
@@ -21,7 +21,7 @@ from metalens.core.errors import ProcessError
 MOST_PLACED = 4000  # parts on a die
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class StandingPart:
     """One copy of a part: where, and the boxes of its exposures there."""
 
@@ -107,10 +107,8 @@ def check_separation(
     return violations
 
 
-def extent_of_copies(
-    placed: Sequence[PartPlacement], *, exposed: bool = False
-) -> Array:
-    """(4,) left, bottom, right, top around all copies, database units.
+def extent_um(placed: Sequence[PartPlacement], *, exposed: bool = False) -> Array:
+    """(4,) left, bottom, right, top around all copies.
 
     Args:
         placed: parts on the die.
@@ -119,7 +117,7 @@ def extent_of_copies(
     boxes = []
     for copy in standing_parts(placed):
         boxes.append(copy.box() if exposed else copy.moved(copy.part.extent[None])[0])
-    return box_around(np.array(boxes))
+    return box_around(np.array(boxes)) / PER_UM
 
 
 def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
@@ -127,23 +125,11 @@ def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
 
     Args:
         placed: parts on the die.
-
-    Raises:
-        ProcessError: more than 4000 copies of a part.
     """
     for placing in placed:
         for copies in placing.copies(placing.part.top):
-            yield from _each(placing.part, copies)
-
-
-def _each(part: DieComponent, copies: CellReference) -> Iterator[StandingPart]:
-    """Each copy of an array as a part of its own."""
-    if copies.count > MOST_PLACED:
-        raise ProcessError(
-            f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked"
-        )
-    for x, y in zip(*(values.tolist() for values in copies.places()), strict=True):
-        yield StandingPart(part, copies.turn, x, y)
+            for x, y in zip(*map(np.ndarray.tolist, copies.places()), strict=True):
+                yield StandingPart(placing.part, copies.turn, x, y)
 
 
 def _between(

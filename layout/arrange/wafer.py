@@ -18,16 +18,17 @@ NOTCH_RADIUS_MM = 0.9  # of the bottom of a notch, SEMI M1
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class WaferDies:
     """Dies on a wafer.
 
     index: (n, 2) column and row in the raster, row by row from the lowest. place_um:
-    (n, 2) centres.
+    (n, 2) centres. pitch_um: along x and y.
     """
 
     index: Array
     place_um: Array
+    pitch_um: tuple[float, float]
 
 
 def usable_dies(
@@ -82,7 +83,7 @@ def usable_dies(
             f"no die of {right - left:.0f} x {top - bottom:.0f} um fits on the wafer; change wafer.offset_um, "
             "wafer.edge_exclusion_mm or wafer.diameter_mm"
         )
-    return WaferDies(index[usable], place[usable])
+    return WaferDies(index[usable], place[usable], wafer.pitch_um)
 
 
 def refuse_marks_off(wafer: WaferSettings) -> None:
@@ -162,17 +163,23 @@ def step_and_repeat(
         units_per_um: database units in a micrometre.
     """
     column, row = (dies.index - dies.index.min(0)).T
-    places = np.full((row.max() + 1, column.max() + 1, 2), np.nan)
-    places[row, column] = dies.place_um * units_per_um
-    steps = [
-        int(np.rint(np.nanmax(np.append(np.diff(places[..., axis], axis=1 - axis), 0))))
-        for axis in (0, 1)
-    ]
+    filled = np.zeros((row.max() + 1, column.max() + 1), bool)
+    filled[row, column] = True
+    pitch = np.array(dies.pitch_um) * units_per_um
+    origin = dies.place_um[0] * units_per_um - (column[0], row[0]) * pitch
+    step_x, step_y = np.rint(pitch).astype(int).tolist()
     copies = []
-    runs = rectilinear.merge_runs(~np.isnan(places[..., 0]))
-    for left, low, right, high in runs.tolist():
-        x, y = np.rint(places[low, left]).astype(int).tolist()
-        size = {"columns": right - left, "rows": high - low}
-        across, up = (steps[0], 0), (0, steps[1])
-        copies.append(CellReference(child, x, y, **size, across=across, up=up))
+    for left, low, right, high in rectilinear.merge_runs(filled).tolist():
+        x, y = np.rint(origin + (left, low) * pitch).astype(int).tolist()
+        copies.append(
+            CellReference(
+                child,
+                x,
+                y,
+                columns=right - left,
+                rows=high - low,
+                across=(step_x, 0),
+                up=(0, step_y),
+            )
+        )
     return tuple(copies)

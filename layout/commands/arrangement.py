@@ -2,38 +2,34 @@
 put together in one mask.
 """
 
-import csv
 import dataclasses
-import io
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from layout.arrange import assembly, parts, separation, wafer
 from layout.arrange.record import CellPart, DieFloorplan, PartInstances, WaferSettings
 from layout.commands import make, page
-from layout.commands.job import FloorplanWork, Options, StageTimes
+from layout.commands.job import FloorplanWork, LayoutJob, Options
 from layout.drc.klayout import write_lyp
 from layout.drc.lattice import check_plan
 from layout.drc.library import check_library
-from layout.formats import compare, gdsii_write, job_files, oasis_write
+from layout.formats import compare, job_files
 from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, library_of
 from layout.formats.reading import read_mask
 from layout.mask import build
 from layout.mask.plan import MaskPlan
 from layout.process import process as processes
-from layout.process.jit import announce_compilation
 from layout.process.process import LayerNumber
 from layout.verify.exposure import verify_exposure
-from metalens.core import config, reading, store
-from metalens.core.errors import MaskFileError, ProcessError
+from metalens.core import config, store
+from metalens.core.errors import ProcessError
 
 _LISTED = 12  # spaces between parts that are listed one by one
+_MARK = "WMARK"  # cell of a mark of the wafer
 
 
-def run(options: Options) -> int:
+def make_floorplan(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does
     not read back as planned.
 
@@ -42,26 +38,17 @@ def run(options: Options) -> int:
     """
     record = config.load(options.lens, DieFloorplan)
     named = [part.file for part in record.parts]
-    process = (
-        processes.Process()
-        if options.process is None
-        else processes.load_process(options.process)
-    )
+    process = processes.load_process(options.process)
     if not options.dose:
         exposure = dataclasses.replace(process.exposure, correct=False)
         process = dataclasses.replace(process, exposure=exposure)
     inputs = [options.lens.parent / file for file in named]
-    with (
-        options.claim_folder(options.output, inputs=inputs) as draft,
-        options.shared(),
-        announce_compilation(options.console.say),
-    ):
-        stages = StageTimes(options.console.say)
-        work = FloorplanWork(options, record, process, draft.path, stages)
+    with options.claim_folder(options.output, inputs=inputs) as draft, options.shared():
+        work = FloorplanWork(options, record, process, draft.path, options.console.say)
         made = _whole(work)
         _write(work, made)
-        with stages("report"):
-            _accompany(work, made)
+        work.say("report")
+        _accompany(work, made)
     return options.console.judged(_values(work, made), _text(work, made), work.failures)
 
 
@@ -88,8 +75,8 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
     work.placed, marks = _parts(work)
-    with work.stages("room between parts"):
-        work.near = separation.check_separation(work.placed, work.process)
+    work.say("room between parts")
+    work.near = separation.check_separation(work.placed, work.process)
     spaces = [
         f"{violation.text}: {violation.value / 1e3:.3f} um apart, "
         f"need {violation.limit / 1e3:.4g}"
@@ -122,58 +109,50 @@ def _parts(
         options.console.say(f"{part.name}: {part.file}")
         furniture: build.Furniture = "die" if record.furnished(part) else "aperture"
         drawings.append(make.draw_lens(options, furniture=furniture))
-    plans = [drawing.made.plan for drawing in drawings]
+    plans = {drawing.plan.name: drawing.plan for drawing in drawings}
     if record.die is not None:
         sketches = [
             assembly.PartPlacement(
-                parts.of_plan(part.name, plan, process, corrected=False), part.at
+                parts.of_plan(part.name, plans[part.name], process, corrected=False),
+                part.at,
             )
-            for part, plan in zip(record.lens, plans, strict=True)
+            for part in record.lens
         ]
-        box = (
-            separation.extent_of_copies([*sketches, *files], exposed=True)
-            / assembly.PER_UM
+        exposed_um = separation.extent_um([*sketches, *files], exposed=True)
+        left, _, right, _ = exposed_um.tolist()
+        plans["DIE"] = build.die_surroundings(
+            drawings[0].source,
+            process,
+            name="DIE",
+            size_um=record.die.size_um,
+            clear_um=max(-left, right) + separation.reach_um(process),
+            label=record.die.label or record.name,
         )
-        plans.append(
-            build.die_surroundings(
-                drawings[0].source,
-                process,
-                name="DIE",
-                size_um=record.die.size_um,
-                clear_um=float(max(-box[0], box[2])) + separation.reach_um(process),
-                label=record.die.label or record.name,
-            ).plan
+    if size is not None and size.marks:
+        plans[_MARK] = build.wafer_mark(
+            drawings[0].source,
+            process,
+            name=_MARK,
+            mark_um=size.mark_um,
+            width_um=size.mark_width_um,
         )
-    has_marks = size is not None and bool(size.marks)
-    if size is not None and has_marks:
-        source = drawings[0].source
-        plans.append(
-            build.wafer_mark(
-                source,
-                process,
-                name="WMARK",
-                mark_um=size.mark_um,
-                width_um=size.mark_width_um,
-            ).plan
-        )
-    with work.stages("dose"):
-        solved_plans = make.correct_doses(plans, process, corrected=work.corrected)
-    mark = _frame_part(work, solved_plans.pop()[0]) if has_marks else None
+    work.say("dose")
+    doses = make.correct_doses([*plans.values()], process, corrected=work.corrected)
+    solved = dict(zip(plans, doses, strict=True))
+    mark = _frame_part(work, solved[_MARK][0]) if _MARK in solved else None
     placed = [
-        assembly.PartPlacement(_lens_part(work, drawing, solved_plan), part.at)
-        for part, drawing, solved_plan in zip(
-            record.lens, drawings, solved_plans, strict=False
-        )
+        assembly.PartPlacement(_lens_part(work, drawing, solved[part.name]), part.at)
+        for part, drawing in zip(record.lens, drawings, strict=True)
     ]
     placed += files
     if record.die is not None:
-        around = _frame_part(work, solved_plans[-1][0])
+        around = _frame_part(work, solved["DIE"][0])
         placed.append(assembly.PartPlacement(around, (PartInstances(),)))
     return placed, mark
 
 
 def _lens_part(
-    work: FloorplanWork, drawing: make.DrawnLens, solved: make.SolvedPlan
+    work: FloorplanWork, drawing: LayoutJob, solved: make.SolvedPlan
 ) -> parts.DieComponent:
     """A lens, with mask, report and job sheet in a folder of its own."""
     name = drawing.options.name
@@ -184,8 +163,6 @@ def _lens_part(
     work.failures += [f"{name}: {text}" for text in job.failures]
     work.lenses[name] = make.values_of(job)
     work.splits[name] = job.fields
-    for stage, seconds in job.seconds.items():
-        work.stages.seconds[f"{name}: {stage}"] = seconds
     return parts.of_plan(name, job.plan, work.process, corrected=job.dose is not None)
 
 
@@ -193,11 +170,11 @@ def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
     """What stands around the lenses as a part of the die, checked and verified."""
     name = plan.name
     process = work.process
-    with work.stages(f"{name}: check"):
-        work.judge_rules(name, check_plan(plan, process.rules))
+    work.say(f"{name}: check")
+    work.judge_rules(name, check_plan(plan, process.rules))
     if work.corrected and process.exposure.csv is None:
-        with work.stages(f"{name}: verify exposure"):
-            exposure = verify_exposure(library_of(plan), plan, plan.doses, process)
+        work.say(f"{name}: verify exposure")
+        exposure = verify_exposure(library_of(plan), plan, plan.doses, process)
         if not exposure.ok:
             work.failures.append(
                 f"{name}: exposure off by {100 * exposure.worst_exposure:.2g} % and "
@@ -217,13 +194,8 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
         MaskFileError: the file is missing, too large or cannot be read.
     """
     path = work.options.lens.parent / part.file
-    if not path.is_file():
-        raise MaskFileError(
-            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
-        )
-    limit = placement_limit(path)
-    content = read_mask(path, limit)
-    content.refuse_beyond(limit)
+    content = read_mask(path)
+    content.refuse_beyond(placement_limit(path))
     component = parts.of_file(
         part.name,
         path,
@@ -232,34 +204,30 @@ def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
         cell=part.cell,
         relative_dose=part.relative_dose,
     )
-    text_count = component.library.skipped["text"]
-    for number, kind in (
-        (text_count, "texts"),
-        (component.empty, "shapes without area"),
-    ):
-        if number:
-            work.notes.append(
-                f"{number} {kind} of {path.name} are left out: they draw nothing"
-            )
+    skipped = component.library.skipped
+    empty = sum(count for kind, count in skipped.items() if "without area" in kind)
+    work.notes += [
+        f"{count} {kind} of {path.name} are left out: they draw nothing"
+        for count, kind in ((skipped["text"], "texts"), (empty, "shapes without area"))
+        if count
+    ]
     if part.checked:
         layers = work.process.layers
         skip = {layers.outline[0], layers.fields[0]}
         drawn = {number for number, _ in component.library.layers}
-        with work.stages(f"{part.name}: check"):
-            chosen = [(number, None) for number in sorted(drawn - skip)]
-            report = check_library(component.library, work.process.rules, layers=chosen)
+        work.say(f"{part.name}: check")
+        chosen = [(number, None) for number in sorted(drawn - skip)]
+        report = check_library(component.library, work.process.rules, layers=chosen)
         work.judge_rules(part.name, report)
     else:
         work.unchecked.append(part.name)
     if work.corrected and component.uncorrected:
-        names = ", ".join(f"{a}/{b}" for a, b in list(component.uncorrected)[:8])
-        doses = sorted(
-            {component.library.doses[layer] for layer in component.uncorrected}
-        )
+        names = ", ".join(f"{a}/{b}" for a, b in component.uncorrected)
+        doses = {component.library.doses[layer] for layer in component.uncorrected}
         work.failures.append(
-            f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names}"
-            f"{', ...' * (len(component.uncorrected) > 8)} of {part.file} get the "
-            f"relative dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+            f"{part.name}: {sum(component.uncorrected.values()):,} shapes on {names} of "
+            f"{part.file} get the relative dose "
+            f"{', '.join(f'{dose:g}' for dose in sorted(doses))} without proximity "
             "correction; correct the file and lay its doses.csv beside it, or set "
             "exposure.correct = false"
         )
@@ -281,9 +249,7 @@ def _stepped(
         mark: alignment mark; None: no marks.
     """
     scatter_um = separation.reach_um(work.process)
-    exposed_box = (
-        separation.extent_of_copies(work.placed, exposed=True) / assembly.PER_UM
-    )
+    exposed_box = separation.extent_um(work.placed, exposed=True)
     need = max(scatter_um, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(exposed_box[2 + axis] - exposed_box[axis])
@@ -292,11 +258,10 @@ def _stepped(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
                 f"need {need:.4g}"
             )
-    box = separation.extent_of_copies(work.placed) / assembly.PER_UM
-    left, bottom, right, top = box.tolist()
+    left, bottom, right, top = separation.extent_um(work.placed).tolist()
     margin = max(scatter_um, assembly.MARGIN_UM)
-    box_um = left, bottom, right, top
-    work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
+    die_um = left, bottom, right, top
+    work.dies = wafer.usable_dies(size, die_um, around_marks_um=margin)
     steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=assembly.PER_UM)
     at = tuple(
         PartInstances(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks
@@ -307,18 +272,13 @@ def _stepped(
 
 def _write(work: FloorplanWork, library: MaskLibrary) -> None:
     """Write the mask files of the options, and read each back."""
-    writers: dict[str, Callable[[MaskLibrary, Path], None]] = {}
-    if work.options.writes_oasis:
-        writers["mask.oas"] = oasis_write.write_oasis
-    if work.options.writes_gds:
-        writers["mask.gds"] = gdsii_write.write_gdsii
-    for name, write in writers.items():
+    for name, write in make.mask_writers(work.options).items():
         path = work.folder / name
-        with work.stages(f"write {name}"):
-            write(library, path)
-        with work.stages(f"read back {name}"):
-            content = read_mask(path, make.MOST_READ, keep=make.KEPT)
-            differences = compare.mask_differences(library, content)
+        work.say(f"write {name}")
+        write(library, path)
+        work.say(f"read back {name}")
+        content = read_mask(path, make.MOST_READ, keep=make.KEPT)
+        differences = compare.mask_differences(library, content)
         work.failures += [
             f"{name} does not read back as planned: {text}" for text in differences
         ]
@@ -353,13 +313,11 @@ def _accompany(work: FloorplanWork, library: MaskLibrary) -> None:
         "layout.json": json.dumps(_values(work, library), indent=1) + "\n",
     }
     if work.dies is not None:
-        table = io.StringIO()
-        out = csv.writer(table, lineterminator="\n")
-        out.writerow(("die", "column", "row", "x_um", "y_um"))
         pairs = zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True)
-        for n, (index, place) in enumerate(pairs, 1):
-            out.writerow([n, *index, *(f"{v:.4f}" for v in place)])
-        texts["dies.csv"] = table.getvalue()
+        texts["dies.csv"] = "die,column,row,x_um,y_um\n" + "".join(
+            f"{n},{column},{row},{x:.4f},{y:.4f}\n"
+            for n, ((column, row), (x, y)) in enumerate(pairs, 1)
+        )
     for name, text in texts.items():
         store.write_text(work.folder / name, text)
     page.write_floorplan_page(work, library)
@@ -378,7 +336,6 @@ def _values(work: FloorplanWork, library: MaskLibrary) -> dict[str, Any]:
         "doses": len(library.doses),
         "files": work.written,
         "lenses": work.lenses,
-        "seconds": work.stages.seconds,
     }
 
 
@@ -447,8 +404,5 @@ def _text(work: FloorplanWork, library: MaskLibrary) -> str:
         for name, size in work.written.items()
     ]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
-    lines.append(
-        f"  {dies}{len(library.cells):,} cells; {target / 'report.html'}; "
-        f"{sum(work.stages.seconds.values()):.1f} s"
-    )
+    lines.append(f"  {dies}{len(library.cells):,} cells; {target / 'report.html'}")
     return "\n".join(lines)

@@ -52,11 +52,7 @@ def run(options: Options) -> int:
         options: of the command.
     """
     layers = [parse_layer(text) for text in options.layers]
-    process = (
-        processes.Process()
-        if options.process is None
-        else processes.load_process(options.process)
-    )
+    process = processes.load_process(options.process)
     output = (
         options.claim(options.output)
         if options.output is not None

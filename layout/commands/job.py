@@ -1,8 +1,6 @@
 """Options and results so far of ``metalens layout``."""
 
-import contextlib
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ import tyro
 from layout.arrange import assembly, wafer
 from layout.arrange.record import DieFloorplan
 from layout.drc.report import DrcReport, RuleViolation
-from layout.formats import compare, job_files
+from layout.formats import compare
 from layout.formats.dxf import DxfWindow
 from layout.mask import build
 from layout.mask.fields import FieldPlan
@@ -23,12 +21,7 @@ from layout.process.process import LayerNumber
 from layout.verify.report import ExposureReport
 from layout.verify.written_lens import LensRows
 from metalens.commands import DistributedOptions, Output
-from metalens.core.errors import ConfigError
 from metalens.lens import Lens
-
-MOST_ANSWERS_ERROR = (
-    0.5  # relative error of how pillars answer, above which a study of them is none
-)
 
 
 @dataclass(frozen=True)
@@ -64,19 +57,6 @@ class Options(DistributedOptions):
     dose: bool = True
     study: bool = False
 
-    def shared(self) -> contextlib.AbstractContextManager[None]:
-        """Where the work of --study is done.
-
-        Raises:
-            ConfigError, WorkerError: as of other verbs; workers without --study, which
-                is all that they share.
-        """
-        if self.workers is not None and not self.study:
-            raise ConfigError(
-                "--workers shares out the work of --study: ask for it too, or leave it"
-            )
-        return super().shared()
-
     @property
     def writes_oasis(self) -> bool:
         """Whether OASIS is written: asked for, or the default."""
@@ -88,53 +68,29 @@ class Options(DistributedOptions):
         return self.gds or not self.oasis
 
 
-@dataclass(eq=False, slots=True)
-class StageTimes:
-    """Seconds of each stage; ``say`` announces each as it begins."""
-
-    say: Callable[[str], None]
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextlib.contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time what happens inside as ``stage``."""
-        self.say(stage)
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = time.perf_counter() - start
-
-
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class LayoutJob:
     """Results so far of a run of the command.
 
-    stages: what the time went to. written: {file name: bytes}. compared: {file name:
+    say: announces each stage. written: {file name: bytes}. compared: {file name:
     outcome of reading it back}.
     verified: {file name: what the file and the dose table make, by the simulator}.
     made_rows: the lens that comes out.
-    rates_error: of --study, by how much the solver may miss how pillars answer to the
-    process, relative.
     """
 
     options: Options
     source: Lens
     process: processes.Process
-    made: build.DrawnMask
-    dose: DoseLadder | None
+    drawn: build.DrawnMask
     fields: FieldPlan
     plan: MaskPlan
     drc: DrcReport
-    stages: StageTimes
+    say: Callable[[str], None]
+    dose: DoseLadder | None = None
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, compare.ReadbackComparison] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None
-    rates_error: float = 0.0
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Of each stage."""
-        return self.stages.seconds
 
     @property
     def failures(self) -> list[str]:
@@ -147,35 +103,21 @@ class LayoutJob:
             if not outcome.ok
         ]
         exposure = self.process.exposure  # a fitted table has an error of its own
+        needed, most = (
+            0 if self.dose is None else self.dose.needed,
+            exposure.maximum_classes,
+        )
+        too_few = f" ({needed} doses are needed, exposure.maximum_classes = {most})"
         if exposure.corrected and exposure.csv is None and self.options.dose:
             failures += [
-                f"{name}: exposure off by {100 * report.worst_exposure:.2g} % and {report.worst_nm:.2g} nm{self._too_few}"
+                f"{name}: exposure off by {100 * report.worst_exposure:.2g} % and "
+                f"{report.worst_nm:.2g} nm{too_few * (needed > most)}"
                 for name, report in self.verified.items()
                 if not report.ok
             ]
-        return failures + (
-            [f"design rules violated: {self.drc.violated}"] if self.drc.violated else []
-        )
-
-    @property
-    def _too_few(self) -> str:
-        """That the writer holds fewer doses than the tolerance needs; empty where it
-        holds enough.
-        """
-        needed = 0 if self.dose is None else self.dose.needed
-        most = self.process.exposure.maximum_classes
-        return (
-            f" ({needed} doses are needed, exposure.maximum_classes = {most})"
-            if needed > most
-            else ""
-        )
-
-    @property
-    def sheet(self) -> str:
-        """The job sheet."""
-        return job_files.job_sheet(
-            self.plan, self.process, self.fields, self.written, self.verdict
-        )
+        if self.drc.violated:
+            failures.append(f"design rules violated: {self.drc.violated}")
+        return failures
 
     @property
     def ok(self) -> bool:
@@ -183,18 +125,6 @@ class LayoutJob:
         planned.
         """
         return not self.failures
-
-    @property
-    def hardly_known(self) -> str:
-        """Why the study of --study is none, for a person; empty where it is one. The
-        mask is not touched by it.
-        """
-        if self.rates_error <= MOST_ANSWERS_ERROR:
-            return ""
-        return (
-            f"--study: how these pillars answer to height, wall and index is known within {self.rates_error:.0%} "
-            "alone, and its tolerances no better: take lower or wider pillars, or the mask without --study"
-        )
 
     @property
     def verdict(self) -> str:
@@ -206,7 +136,7 @@ class LayoutJob:
         )
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class FloorplanWork:
     """What is known so far of an arrangement.
 
@@ -228,7 +158,7 @@ class FloorplanWork:
     record: DieFloorplan
     process: processes.Process
     folder: Path
-    stages: StageTimes
+    say: Callable[[str], None]
     failures: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     unchecked: list[str] = field(default_factory=list)

@@ -6,14 +6,13 @@ from pathlib import Path
 
 from layout.commands import make
 from layout.commands.job import LayoutJob, Options
-from layout.process.jit import announce_compilation
 
 ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 
 
 def run(options: Options) -> int:
-    """Make the mask; exit 1 where a rule is broken, a file does not read back as
-    planned or a study is none.
+    """Make the mask; exit 1 where a rule is broken or a file does not read back as
+    planned.
 
     Args:
         options: of the command.
@@ -21,17 +20,11 @@ def run(options: Options) -> int:
     if options.lens.suffix.lower() == ARRANGEMENT:
         from layout.commands import arrangement
 
-        return arrangement.run(options)
-    with (
-        options.claim_folder(options.output) as draft,
-        options.shared(),
-        announce_compilation(options.console.say),
-    ):
+        return arrangement.make_floorplan(options)
+    with options.claim_folder(options.output) as draft, options.shared():
         job = make.make_mask(make.draw_lens(options), draft.path)
     return options.console.judged(
-        make.values_of(job),
-        _text(job, options.output),
-        [*job.failures, job.hardly_known],
+        make.values_of(job), _text(job, options.output), job.failures
     )
 
 
@@ -52,5 +45,5 @@ def _text(job: LayoutJob, target: Path) -> str:
         f"{violation.centre[1]:.0f}) nm: {violation.summary}"
         for violation in job.drc.violations[:10]
     ]
-    lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")
+    lines.append(f"  {target / 'report.html'}")
     return "\n".join(lines)

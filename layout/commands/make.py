@@ -4,26 +4,19 @@ verified, with its companions.
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from layout.commands import page
-from layout.commands.job import LayoutJob, Options, StageTimes
+from layout.commands.job import LayoutJob, Options
 from layout.drc.klayout import write_lyp, write_lyrdb
 from layout.drc.lattice import check_plan
-from layout.formats import (
-    compare,
-    dxf,
-    gdsii_read,
-    gdsii_write,
-    job_files,
-    oasis_read,
-    oasis_write,
-)
+from layout.drc.report import DrcReport
+from layout.formats import compare, dxf, gdsii_write, job_files, oasis_write
 from layout.formats.library import MaskLibrary
+from layout.formats.reading import read_mask
 from layout.mask import build, fields
 from layout.mask.plan import MaskPlan
 from layout.pec import correct
@@ -49,46 +42,31 @@ MOST_READ = 2**40
 SolvedPlan = tuple[MaskPlan, DoseLadder | None]  # dose None: every dose is 1
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class DrawnLens:
-    """A lens as it is drawn, before any correction."""
-
-    options: Options
-    source: Lens
-    process: processes.Process
-    made: build.DrawnMask
-    stages: StageTimes
-
-    @property
-    def corrected(self) -> bool:
-        """Whether every shape gets a dose of its own."""
-        return self.options.dose and self.process.exposure.corrected
-
-
-def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnLens:
-    """The plan of the lens of a command, before any correction.
+def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> LayoutJob:
+    """The plan of the lens of a command, before any correction, and its write fields.
 
     Args:
         options: of the command.
         furniture: what stands on the die with the lens.
     """
-    stages = StageTimes(options.console.say)
-    with stages("read"):
-        source = (lenses.load if options.study else lenses.load_out_of_core)(
-            options.lens
-        )
-        if options.study:
-            from layout.study.focus import check_study_lens
+    say = options.console.say
+    say("read")
+    source = (lenses.load if options.study else lenses.load_out_of_core)(options.lens)
+    if options.study:
+        from layout.study.focus import check_study_lens
 
-            check_study_lens(source)
-        process = (
-            processes.Process()
-            if options.process is None
-            else processes.load_process(options.process)
-        )
-    with stages("classes"):
-        mask = build.draw_mask(source, process, name=options.name, furniture=furniture)
-    return DrawnLens(options, source, process, mask, stages)
+        check_study_lens(source)
+    process = processes.load_process(options.process)
+    say("classes")
+    drawn = build.draw_mask(source, process, name=options.name, furniture=furniture)
+    say("write fields")
+    write_fields = fields.split_write_fields(
+        source.diameters, process, pillar_classes=drawn.cells
+    )
+    report = DrcReport.empty(drawn.plan.unit_nm, process.rules)
+    return LayoutJob(
+        options, source, process, drawn, write_fields, drawn.plan, report, say
+    )
 
 
 def correct_doses(
@@ -103,51 +81,37 @@ def correct_doses(
     """
     if not (corrected and plans):
         return [(plan, None) for plan in plans]
-    return list(correct.correct_plans(plans, process.exposure, process.layers))
+    return list(correct.correct_plans(plans, process.exposure))
 
 
 def make_mask(
-    drawing: DrawnLens, folder: Path, solved: SolvedPlan | None = None
+    job: LayoutJob, folder: Path, solved: SolvedPlan | None = None
 ) -> LayoutJob:
     """Write the mask of a lens and all that goes with it into a folder.
 
     Args:
-        drawing: of the lens.
+        job: with the lens drawn.
         folder: that exists.
         solved: plan with the doses of a job of several masks; None: of this one alone.
     """
+    process = job.process
     if solved is None:
-        with drawing.stages("dose"):
-            (solved,) = correct_doses(
-                [drawing.made.plan], drawing.process, corrected=drawing.corrected
-            )
-    job = _checked(drawing, *solved)
-    job_files.write_dose_table(job.plan, job.process, folder / "doses.csv")
+        is_corrected = job.options.dose and process.exposure.corrected
+        job.say("dose")
+        (solved,) = correct_doses([job.plan], process, corrected=is_corrected)
+    plan, job.dose = solved
+    job.plan = fields.with_fields(plan, job.fields, process)
+    job.say("check")
+    foot_nm = _feet(job.plan, job.source, process)
+    job.drc = check_plan(job.plan, process.rules, foot_nm=foot_nm)
+    job_files.write_dose_table(job.plan, process, folder / "doses.csv")
     _write_masks(job, folder)
-    with job.stages("report"):
-        _accompany(job, folder)
+    job.say("report")
+    _accompany(job, folder)
     store.write_text(
         folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n"
     )
     return job
-
-
-def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> LayoutJob:
-    """A job whose write fields are planned and whose design rules are checked."""
-    source = drawing.source
-    process = drawing.process
-    stages = drawing.stages
-    mask = drawing.made
-    with stages("write fields"):
-        write_fields = fields.split_write_fields(
-            source.diameters, process, pillar_classes=mask.cells
-        )
-        plan = fields.with_fields(plan, write_fields, process)
-    with stages("check"):
-        drc = check_plan(plan, process.rules, foot_nm=_feet(plan, source, process))
-    return LayoutJob(
-        drawing.options, source, process, mask, dose, write_fields, plan, drc, stages
-    )
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
@@ -166,24 +130,34 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
     return np.maximum(top, foot)
 
 
+def mask_writers(
+    options: Options,
+) -> dict[str, Callable[[MaskPlan | MaskLibrary, Path], None]]:
+    """{file name: writer} of the mask files that are asked for.
+
+    Args:
+        options: of the command.
+    """
+    writers: dict[str, Callable[[MaskPlan | MaskLibrary, Path], None]] = {}
+    if options.writes_oasis:
+        writers["mask.oas"] = oasis_write.write_oasis
+    if options.writes_gds:
+        writers["mask.gds"] = gdsii_write.write_gdsii
+    return writers
+
+
 def _write_masks(job: LayoutJob, target: Path) -> None:
     """Write the mask files of the options, and read each back."""
     options = job.options
     plan = job.plan
-    if options.writes_oasis:
-        path = target / "mask.oas"
-        with job.stages("write OASIS"):
-            oasis_write.write_oasis(plan, path)
-        _read_back(job, path, oasis_read.read_oasis)
-    if options.writes_gds:
-        path = target / "mask.gds"
-        with job.stages("write GDSII"):
-            gdsii_write.write_gdsii(plan, path)
-        _read_back(job, path, gdsii_read.read_gdsii)
+    for name, write in mask_writers(options).items():
+        job.say(f"write {name}")
+        write(plan, target / name)
+        _read_back(job, target / name)
     if options.dxf:
         path = target / "mask.dxf"
-        with job.stages("write DXF"):
-            dxf.write_dxf(plan, path, window=options.window)
+        job.say("write DXF")
+        dxf.write_dxf(plan, path, window=options.window)
         job.written[path.name] = path.stat().st_size
     if options.stl or options.step:
         _write_solids(job, target)
@@ -207,45 +181,42 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
     ):
         if is_wanted:
             path = target / f"pillars.{form.lower()}"
-            with job.stages(f"write {form}"):
-                write(path, tile)
+            job.say(f"write {form}")
+            write(path, tile)
             job.written[path.name] = path.stat().st_size
 
 
-def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> None:
-    """Read a mask file back: compare it with the plan, verify its exposure."""
-    with job.stages(f"read back {path.suffix[1:]}"):
-        content = read(path, limit=MOST_READ, keep=KEPT)
-        job.compared[path.name] = compare.compare(job.plan, content)
-        table = job_files.read_dose_table(path.with_name("doses.csv"))
-    if _is_verifiable(job) and job.compared[path.name].ok:
-        with job.stages(f"verify exposure {path.suffix[1:]}"):
-            job.verified[path.name] = _verified(job, content, table)
-    job.written[path.name] = path.stat().st_size
+def _read_back(job: LayoutJob, path: Path) -> None:
+    """Read a mask file back: compare it with the plan, verify its exposure.
 
-
-def _is_verifiable(job: LayoutJob) -> bool:
-    """Whether the point exposure is known, and pillars are written."""
-    return job.process.exposure.known and job.process.tone == "positive"
+    Files of the same polygons share one exposure report.
+    """
+    name, plan = path.name, job.plan
+    job.say(f"read back {name}")
+    content = read_mask(path, MOST_READ, keep=KEPT)
+    job.compared[name] = compare.compare(plan, content)
+    is_verifiable = job.process.exposure.known and job.process.tone == "positive"
+    if is_verifiable and job.compared[name].ok:
+        job.say(f"verify exposure {name}")
+        job.verified[name] = next(iter(job.verified.values()), None) or _verified(
+            job, content, job_files.read_dose_table(path.with_name("doses.csv"))
+        )
+    job.written[name] = path.stat().st_size
 
 
 def _verified(
     job: LayoutJob, content: MaskLibrary, table: Mapping[LayerNumber, float]
 ) -> ExposureReport:
-    """Exposure report of a file; files of the same polygons share one report."""
-    if job.verified:
-        return next(iter(job.verified.values()))
+    """Exposure report of a file; keeps the lens that comes out, up to a size."""
     lattice = job.plan.lattices[0]
-    keeps_rows = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
-    job.made_rows = LensRows(job.plan) if keeps_rows else job.made_rows
-    keep = job.made_rows.take if keeps_rows and job.made_rows else None
+    if lattice.rows * lattice.columns <= MOST_MADE:
+        job.made_rows = LensRows(job.plan)
     return verify_exposure(
         content,
         job.plan,
         table,
         job.process,
-        height_um=job.source.cell.height_um,
-        keep=keep,
+        keep=job.made_rows.take if job.made_rows else None,
     )
 
 
@@ -255,7 +226,10 @@ def _accompany(job: LayoutJob, target: Path) -> None:
     write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
     job_files.write_fields(job_files.field_sequence(job.fields), target / "fields.csv")
-    store.write_text(target / "job.txt", job.sheet)
+    sheet = job_files.job_sheet(
+        job.plan, job.process, job.fields, job.written, job.verdict
+    )
+    store.write_text(target / "job.txt", sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))
     page.write_mask_page(job, target)
@@ -273,7 +247,7 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
         "failures": job.failures,
         "pillars": drc.shapes,
         "classes": len(job.plan.classes),
-        "diameters": len(job.made.cells.diameters_nm),
+        "diameters": len(job.drawn.cells.diameters_nm),
         **drc.sizes,
         "maximum_density": drc.maximum_density,
         "violations": drc.counts,
@@ -292,6 +266,4 @@ def values_of(job: LayoutJob) -> dict[str, Any]:
         "differences": {
             name: list(outcome.differences) for name, outcome in job.compared.items()
         },
-        "rates_error": job.rates_error,
-        "seconds": job.seconds,
     }

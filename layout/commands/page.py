@@ -3,9 +3,8 @@ it was checked.
 """
 
 from pathlib import Path
-from typing import Any
 
-from layout.arrange import assembly, separation
+from layout.arrange import separation
 from layout.commands import pictures
 from layout.commands.job import FloorplanWork, LayoutJob
 from layout.drc.report import DrcReport, format_size
@@ -43,7 +42,6 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
         from layout.study import page as study_page
 
         rates = study_page.rates_by_light(job.source)
-        job.rates_error = max(one.error for one in rates.values())
         sections += study_page.study_sections(
             job.source, job.process, job.fields, rates
         )
@@ -51,7 +49,7 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
         name: "; ".join(outcome.differences) or "as planned"
         for name, outcome in job.compared.items()
     }
-    sections.append(_files(job.written, read_back, job.seconds))
+    sections.append(_files(job.written, read_back))
     drc = job.drc
     pillars = int(job.plan.lattices[0].counts(len(job.plan.classes))[1:].sum())
     violations = sum(drc.counts.values())
@@ -60,7 +58,7 @@ def write_mask_page(job: LayoutJob, target: Path) -> None:
         f"Mask {job.plan.name}",
         sections,
         lead=f"{job.verdict} A {job.source.profile} lens for "
-        f"{job.source.wavelength_um / nm:.0f} nm, {2 * job.made.radius_um / 1e3:.4g} mm "
+        f"{job.source.wavelength_um / nm:.0f} nm, {2 * job.drawn.radius_um / 1e3:.4g} mm "
         f"across, as {pillars:,} pillars ({drc.shapes:,} on the die) in "
         f"{len(job.plan.classes)} cells; process “{job.process.name}”.",
         key_figures=[
@@ -120,7 +118,6 @@ def _exposure(job: LayoutJob) -> list[Section]:
             f"{100 * verified.worst_exposure:.2f}",
             f"{100 * verified.error:.2g}",
             f"{verified.worst_nm:.2f}",
-            f"{verified.thinnest_top_nm:.0f} to {verified.widest_foot_nm:.0f}",
             "yes" if verified.ok else "NO",
         ]
         for name, verified in job.verified.items()
@@ -132,7 +129,6 @@ def _exposure(job: LayoutJob) -> list[Section]:
         "worst exposure / %",
         "field less direct sums / %",
         "worst width / nm",
-        "thinnest top to widest foot / nm",
         f"within {100 * job.process.exposure.tolerance:g} % and 1 nm",
     )
     picture = pictures.plot_verification(next(iter(job.verified.values())))
@@ -163,20 +159,16 @@ def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
     )
 
 
-def _files(
-    written: dict[str, int], read_back: dict[str, str], seconds: dict[str, float]
-) -> Section:
-    """Section on the files: sizes, outcome of reading back, and times."""
+def _files(written: dict[str, int], read_back: dict[str, str]) -> Section:
+    """Section on the files: sizes, and outcome of reading back."""
     rows = [
         [name, f"{size / 1e6:.3f}", read_back.get(name, "not read back")]
         for name, size in written.items()
     ]
-    items = [
-        Table(("file", "MB", "read back and compared"), rows),
-        Table(("stage", "seconds"), list(map(list, seconds.items())), digits=3),
-    ]
     text = "Each mask file was read back: every cell, polygon vertex and placement."
-    return Section("Files", text, items)
+    return Section(
+        "Files", text, [Table(("file", "MB", "read back and compared"), rows)]
+    )
 
 
 # arrangements
@@ -198,7 +190,7 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
     dies = 1
     if work.dies is not None and work.record.wafer is not None:
         dies = len(work.dies.index)
-        box = separation.extent_of_copies(work.placed) / assembly.PER_UM
+        box = separation.extent_um(work.placed)
         wafer_png = pictures.plot_wafer(work.record.wafer, work.dies, box)
         (work.folder / "wafer.png").write_bytes(wafer_png)
         caption = "Dies within the edge exclusion, and marks."
@@ -210,7 +202,7 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
         for name in work.written
     }
     sections.append(_checks(work))
-    sections.append(_files(work.written, read_back, work.stages.seconds))
+    sections.append(_files(work.written, read_back))
     lead = (
         f"{work.verdict} {len(work.lenses)} lenses on a die; process "
         f"“{work.process.name}”. doses.csv: one dose for each layer and datatype; "
@@ -231,18 +223,18 @@ def write_floorplan_page(work: FloorplanWork, library: MaskLibrary) -> None:
 
 
 def _checks(work: FloorplanWork) -> Section:
-    """Rules, exposure and read-back of each part, and what stands too near what."""
-    rows = [_lens_row(name, values) for name, values in work.lenses.items()]
-    for name, drc in work.rules.items():
-        sizes = map(format_size, (drc.minimum_space_nm, drc.minimum_width_nm))
-        broken = sum(drc.counts.values())
-        verdict = "FAILS" if broken else "passes"
-        rows.append([name, f"{drc.shapes:,}", *sizes, broken, "", "", verdict])
-    rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
-    columns = "part, shapes, least gap, least feature, broken rules, exposure, "
-    columns += "read back, verdict"
+    """Verdict on each part, and what stands too near what."""
+    rows = [
+        [name, f"{lens['pillars']:,}", "; ".join(lens["failures"]) or "passes"]
+        for name, lens in work.lenses.items()
+    ]
+    rows += [
+        [name, f"{drc.shapes:,}", drc.violated or "passes"]
+        for name, drc in work.rules.items()
+    ]
+    rows += [[name, "", "NOT CHECKED"] for name in work.unchecked]
     caption = "Each lens has a report of its own, in the folder of its name."
-    items = [Table(columns.split(", "), rows, caption)]
+    items = [Table(("part", "shapes", "verdict"), rows, caption)]
     if work.near:
         near = [
             [violation.text, violation.value / 1e3, violation.limit / 1e3]
@@ -258,21 +250,3 @@ def _checks(work: FloorplanWork) -> Section:
             "other."
         )
     return Section("Checks", "\n\n".join(text), items)
-
-
-def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
-    """Of layout.json of a lens."""
-    exposed = [
-        f"{100 * exposure['worst_relative']:.2f} %, {exposure['worst_diameter_nm']:.2f} nm"
-        for exposure in values["exposure"].values()
-    ]
-    return [
-        name,
-        f"{values['pillars']:,}",
-        format_size(values["minimum_space_nm"]),
-        format_size(values["minimum_width_nm"]),
-        sum(values["violations"].values()),
-        exposed[0] if exposed else "not verified",
-        "DIFFERENT" if any(values["differences"].values()) else "as planned",
-        "passes" if values["ok"] else "FAILS",
-    ]

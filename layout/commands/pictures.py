@@ -19,6 +19,14 @@ _FILLED = ("marks", "label")
 _COLOURS = ("#d1495b", "#355070", "#1f6feb", "#888", "#2a9d8f")
 
 
+def _add_polygons(axes: Any, corners: list[Array], fill: str, edge: str) -> None:
+    """Polygons in one colour on matplotlib axes."""
+    from matplotlib.collections import PolyCollection
+
+    style: dict[str, Any] = {"facecolors": fill, "edgecolors": edge, "lw": 0.8}
+    axes.add_collection(PolyCollection(corners, **style))
+
+
 def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
     """Everything on the die as PNG: figures by layer number, lattices as boxes.
 
@@ -26,8 +34,6 @@ def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
         plan: of the mask.
         drc_report: whose violations are marked by crosses.
     """
-    from matplotlib.collections import PolyCollection
-
     figure, axes = report.make_figure(size=(7.2, 6.6))
     scale = plan.unit_nm * 1e-3
     drawn: dict[str, list[Array]] = {
@@ -42,8 +48,7 @@ def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
     for n, (name, shapes) in enumerate(drawn.items()):
         colour = _COLOURS[n % len(_COLOURS)]
         fill = colour if name.startswith(_FILLED) else "none"
-        style: dict[str, Any] = {"facecolors": fill, "edgecolors": colour, "lw": 0.8}
-        axes.add_collection(PolyCollection([p * scale for p in shapes], **style))
+        _add_polygons(axes, [p * scale for p in shapes], fill, colour)
         axes.plot([], [], color=colour, label=name)
     if drc_report.violations:
         places = np.array([violation.centre for violation in drc_report.violations])
@@ -55,23 +60,20 @@ def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
 
 
 def plot_verification(verification: ExposureReport) -> bytes:
-    """Difference of resist and drawn diameters over the die, and its histogram, as PNG.
+    """Difference of resist and drawn diameters over the die as PNG.
 
     Args:
         verification: of a written mask.
     """
-    figure, (at_left, at_right) = report.make_figure(1, 2, size=(8.2, 3.6))
+    figure, axes = report.make_figure(size=(5.2, 4.2))
     left, bottom, right, top = verification.box_um
     extent = (left, right, bottom, top)
-    picture = at_left.imshow(
+    picture = axes.imshow(
         verification.map_nm, origin="lower", extent=extent, cmap="coolwarm"
     )
-    at_left.grid(False)
-    at_left.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
-    figure.colorbar(picture, ax=at_left, label="resist - drawn / nm", shrink=0.8)
-    edges, pillars = verification.histogram
-    at_right.stairs(pillars, edges, fill=True)
-    at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
+    axes.grid(False)
+    axes.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
+    figure.colorbar(picture, ax=axes, label="resist - drawn / nm", shrink=0.8)
     return report.figure_png(figure)
 
 
@@ -87,22 +89,19 @@ def plot_floorplan(
         placed: parts on the die.
         near: places where they are too near each other.
     """
-    from matplotlib.collections import PolyCollection
-
     figure, axes = report.make_figure(size=(7.2, 6.6))
     axes.grid(False)
     for part in separation.standing_parts(placed):
         for colour, boxes in zip(_COLOURS, part.part.boxes.values(), strict=False):
             shapes = [rectilinear.box_corners(box) for box in part.moved(boxes)]
             corners = [shape / assembly.PER_UM for shape in shapes]
-            style: dict[str, Any] = {"facecolors": f"{colour}55", "edgecolors": "none"}
-            axes.add_collection(PolyCollection(corners, **style))
+            _add_polygons(axes, corners, f"{colour}55", "none")
         x, y = part.x / assembly.PER_UM, part.y / assembly.PER_UM
         axes.annotate(part.part.name, (x, y), fontsize=7, ha="center", va="center")
     if near:
         x, y = np.array([violation.centre for violation in near]).T / assembly.PER_UM
         axes.plot(x, y, "x", color="red", ms=6, mew=1.5)
-    box = separation.extent_of_copies(placed) / assembly.PER_UM
+    box = separation.extent_um(placed)
     left, bottom, right, top = box.tolist()
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.set(xlabel="x / µm", ylabel="y / µm")
@@ -117,17 +116,10 @@ def plot_wafer(size: WaferSettings, dies: WaferDies, box_um: Array) -> bytes:
         dies: that it holds.
         box_um: (4,) left, bottom, right, top of a die.
     """
-    from matplotlib.collections import PolyCollection
-
     figure, ax = report.make_figure(size=(6.4, 6.2))
     corner = rectilinear.box_corners(box_um / 1e3)
     shapes = list(dies.place_um[:, None] / 1e3 + corner)
-    style: dict[str, Any] = {
-        "facecolors": "#1f6feb55",
-        "edgecolors": "#355070",
-        "linewidths": 0.4,
-    }
-    ax.add_collection(PolyCollection(shapes, **style))
+    _add_polygons(ax, shapes, "#1f6feb55", "#355070")
     turn = np.linspace(0, 2 * np.pi, 400)
     radius = size.diameter_mm / 2
     for r, line in ((radius, "-"), (radius - size.edge_exclusion_mm, ":")):

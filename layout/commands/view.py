@@ -14,7 +14,7 @@ from layout.formats.reading import read_mask
 from layout.process.process import LayerNumber
 from metalens.commands import MASKS
 from metalens.core.errors import MaskFileError
-from metalens.view import DrawingPanel, OutlinePanel, Panel, TablePanel
+from metalens.view import DrawingPanel, OutlinePanel, Panel
 
 _MARKER = re.compile(
     r"<category>'([^<]*)'</category>.*?box: \(([^,;]+),([^,;]+);([^,;]+),([^,;]+)\)",
@@ -22,14 +22,8 @@ _MARKER = re.compile(
 )
 
 
-def mask_of(folder: Path) -> Path | None:
-    """The mask file of a folder, OASIS before GDSII."""
-    return next((p for end in MASKS for p in sorted(folder.glob(f"*{end}"))), None)
-
-
 def mask_panels(path: Path) -> list[Panel]:
-    """The drawing of a mask file, or of the one in a folder, and its layers with their
-    doses.
+    """The drawing of a mask file, or of the one in a folder.
 
     Args:
         path: of a mask file, or of a folder with one.
@@ -37,16 +31,18 @@ def mask_panels(path: Path) -> list[Panel]:
     Raises:
         MaskFileError: no mask file, one that cannot be read, or that draws nothing.
     """
-    mask = mask_of(path) if path.is_dir() else path
-    if mask is None:
+    masks = [path]
+    if path.is_dir():
+        masks = [mask for end in MASKS for mask in sorted(path.glob(f"*{end}"))]
+    if not masks:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
+    mask = masks[0]
     limit = placement_limit(mask)
     content = read_mask(mask, limit)
     content.refuse_beyond(limit)
     table = mask.with_name("doses.csv")
     dose = job_files.read_dose_table(table) if table.is_file() else {}
-    groups = equal_shapes(content, lambda shape: (shape.cell, shape.layer))
-    outlines = [_outline(content, group, dose) for group in groups.values()]
+    outlines = [_outline(content, group, dose) for group in equal_shapes(content)]
     if not outlines:
         raise MaskFileError(f"{mask} holds no shape to be shown")
     marks = _marks(mask.with_suffix(".lyrdb"))
@@ -56,7 +52,7 @@ def mask_panels(path: Path) -> list[Panel]:
         + (f"Boxes: {len(marks)} places where a rule is broken." if marks else "")
     )
     drawn = DrawingPanel(mask.name, outlines, 1e-3 * content.unit_nm, caption, marks)
-    return [drawn, _layers(content, dose)]
+    return [drawn]
 
 
 def _outline(
@@ -84,23 +80,6 @@ def _name(content: MaskLibrary, layer: LayerNumber) -> str:
     """One switch for all doses of a layer."""
     name = content.layer_names.get(layer, "").partition("_dose_")[0]
     return f"{layer[0]} {name.replace('_', ' ')}".strip()
-
-
-def _layers(content: MaskLibrary, dose: dict[LayerNumber, float]) -> TablePanel:
-    """Shapes, area and dose of each (layer, datatype)."""
-    counts, areas = content.count_shapes(), content.areas_um2()
-    rows = [
-        (
-            "/".join(map(str, layer)),
-            content.layer_names.get(layer, ""),
-            counts[layer],
-            areas[layer],
-            dose.get(layer, "none stated"),
-        )
-        for layer in sorted(content.layers)
-    ]
-    head = ("layer/datatype", "name", "shapes", "area / µm²", "relative dose")
-    return TablePanel("Layers", head, rows)
 
 
 def _marks(path: Path) -> list[tuple[float, float, str]]:

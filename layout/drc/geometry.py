@@ -8,6 +8,7 @@ import numpy as np
 from layout.formats.library import stable_order
 from layout.process.jit import compile_loop
 from layout.shapes import convex
+from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -16,7 +17,7 @@ SHARPEST_CORNER = 60.0
 MAX_PAIRS = 40_000_000  # of close boxes, 16 bytes each
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ShapeMeasurement:
     """A width, notch or sharp corner of one polygon.
 
@@ -27,7 +28,7 @@ class ShapeMeasurement:
 
     rule: str
     value: float
-    box: tuple[int, int, int, int]
+    box: IntBox
 
 
 def clean_contour(points: Array) -> Array:
@@ -85,7 +86,7 @@ def contour_edges(contours: Sequence[Array]) -> Array:
     return np.concatenate([np.empty((0, 4)), *edges])
 
 
-def contour_box(contours: Sequence[Array]) -> tuple[int, int, int, int]:
+def contour_box(contours: Sequence[Array]) -> IntBox:
     """Left, bottom, right, top of some contours."""
     points = np.concatenate(contours)
     left, bottom = points.min(0).tolist()
@@ -117,27 +118,18 @@ def measure_polygon(
     measurements = find_sharp_corners(contours)
     number_of_edge = []
     for number, points in enumerate(contours):
-        is_outer = is_convex(points)
-        is_hole = is_convex(points[::-1])
-        number_of_edge.append(
-            np.full(len(points), number if is_outer or is_hole else -1)
-        )
-        if is_outer:
-            measurements.append(
-                ShapeMeasurement(
-                    "width", convex.least_width(points), contour_box([points])
-                )
-            )
-        elif is_hole:
-            measurements.append(
-                ShapeMeasurement(
-                    "notch", convex.least_width(points[::-1]), contour_box([points])
-                )
-            )
+        rule = "width" if is_convex(points) else ""
+        rule = "notch" if is_convex(points[::-1]) else rule
+        number_of_edge.append(np.full(len(points), number if rule else -1))
+        if rule:
+            value = convex.least_width(points if rule == "width" else points[::-1])
+            measurements.append(ShapeMeasurement(rule, value, contour_box([points])))
     if len(contours) == 1 and number_of_edge[0][0] == 0:
         return measurements
     edges = contour_edges(contours)
-    pairs = find_close_boxes(edge_boxes(edges), max(width_limit, space_limit))
+    start, end = edges[:, :2], edges[:, 2:]
+    boxes = np.hstack([np.minimum(start, end), np.maximum(start, end)])
+    pairs = find_close_boxes(boxes, max(width_limit, space_limit))
     contour_of_edge = np.concatenate(number_of_edge)
     pairs = pairs[
         (contour_of_edge[pairs[:, 0]] != contour_of_edge[pairs[:, 1]])
@@ -148,12 +140,9 @@ def measure_polygon(
         ("notch", -1.0, space_limit),
     ):
         distances = projected_distances(edges, pairs, side)
-        for (i, j), value in zip(
-            pairs[distances < limit - 1e-9],
-            distances[distances < limit - 1e-9],
-            strict=True,
-        ):
-            corners = edges[[i, j]].reshape(4, 2).astype(np.int64)
+        is_below = distances < limit - 1e-9
+        for pair, value in zip(pairs[is_below], distances[is_below], strict=True):
+            corners = edges[pair].reshape(4, 2).astype(np.int64)
             measurements.append(
                 ShapeMeasurement(rule, float(value), contour_box([corners]))
             )
@@ -183,12 +172,6 @@ def find_sharp_corners(contours: Sequence[Array]) -> list[ShapeMeasurement]:
             box = (x - 1, y - 1, x + 1, y + 1)
             measurements.append(ShapeMeasurement("corner", float(angle), box))
     return measurements
-
-
-def edge_boxes(edges: Array) -> Array:
-    """(m, 4) left, bottom, right, top of edges (m, 4)."""
-    start, end = edges[:, :2], edges[:, 2:]
-    return np.hstack([np.minimum(start, end), np.maximum(start, end)])
 
 
 def find_close_boxes(

@@ -28,8 +28,9 @@ from layout.mask.plan import (
     PillarClass,
 )
 from layout.process.jit import compile_loop
-from layout.process.process import DesignRules, KeepOutZone
+from layout.process.process import DesignRules
 from layout.shapes import rectilinear, region
+from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -41,7 +42,7 @@ MAX_OUTLINES = (
 def check_plan(
     plan: MaskPlan, rules: DesignRules, *, foot_nm: Array | None = None
 ) -> DrcReport:
-    """Check width, space, overlap, grid, density, exclusion zones and clearance of a
+    """Check width, space, overlap, grid, density and clearance of a
     mask plan.
 
     Neighbouring pillars are counted by class pair and lattice vector; each such pair is
@@ -73,8 +74,6 @@ def check_plan(
         counts = _check_density(plan, lattice, rules, report)
         _LatticeCheck(plan, lattice, rules, counts, report).run(foot_nm)
     _check_figures(plan, report)
-    for zone, lattice in itertools.product(rules.exclusion, plan.lattices):
-        _check_zone(plan, lattice, zone, report)
     _check_clearance(plan, rules, report)
     return report
 
@@ -82,7 +81,7 @@ def check_plan(
 # pillars
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class _LatticeCheck:
     """Widths and spaces of one lattice. counts: (classes + 1,) sites of each class
     number.
@@ -111,50 +110,59 @@ class _LatticeCheck:
             return
         outlines, outline_of_class = _distinct_outlines(self.plan.classes, used)
         self._check_widths(outlines, outline_of_class, used)
-        foot_diameter_nm, growth_nm = np.zeros((2, len(outlines) + 1))
-        limit = self.rules.minimum_gap_nm / self.plan.unit_nm
-        measured_below = limit
+        drawn_nm = np.zeros(len(outlines) + 1)
+        growth_nm = np.full(len(outlines) + 1, -math.inf)
+        unit = self.plan.unit_nm
+        limit = measured_below = self.rules.minimum_gap_nm / unit
+        foot_reach = 0.0
+        is_round = all(self.plan.classes[k - 1].round for k in used)
         if foot_nm is not None:
-            drawn_nm = np.array([self.plan.classes[k - 1].diameter_nm for k in used])
-            np.maximum.at(foot_diameter_nm, outline_of_class[used], foot_nm[used - 1])
-            np.maximum.at(
-                growth_nm, outline_of_class[used], foot_nm[used - 1] - drawn_nm
-            )
-            if not all(self.plan.classes[k - 1].round for k in used):
-                widest = self.rules.minimum_foot_gap_nm + growth_nm.max()
-                measured_below = max(limit, widest / self.plan.unit_nm)
+            diameter_nm = np.array([self.plan.classes[k - 1].diameter_nm for k in used])
+            growth = foot_nm[used - 1] - diameter_nm
+            np.maximum.at(drawn_nm, outline_of_class[used], diameter_nm)
+            np.maximum.at(growth_nm, outline_of_class[used], growth)
+            widest_nm = growth_nm.max() + self.rules.minimum_foot_gap_nm
+            foot_reach = (drawn_nm.max() + widest_nm) / unit
+            if not is_round:
+                measured_below = max(limit, widest_nm / unit)
         radius = np.array(
             [0.0, *(np.hypot(*outline[0].T).max() for outline in outlines)]
         )
-        foot_reach = (
-            foot_diameter_nm.max() + self.rules.minimum_foot_gap_nm
-        ) / self.plan.unit_nm
         vectors = lattice_vectors(
             self.lattice, max(2 * radius.max() + measured_below, foot_reach)
         )
         table = np.zeros((len(vectors), len(radius), len(radius)), np.int64)
         for block, first_new_row, _ in self._blocks(vectors):
             count_pairs(block, first_new_row, outline_of_class, vectors, table)
-        steps = vectors * (self.lattice.pitch, self.lattice.down)
-        spaces = self._measure_pairs(table, steps, outlines, radius, measured_below)
-        nearest = min(spaces.values(), default=math.inf)
-        self.report.measured("space", nearest * self.plan.unit_nm)
-        too_close = {
-            key: space for key, space in spaces.items() if space < limit - 1e-9
-        }
-        if too_close:
-            self._report_pairs(outline_of_class, vectors, table, too_close)
+        kinds = np.argwhere(table[:, 1:, 1:]) + np.array([0, 1, 1])
+        pairs = table[tuple(kinds.T)]
+        steps = vectors[kinds[:, 0]] * (self.lattice.pitch, self.lattice.down)
+        spaces = self._measure_pairs(
+            kinds[:, 1:], steps, outlines, radius, measured_below
+        )
+        spaces_nm = spaces * unit
+        self.report.measured("space", float(spaces_nm.min(initial=math.inf)))
+        is_overlap = spaces <= 0
+        for rule, is_broken in (
+            ("overlap", is_overlap),
+            ("space", ~is_overlap & (spaces < limit - 1e-9)),
+        ):
+            values_nm = np.full(table.shape, np.nan)
+            values_nm[tuple(kinds[is_broken].T)] = spaces_nm[is_broken]
+            self.report.add(
+                rule,
+                int(pairs[is_broken].sum()),
+                layer=self.plan.classes[0].layer[0],
+                cell=self.lattice.name,
+                worst=float(spaces_nm[is_broken].min(initial=math.inf)),
+                examples=self._close_pairs(rule, outline_of_class, vectors, values_nm),
+            )
         if foot_nm is not None:
-            if all(self.plan.classes[k - 1].round for k in used):
-                self._check_feet(*self._foot_spaces(table, steps, foot_diameter_nm))
-            else:
-                pairs = np.array(list(spaces), np.int64).reshape(-1, 3)
-                _, first, second = pairs.T
-                spaces_nm = np.array(list(spaces.values())) * self.plan.unit_nm
-                self._check_feet(
-                    spaces_nm - (growth_nm[first] + growth_nm[second]) / 2,
-                    table[tuple(pairs.T)],
-                )
+            if is_round:
+                distance_nm = np.hypot(*steps.T) * unit
+                spaces_nm = distance_nm - drawn_nm[kinds[:, 1:]].sum(1) / 2
+            foot_spaces_nm = spaces_nm - growth_nm[kinds[:, 1:]].sum(1) / 2
+            self._check_feet(foot_spaces_nm, pairs)
 
     def _check_widths(
         self, outlines: list[tuple[Array, ...]], outline_of_class: Array, used: Array
@@ -196,12 +204,12 @@ class _LatticeCheck:
 
     def _measure_pairs(
         self,
-        table: Array,
+        outlines_of_pair: Array,
         steps: Array,
         outlines: list[tuple[Array, ...]],
         radius: Array,
         limit: float,
-    ) -> dict[tuple[int, int, int], float]:
+    ) -> Array:
         """Euclidean space of each kind of pair, database units, nearest pairs first.
 
         The space of a pair is at least |step| - radius - radius. Pairs are measured in
@@ -209,110 +217,50 @@ class _LatticeCheck:
         so far.
 
         Args:
-            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
-            steps: (vectors, 2) displacement of the second pillar, database units.
+            outlines_of_pair: (n, 2) outline numbers, from 1 on, of each kind of pair.
+            steps: (n, 2) displacement of the second pillar, database units.
             outlines: contours of each distinct outline; only the outer one is measured.
             radius: (outlines + 1,) largest distance of a corner from the site.
             limit: spaces below it are all measured.
 
         Returns:
-            {(vector, outline, outline): space} of all pairs below the limit and of the
-            nearest.
+            (n,) spaces of all pairs below the limit and of the nearest; inf of others.
         """
-        vector, first, second = np.nonzero(table)
-        both_pillars = (first > 0) & (second > 0)
-        vector = vector[both_pillars]
-        first = first[both_pillars]
-        second = second[both_pillars]
-        least_space = np.hypot(*steps[vector].T) - radius[first] - radius[second]
+        least_space = np.hypot(*steps.T) - radius[outlines_of_pair].sum(1)
         order = np.argsort(least_space, kind="stable")
         edges = [contour_edges(outline[:1]) for outline in outlines]
-        spaces: dict[tuple[int, int, int], float] = {}
-        nearest = math.inf
+        spaces = np.full(len(steps), math.inf)
         for batch in np.array_split(order, max(1, len(order) // 256)):
-            if not len(batch) or least_space[batch[0]] >= max(limit, nearest):
+            if not len(batch) or least_space[batch[0]] >= max(limit, spaces.min()):
                 break
-            distances, _ = measure_separation(
-                edges, first[batch] - 1, second[batch] - 1, steps[vector[batch]]
-            )
-            nearest = min(nearest, float(distances.min()))
-            keys = zip(
-                vector[batch].tolist(),
-                first[batch].tolist(),
-                second[batch].tolist(),
-                strict=True,
-            )
-            spaces |= dict(zip(keys, distances.tolist(), strict=True))
+            first, second = outlines_of_pair[batch].T - 1
+            spaces[batch], _ = measure_separation(edges, first, second, steps[batch])
         return spaces
 
-    def _report_pairs(
-        self,
-        outline_of_class: Array,
-        vectors: Array,
-        table: Array,
-        spaces: dict[tuple[int, int, int], float],
-    ) -> None:
-        """Report overlaps and spaces below the limit: their number, and some of them.
-
-        Args:
-            outline_of_class: (classes + 1,) outline number of each class.
-            vectors: (vectors, 2) columns to the right and rows up.
-            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
-            spaces: {(vector, outline, outline): space} below the limit, database units.
-        """
-        layer = self.plan.classes[0].layer[0]
-        unit = self.plan.unit_nm
-        for rule in ("overlap", "space"):
-            values_nm = {
-                key: space * unit
-                for key, space in spaces.items()
-                if (space <= 0) == (rule == "overlap")
-            }
-            if not values_nm:
-                continue
-            marked = np.zeros(table.shape, bool)
-            marked[tuple(np.array(list(values_nm)).T)] = True
-            violations = self._close_pairs(
-                rule, outline_of_class, vectors, marked, values_nm
-            )
-            count = int(table[marked].sum())
-            worst = min(values_nm.values())
-            self.report.add(
-                rule,
-                count,
-                layer=layer,
-                cell=self.lattice.name,
-                worst=worst,
-                examples=violations,
-            )
-
     def _close_pairs(
-        self,
-        rule: str,
-        outline_of_class: Array,
-        vectors: Array,
-        marked: Array,
-        values: dict[tuple[int, int, int], float],
+        self, rule: str, outline_of_class: Array, vectors: Array, values_nm: Array
     ) -> Iterator[RuleViolation]:
-        """Violations of the marked kinds of pairs, with a box around both pillars.
+        """Violations of some kinds of pairs, with a box around both pillars.
 
         Args:
             rule: name of the rule.
             outline_of_class: (classes + 1,) outline number of each class.
             vectors: (vectors, 2) columns to the right and rows up.
-            marked: (vectors, outlines + 1, outlines + 1) whether a kind of pair is
-                listed.
-            values: {(vector, outline, outline): space in nm}.
+            values_nm: (vectors, outlines + 1, outlines + 1) space of each kind of pair
+                that is listed; NaN of others.
         """
         limit = self.rules.minimum_gap_nm
+        is_listed = ~np.isnan(values_nm)
         for block, first_new_row, top in self._blocks(vectors):
-            for vector in np.flatnonzero(marked.any((1, 2))).tolist():
+            for vector in np.flatnonzero(is_listed.any((1, 2))).tolist():
                 right, up = vectors[vector].tolist()
                 low, left = max(first_new_row, up), max(0, -right)
                 below = block[low:, left : block.shape[1] - max(0, right)]
                 above = block[low - up : len(block) - up, left + right :]
                 above = above[:, : below.shape[1]]
-                hits = marked[vector][outline_of_class[below], outline_of_class[above]]
+                hits = is_listed[vector][
+                    outline_of_class[below], outline_of_class[above]
+                ]
                 for row, column in np.argwhere(hits)[:MAX_LISTED].tolist():
                     numbers = int(below[row, column]), int(above[row, column])
                     x, y = self._place(top + low + row, left + column)
@@ -320,37 +268,15 @@ class _LatticeCheck:
                     step = right * self.lattice.pitch, up * self.lattice.down
                     moved = [shapes[0].outline + np.array([x, y])]
                     moved.append(shapes[1].outline + np.add((x, y), step))
-                    names = " to ".join(shape.name for shape in shapes)
                     first, second = outline_of_class[list(numbers)].tolist()
                     yield RuleViolation(
                         rule,
                         contour_box(moved),
-                        values[vector, first, second],
+                        float(values_nm[vector, first, second]),
                         limit,
-                        f"{names} in {self.lattice.name}",
+                        f"{' to '.join(shape.name for shape in shapes)} in "
+                        f"{self.lattice.name}",
                     )
-
-    def _foot_spaces(
-        self, table: Array, steps: Array, foot_nm: Array
-    ) -> tuple[Array, Array]:
-        """Spaces between feet of discs for each kind of pair, nm, and number of pairs.
-
-        space = distance of the sites - (foot_1 + foot_2) / 2.
-
-        Args:
-            table: (vectors, outlines + 1, outlines + 1) number of pairs of each kind.
-            steps: (vectors, 2) displacement of the second pillar, database units.
-            foot_nm: (outlines + 1,) diameter at the foot.
-        """
-        vector, first, second = np.nonzero(table)
-        both_pillars = (first > 0) & (second > 0)
-        vector = vector[both_pillars]
-        first = first[both_pillars]
-        second = second[both_pillars]
-        distance_nm = np.hypot(*steps[vector].T) * self.plan.unit_nm
-        return distance_nm - (foot_nm[first] + foot_nm[second]) / 2, table[
-            vector, first, second
-        ]
 
     def _check_feet(self, spaces_nm: Array, pairs: Array) -> None:
         """Report the pairs of feet whose space is below the rule.
@@ -539,20 +465,13 @@ def _check_density(
     worst = float(density.max(initial=0.0))
     report.maximum_density = max(report.maximum_density, worst)
     dense = np.argwhere(density > rules.maximum_density)
-    violations = []
+    boxes = []
     for row, column in dense[:MAX_LISTED].tolist():
         x = lattice.x0 + column * tile_columns * lattice.pitch
         y = lattice.y0 - row * tile_rows * lattice.down
-        box = (x, y - height, x + width, y)
-        violations.append(
-            RuleViolation(
-                "density",
-                box,
-                float(density[row, column]),
-                rules.maximum_density,
-                lattice.name,
-            )
-        )
+        boxes.append(((x, y - height, x + width, y), float(density[row, column])))
+    limit, cell = rules.maximum_density, lattice.name
+    violations = (RuleViolation("density", *each, limit, cell) for each in boxes)
     layer = plan.classes[0].layer[0]
     report.add(
         "density",
@@ -593,7 +512,7 @@ def add_coverage(
             covered[tile_row, column // tile[1]] += area[number]
 
 
-# figures, grid, zones
+# figures, grid
 
 
 def _check_figures(plan: MaskPlan, report: DrcReport) -> None:
@@ -616,16 +535,9 @@ def _check_negative_frame(plan: MaskPlan, report: DrcReport) -> None:
     it as a width.
     """
     drawn = [tone.lattice_box(lattice, plan.grid) for lattice in plan.lattices]
-    aperture = {
-        layer
-        for figure in plan.figures
-        if figure.name == "APERTURE"
-        for layer in figure.polygons
-    }
     for figure in plan.figures:
-        if figure.name not in (*UNDRAWN, "CLEAR"):
-            for layer, polygons in figure.polygons.items():
-                drawn += polygons if layer not in aperture else ()
+        if figure.name == "FRAME":
+            drawn += itertools.chain.from_iterable(figure.polygons.values())
     rule_names = {"width": "space", "notch": "width"}
     _check_merged(
         drawn,
@@ -693,41 +605,6 @@ def _check_grid(plan: MaskPlan, report: DrcReport) -> None:
         report.add_equal("off-grid", 0.0, boxes, count=len(off), layer=layer, cell=cell)
 
 
-def _check_zone(
-    plan: MaskPlan, lattice: PillarArray, zone: KeepOutZone, report: DrcReport
-) -> None:
-    """Report pillars that share area with an exclusion zone.
-
-    Pillars whose box lies inside the zone count at once. Where the box only meets the
-    zone, the area of the intersection decides.
-    """
-    size = (0, 0, zone.width_um, zone.height_um)
-    box = np.add((zone.x_um, zone.y_um) * 2, size) * 1e3 / plan.unit_nm
-    corners = box[[[0, 1], [2, 1], [2, 3], [0, 3]]]
-    reach = 1 + max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
-    left, bottom, right, top = (box + np.array([-1, -1, 1, 1]) * reach).tolist()
-    numbers, x, y = lattice.sites_in((left, bottom, right, top))
-    for number in np.unique(numbers).tolist():
-        pillar = plan.classes[number - 1]
-        sites = np.column_stack([x, y])[numbers == number]
-        low = pillar.outline.min(0) + sites
-        high = pillar.outline.max(0) + sites
-        meets = ((low < box[2:]) & (high > box[:2])).all(1)
-        inside = ((low >= box[:2]) & (high <= box[2:])).all(1)
-        for n in np.flatnonzero(meets & ~inside).tolist():
-            moved = [contour + sites[n] for contour in pillar.contours]
-            meets[n] = region.overlap_area(moved, [corners]) > 1e-9
-        report.add_equal(
-            "exclusion",
-            0.0,
-            (_moved_box(pillar.outline, *site) for site in sites[meets].tolist()),
-            count=int(meets.sum()),
-            layer=pillar.layer[0],
-            cell=pillar.name,
-            text=f"{pillar.name} in {zone.name}",
-        )
-
-
 def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
     """Report lattices and figures whose boxes are closer than the minimum space.
 
@@ -760,6 +637,6 @@ def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> N
             )
 
 
-def _moved_box(outline: Array, x: int, y: int) -> tuple[int, int, int, int]:
+def _moved_box(outline: Array, x: int, y: int) -> IntBox:
     """Left, bottom, right, top of an outline about the site (x, y)."""
     return contour_box([outline + np.array([x, y])])

@@ -28,6 +28,7 @@ from layout.formats.reading import read_mask
 from layout.mask.plan import MaskPlan
 from layout.process.process import DesignRules, LayerNumber
 from layout.shapes import region
+from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -104,7 +105,14 @@ def check_library(
     shapes = content.count_shapes()
     if layers is None:
         layers = [(number, None) for number in sorted({number for number, _ in shapes})]
-    groups = [_select_layers(choice, shapes) for choice in layers]
+    groups = [
+        {
+            layer
+            for layer in shapes
+            if layer[0] == number and datatype in (None, layer[1])
+        }
+        for number, datatype in layers
+    ]
     checked = set().union(*groups)
     report.layers = {
         layer: LayerCoverage(layer in checked, shapes[layer])
@@ -125,17 +133,7 @@ def check_library(
     return report
 
 
-def _select_layers(
-    choice: LayerChoice, shapes: Collection[LayerNumber]
-) -> set[LayerNumber]:
-    """Layers of a file that a choice names."""
-    number, datatype = choice
-    return {
-        layer for layer in shapes if layer[0] == number and datatype in (None, layer[1])
-    }
-
-
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Element:
     """A distinct polygon, or a distinct cell reference of one orientation.
 
@@ -153,7 +151,7 @@ class _Element:
     rounded: bool
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Placements:
     """(n,) number of the element, and (n, 2) place of each; int32 where that holds
     them.
@@ -270,14 +268,13 @@ class _LayerCheck:
         """(referenced cell, orientation, (n, 2) places) of all references that draw on
         the layer.
         """
-        content = self.content.cells[cell]
-        drawing = [c for c in content.children if self.bounding_box(c) is not None]
         return [
             (child, turn, np.array([x, y]).T)
-            for child, turn, x, y in content.instances(drawing)
+            for child, turn, x, y in self.content.cells[cell].instances()
+            if self.bounding_box(child) is not None
         ]
 
-    def _bounding_box(self, cell: str) -> tuple[int, int, int, int] | None:
+    def _bounding_box(self, cell: str) -> IntBox | None:
         """Box around all that a cell draws on the layer; None for nothing."""
         corners = []
         for outline, places in self.polygons(cell):
@@ -647,50 +644,28 @@ class _LayerCheck:
                             key, [0, x + int(first[0]), y + int(first[1])]
                         )
                         entry[0] += times * int(count)
-                grid = step, phase[0], phase[1]
-                self._check_grid_of_cell(name, turn, grid, (times, x, y), report)
-
-    def _check_grid_of_cell(
-        self,
-        cell: str,
-        turn: Orientation,
-        grid: tuple[float, float, float],
-        instances: tuple[int, int, int],
-        report: DrcReport,
-    ) -> None:
-        """Report polygons off the grid of a cell, for equal instances at once.
-
-        Instances are equal where orientation and position modulo the grid are.
-
-        Args:
-            cell: name of the cell.
-            turn: orientation of the instances.
-            grid: step, and x and y of the instances modulo the step, database units.
-            instances: their number, and x and y of the first.
-            report: receives the violations.
-        """
-        step, *phase = grid
-        times, x, y = instances
-        for outline, places in self.polygons(cell):
-            corners = np.column_stack(turn.apply(*outline.T)) + phase
-            xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
-            residue = np.mod(xy[:, None] + corners, step)
-            is_off = (np.minimum(residue, step - residue) > 1e-6).any((1, 2))
-            box = np.array(
-                contour_box([np.column_stack(turn.apply(*outline.T)).astype(np.int64)])
-            )
-            boxes = (
-                tuple((box + (u + x, v + y) * 2).tolist())
-                for u, v in xy[is_off].tolist()
-            )
-            report.add_equal(
-                "off-grid",
-                0.0,
-                boxes,
-                count=times * int(is_off.sum()),
-                layer=self.layer,
-                cell=cell,
-            )
+                for outline, places in self.polygons(name):
+                    corners = np.column_stack(turn.apply(*outline.T)) + phase
+                    xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
+                    residue = np.mod(xy[:, None] + corners, step)
+                    is_off = (np.minimum(residue, step - residue) > 1e-6).any((1, 2))
+                    box = np.array(
+                        contour_box(
+                            [np.column_stack(turn.apply(*outline.T)).astype(np.int64)]
+                        )
+                    )
+                    boxes = (
+                        tuple((box + (u + x, v + y) * 2).tolist())
+                        for u, v in xy[is_off].tolist()
+                    )
+                    report.add_equal(
+                        "off-grid",
+                        0.0,
+                        boxes,
+                        count=times * int(is_off.sum()),
+                        layer=self.layer,
+                        cell=name,
+                    )
 
 
 def _merged_contours(polygons: Sequence[Array]) -> tuple[Array, ...]:
@@ -718,9 +693,7 @@ def _instance_violations(
         yield replace(violation, rule=rule, box=box, text=violation.text + text)
 
 
-def _turned_box(
-    box: tuple[int, int, int, int] | None, turn: Orientation
-) -> tuple[int, int, int, int]:
+def _turned_box(box: IntBox | None, turn: Orientation) -> IntBox:
     """Box around the box of a cell that draws, in some orientation."""
     if box is None:
         raise ValueError("a cell that draws nothing has no box")

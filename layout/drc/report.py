@@ -8,6 +8,7 @@ from typing import Any
 
 from layout.drc.geometry import SHARPEST_CORNER
 from layout.process.process import DesignRules, LayerNumber
+from layout.shapes.rectilinear import IntBox
 
 MAX_LISTED = 500  # violations of one rule with their places
 RULES = (
@@ -19,13 +20,12 @@ RULES = (
     "foot",
     "off-grid",
     "density",
-    "exclusion",
     "clearance",
 )
 _UNITS = {"corner": " degrees", "density": ""}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RuleViolation:
     """One place where a rule is violated.
 
@@ -37,7 +37,7 @@ class RuleViolation:
     """
 
     rule: str
-    box: tuple[int, int, int, int]
+    box: IntBox
     value: float
     limit: float
     text: str
@@ -55,7 +55,7 @@ class RuleViolation:
         return f"{self.value:.4g}{unit}, need {self.limit:.4g}; {self.text}"
 
 
-@dataclass(slots=True)
+@dataclass
 class ViolationTally:
     """Number of violations, and the worst value in the unit of its rule."""
 
@@ -63,7 +63,7 @@ class ViolationTally:
     worst: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LayerCoverage:
     """Whether the shapes of a layer were checked, and how many the hierarchy draws."""
 
@@ -71,7 +71,7 @@ class LayerCoverage:
     shapes: int
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class DrcReport:
     """Violations by rule, layer and cell, with the extreme sizes measured.
 
@@ -204,7 +204,7 @@ class DrcReport:
         self,
         rule: str,
         value: float,
-        boxes: Iterable[tuple[int, int, int, int]],
+        boxes: Iterable[IntBox],
         *,
         count: int,
         layer: int,

@@ -23,7 +23,7 @@ Who = tuple[str, Orientation | None]  # a child and its orientation, None: all t
 Sum = tuple[int, ...]  # count, sums of x and y, number turned, hash of all places
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ReadbackComparison:
     """Outcome of reading a mask back.
 
@@ -81,7 +81,7 @@ def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
     for name, cell in library.cells.items():
         read = content.cells[name]
         differences += _shape_differences(cell, read)
-        merged = read.sums is not None
+        merged = bool(read.sums)
         planned_sums = _sums(cell, merged=merged)
         read_sums = _sums(read, merged=merged)
         for child in sorted(planned_sums.keys() | read_sums.keys(), key=str):
@@ -155,9 +155,8 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
         cell: as planned, or as read.
         merged: all orientations of a child together, as sums are kept while reading.
     """
-    if cell.sums is not None:
-        rows = map(tuple, cell.sums.tolist())
-        return dict(zip(((c, None) for c in cell.placed.children), rows, strict=True))
+    if cell.sums:
+        return {(child, None): sums for child, sums in cell.sums.items()}
     digests: dict[Who, RunningDigest] = {}
     for child, turn, x, y in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)

@@ -9,7 +9,7 @@ from layout.formats import gdsii_records as gds
 from layout.formats import paths
 from layout.formats.files import CONTEXT_CELL, decode_name, map_bytes, release_bytes
 from layout.formats.library import MaskCell, MaskLibrary, Orientation
-from layout.formats.open_cell import OpenCell, PlacementSums, has_area
+from layout.formats.open_cell import OpenCell, has_area
 from layout.formats.read_loops import FARTHEST, sref_run
 from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
@@ -149,7 +149,7 @@ class _Reader:
     def structure(self) -> MaskCell:
         """Read a structure, from STRNAME to ENDSTR."""
         name = self.name(self.next(gds.STRNAME)[1])
-        cell = OpenCell(name, PlacementSums(self.keep))
+        cell = OpenCell(name, self.keep)
         while True:
             self.references(cell)
             kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)

@@ -4,7 +4,6 @@ Bytes are the same for the same mask: the time stamps are fixed. Memory is one b
 whatever the lens.
 """
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,7 +20,6 @@ from layout.formats.library import (
     MaskLibrary,
     Orientation,
     PillarSites,
-    group_equal,
     library_of,
 )
 from layout.mask.plan import MaskPlan, PillarArray
@@ -98,9 +96,12 @@ def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
             for layer, polygons in cell.polygons.items()
             for points in polygons
         ]
-        copies = [_copies(one) for one in cell.references]
-        yield b"".join([head, *shapes, *copies])
-        yield from _placements(cell.kept())
+        yield b"".join([head, *shapes])
+        for one in cell.references:
+            if isinstance(one, CellReference):
+                yield _copies(one)
+            else:
+                yield from _placements(one)
         if cell.pillars is not None:
             yield from _pillars(cell.pillars)
         yield gds.gdsii_record(gds.ENDSTR)
@@ -174,18 +175,16 @@ def _copies(one: CellReference) -> bytes:
 
 
 def _placements(placed: CellPlacements) -> Iterator[bytes]:
-    """All placements, those of one cell and orientation together."""
+    """References to a cell in one orientation."""
+    start = _head(placed.child, placed.turn)
+    head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
     tail = np.frombuffer(gds.gdsii_record(gds.ENDEL), np.uint8)
-    for kind, members in group_equal(placed.kinds()):
-        child, turn = divmod(kind, len(placed.turns))
-        start = _head(placed.children[child], placed.turns[turn])
-        head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
-        for part in np.array_split(members, math.ceil(len(members) / _AT_ONCE)):
-            block = np.empty((len(part), len(head) + len(tail)), np.uint8)
-            block[:, : len(head)], block[:, len(head) :] = head, tail
-            xy = np.column_stack([placed.x[part], placed.y[part]]).astype(">i4")
-            block[:, len(head) - 8 : len(head)] = xy.view(np.uint8).reshape(-1, 8)
-            yield block.tobytes()
+    for first in range(0, placed.count, _AT_ONCE):
+        x, y = (v[first : first + _AT_ONCE] for v in placed.places())
+        block = np.tile(np.r_[head, tail], (len(x), 1))
+        xy = np.column_stack([x, y]).astype(">i4")
+        block[:, len(head) - 8 : len(head)] = xy.view(np.uint8).reshape(-1, 8)
+        yield block.tobytes()
 
 
 def _pillars(some: PillarSites) -> Iterator[memoryview]:

@@ -3,7 +3,6 @@ a job sheet as text.
 """
 
 import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ FIELD_HEAD = ("sequence", "x_um", "y_um", "width_um", "height_um", "pillars")
 _OPEN = "________"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WriteStep:
     """One write field, in the order of writing.
 
@@ -73,15 +72,14 @@ def write_fields(steps: Sequence[WriteStep], path: str | Path) -> None:
         steps: of a lens, or of all parts of an arrangement.
         path: of the CSV file.
     """
-    text = io.StringIO()
     parts = any(step.part for step in steps)
-    out = csv.writer(text, lineterminator="\n")
-    out.writerow([*FIELD_HEAD, "part"] if parts else FIELD_HEAD)
-    for number, step in enumerate(steps, 1):
-        sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
-        row = [number, *(f"{v:.4f}" for v in sizes), step.pillars]
-        out.writerow([*row, step.part] if parts else row)
-    store.write_text(path, text.getvalue())
+    lines = [",".join([*FIELD_HEAD, *["part"] * parts])]
+    for n, step in enumerate(steps, 1):
+        place = f"{step.x_um:.4f},{step.y_um:.4f}"
+        size = f"{step.width_um:.4f},{step.height_um:.4f}"
+        part = f",{step.part}" * parts
+        lines.append(f"{n},{place},{size},{step.pillars}{part}")
+    store.write_text(path, "\n".join([*lines, ""]))
 
 
 def charge_uC(
@@ -150,23 +148,18 @@ def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
     Args:
         plan: of a die.
     """
-    source = plan if plan.standing is None else plan.standing
     shapes = [
         shape
-        for figure in source.figures
+        for figure in (plan.standing or plan).figures
         if figure.name == "MARKS"
         for drawn in figure.polygons.values()
         for shape in drawn
     ]
-    boxes = (
-        [
-            (contour.min(0), contour.max(0))
-            for contour in region.union_contours(shapes)
-            if polygon.twice_area(contour) > 0
-        ]
-        if shapes
-        else []
-    )
+    boxes = [
+        (contour.min(0), contour.max(0))
+        for contour in region.union_contours(shapes)
+        if polygon.twice_area(contour) > 0
+    ]
     scale = plan.unit_nm * nm
     marks = [
         (*((low + high) / 2 * scale).tolist(), *((high - low) * scale).tolist())
@@ -225,7 +218,7 @@ def _lines(
     yield "Marks (middle x, y; width x height):"
     for x, y, width, height in marks_um(plan):
         yield f"  ({x:.3f}, {y:.3f}); {width:.3f} x {height:.3f}"
-    if any(figure.name == "VERNIERS" for figure in plan.figures):
+    if any(figure.name == "VERNIERS" for figure in (plan.standing or plan).figures):
         die = process.die
         yield ""
         yield (
@@ -254,22 +247,13 @@ def write_dose_table(plan: DosedMask, process: Process, path: str | Path) -> Non
         process: base dose, and layer of the aperture.
         path: of the CSV file.
     """
-    text = io.StringIO()
-    out = csv.writer(text, lineterminator="\n")
-    out.writerow(DOSE_HEAD)
+    lines = [",".join(DOSE_HEAD)]
     for layer, dose in sorted(plan.doses.items()):
         step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
+        absolute = dose * process.exposure.base_uC_cm2
         name = plan.layer_names.get(layer, "")
-        out.writerow(
-            [
-                *layer,
-                f"{dose:.6f}",
-                f"{dose * process.exposure.base_uC_cm2:.3f}",
-                step,
-                name,
-            ]
-        )
-    store.write_text(path, text.getvalue())
+        lines.append(f"{layer[0]},{layer[1]},{dose:.6f},{absolute:.3f},{step},{name}")
+    store.write_text(path, "\n".join([*lines, ""]))
 
 
 def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:

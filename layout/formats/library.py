@@ -8,7 +8,7 @@ import dataclasses
 import graphlib
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,10 +21,9 @@ from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
 MAX_DEPTH = 64  # of nested references
-_AT_ONCE = 1 << 22  # placements that are sorted by cell at once
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Orientation:
     """A mirror at the x axis (or none), then a turn counter-clockwise, then a scale."""
 
@@ -72,40 +71,31 @@ class Orientation:
 QUARTERS = tuple(Orientation(90.0 * (k & 3), bool(k & 4)) for k in range(8))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class CellPlacements:
-    """Placements in one cell.
+    """A cell placed anywhere, in one orientation.
 
-    children: names of cells.
-    child: (n,) index into them.
+    child: name of the cell.
+    turn: orientation of all.
     x, y: (n,) int32 places, database units.
-    turn: (n,) index into ``turns``.
-    turns: orientations; the first eight are multiples of 90 degrees counter-clockwise
-        (bits 0-1) after a mirror at the x axis (bit 2).
     """
 
-    children: tuple[str, ...]
-    child: Array
+    child: str
+    turn: Orientation
     x: Array
     y: Array
-    turn: Array
-    turns: tuple[Orientation, ...] = QUARTERS
 
-    def kinds(self, part: slice = slice(None)) -> Array:
-        """(n,) number of child and orientation together: child * len(turns) + turn.
+    @property
+    def count(self) -> int:
+        """Number of instances."""
+        return len(self.x)
 
-        Args:
-            part: of the placements.
-        """
-        return np.asarray(
-            self.child[part].astype(np.int64) * len(self.turns) + self.turn[part]
-        )
+    def places(self) -> tuple[Array, Array]:
+        """x and y of all instances, (count,) each."""
+        return self.x, self.y
 
 
-NOTHING = CellPlacements((), *(np.empty(0, np.int32),) * 3, np.empty(0, np.uint8))
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CellReference:
     """A cell placed once, or as an array.
 
@@ -142,7 +132,7 @@ class CellReference:
         return x.ravel(), y.ravel()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class PillarSites:
     """Pillars of a cell, never all in memory.
 
@@ -164,7 +154,7 @@ class PillarSites:
         )
         source = self.lattice.source
         return dataclasses.replace(
-            self.lattice, source=lambda a, b: lookup[source(a, b)], array=None
+            self.lattice, source=lambda a, b: lookup[source(a, b)]
         )
 
     def places(self) -> Iterator[tuple[str, Array, Array]]:
@@ -189,63 +179,37 @@ class PillarSites:
         return {child: sums for child, sums in pairs if sums[0]}
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class MaskCell:
     """One cell.
 
     polygons: {(layer, datatype): (n, 2) corners each}.
-    placed: placements of other cells.
-    sums: of the placements of each of ``placed.children``, where there are more than
-        are kept; ``placed`` then holds none.
+    references: placements of other cells.
+    sums: {child: count, sums of x and y, number turned, hash} of its placements, where
+        there are more than are kept.
     skipped: elements of the file that draw nothing, by kind.
-    references: placements and arrays beside ``placed``.
     pillars: a lattice of cells beside these.
     """
 
     name: str
     polygons: Mapping[LayerNumber, list[Array]] = field(default_factory=dict)
-    placed: CellPlacements = NOTHING
-    sums: Array | None = None
+    references: tuple[CellReference | CellPlacements, ...] = ()
+    sums: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     skipped: Counter[str] = field(default_factory=Counter)
-    references: tuple[CellReference, ...] = ()
     pillars: PillarSites | None = None
-
-    def kept(self) -> CellPlacements:
-        """The placements.
-
-        Raises:
-            MaskFileError: only their sums were kept.
-        """
-        if self.sums is not None:
-            raise MaskFileError(
-                f"cell {self.name!r}: of its placements only the sums were kept; read "
-                "all of them"
-            )
-        return self.placed
 
     @property
     def children(self) -> tuple[str, ...]:
         """Names of the cells that are placed."""
-        own = (*self.placed.children, *(one.child for one in self.references))
+        own = (*self.sums, *(one.child for one in self.references))
         more = self.pillars.children if self.pillars is not None else ()
         return tuple(dict.fromkeys(child for child in (*own, *more) if child))
 
     def counts(self) -> dict[tuple[str, Orientation], int]:
         """How often each cell is placed in each orientation; of sums all together."""
         counts: Counter[tuple[str, Orientation]] = Counter()
-        if self.sums is not None:
-            for child, count in zip(
-                self.placed.children, self.sums[:, 0].tolist(), strict=True
-            ):
-                counts[child, QUARTERS[0]] += count
-        total = np.zeros(len(self.placed.children) * len(self.placed.turns), np.int64)
-        for first in range(0, len(self.placed.child), _AT_ONCE):
-            kinds = self.placed.kinds(slice(first, first + _AT_ONCE))
-            total += np.bincount(kinds, minlength=len(total))
-        for kind in np.flatnonzero(total).tolist():
-            number, turn = divmod(kind, len(self.placed.turns))
-            key = self.placed.children[number], self.placed.turns[turn]
-            counts[key] += int(total[kind])
+        for child, (count, *_) in self.sums.items():
+            counts[child, QUARTERS[0]] += count
         for reference in self.references:
             counts[reference.child, reference.turn] += reference.count
         if self.pillars is not None:
@@ -256,38 +220,22 @@ class MaskCell:
                 counts[child, QUARTERS[0]] += count
         return {key: count for key, count in counts.items() if count}
 
-    def instances(
-        self, among: Collection[str] | None = None
-    ) -> Iterator[tuple[str, Orientation, Array, Array]]:
+    def instances(self) -> Iterator[tuple[str, Orientation, Array, Array]]:
         """Placements by cell and orientation: name, orientation, x and y (n,) each.
-
-        Args:
-            among: cells whose placements are listed; None: all.
 
         Raises:
             MaskFileError: only sums of the placements were kept.
         """
-        placed = self.kept()
-        among = set(self.children if among is None else among)
-        is_listed = np.array([name in among for name in placed.children], bool)
-        for first in range(0, len(placed.child) if is_listed.any() else 0, _AT_ONCE):
-            block = slice(first, first + _AT_ONCE)
-            x = placed.x[block]
-            y = placed.y[block]
-            kinds = placed.kinds(block)
-            if not is_listed.all():
-                chosen = is_listed[placed.child[block]]
-                x, y, kinds = x[chosen], y[chosen], kinds[chosen]
-            for kind, members in group_equal(kinds):
-                child, turn = divmod(kind, len(placed.turns))
-                yield placed.children[child], placed.turns[turn], x[members], y[members]
+        if self.sums:
+            raise MaskFileError(
+                f"cell {self.name!r}: of its placements only the sums were kept; read "
+                "all of them"
+            )
         for reference in self.references:
-            if reference.child in among:
-                yield reference.child, reference.turn, *reference.places()
-        if self.pillars is not None and among.intersection(self.pillars.children):
+            yield reference.child, reference.turn, *reference.places()
+        if self.pillars is not None:
             for name, x, y in self.pillars.places():
-                if name in among:
-                    yield name, QUARTERS[0], x, y
+                yield name, QUARTERS[0], x, y
 
     @property
     def layers(self) -> set[LayerNumber]:
@@ -300,7 +248,7 @@ class MaskCell:
         return sum(map(len, self.polygons.values())) or int(not self.children)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class MaskLibrary:
     """All of a mask.
 
@@ -414,25 +362,6 @@ class MaskLibrary:
                         child, inner, instance_x, instance_y, (*above, name)
                     )
 
-    def places(self, top: str) -> dict[str, tuple[Array, Array]]:
-        """{cell: x and y of all its instances} of the cells below ``top`` that place
-        nothing themselves.
-
-        Raises:
-            MaskFileError: as :meth:`walk`.
-        """
-        parts_of_cell: dict[str, list[tuple[Array, Array]]] = {}
-        for name, _, x, y in self.walk(top):
-            if name != top and not self.cell(name).children:
-                parts_of_cell.setdefault(name, []).append((x, y))
-        joined = {
-            name: list(zip(*parts, strict=True))
-            for name, parts in parts_of_cell.items()
-        }
-        return {
-            n: (np.concatenate(x), np.concatenate(y)) for n, (x, y) in joined.items()
-        }
-
     def topological_order(self) -> list[str]:
         """All cells, each after those that place it.
 
@@ -459,12 +388,16 @@ class MaskLibrary:
         Raises:
             MaskFileError: as :meth:`topological_order`.
         """
-        times = dict.fromkeys(self.topological_order(), 0)
-        times |= dict.fromkeys(self.tops, 1)
-        for name in times:
-            for (child, _), count in self.cells[name].counts().items():
-                times[child] += times[name] * count
-        return times
+        return {name: int(n) for name, n in self._sums_of_instances(0).items()}
+
+    def _sums_of_instances(self, power: int) -> dict[str, float]:
+        """{cell: sum of scale ** power over its instances below the top cells}."""
+        sums: dict[str, float] = dict.fromkeys(self.topological_order(), 0)
+        sums |= dict.fromkeys(self.tops, 1)
+        for name in sums:
+            for (child, turn), count in self.cells[name].counts().items():
+                sums[child] += sums[name] * count * turn.scale**power
+        return sums
 
     def count_shapes(self) -> Counter[LayerNumber]:
         """Shapes that the top cells draw on each layer.
@@ -480,16 +413,12 @@ class MaskLibrary:
 
     def areas_um2(self) -> dict[LayerNumber, float]:
         """{layer: sum of the areas of all shapes below the top cells}."""
-        weight = dict.fromkeys(self.topological_order(), 0.0)
-        weight |= dict.fromkeys(self.tops, (1e-3 * self.unit_nm) ** 2)
         areas: dict[LayerNumber, float] = {}
-        for name in weight:
-            cell = self.cells[name]
-            for (child, turn), count in cell.counts().items():
-                weight[child] += weight[name] * count * turn.scale**2
-            for layer, shapes in cell.polygons.items():
-                area = sum(abs(polygon.twice_area(p)) / 2 for p in shapes)
-                areas[layer] = areas.get(layer, 0.0) + weight[name] * area
+        for name, weight in self._sums_of_instances(2).items():
+            for layer, shapes in self.cells[name].polygons.items():
+                units = weight * sum(abs(polygon.twice_area(p)) / 2 for p in shapes)
+                um2 = units * (1e-3 * self.unit_nm) ** 2
+                areas[layer] = areas.get(layer, 0.0) + um2
         return areas
 
     def refuse_beyond(self, limit: int) -> None:
@@ -568,7 +497,7 @@ def stable_order(numbers: Array) -> Array:
 # flat shapes
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class PolygonStack:
     """Polygons of one cell and layer with equally many corners, at the same places.
 
@@ -601,14 +530,11 @@ def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
                 yield PolygonStack(name, layer, _turned(points, turn), x, y)
 
 
-def equal_shapes(
-    library: MaskLibrary, key: Callable[[PolygonStack], Hashable]
-) -> dict[Hashable, list[PolygonStack]]:
-    """Shapes below all top cells that are equal, as stacks of one polygon.
+def equal_shapes(library: MaskLibrary) -> Iterable[list[PolygonStack]]:
+    """Shapes of one cell and layer that are equal, as stacks of one polygon.
 
     Args:
         library: of a file.
-        key: of a stack; polygons of different keys are not equal.
 
     Raises:
         MaskFileError: as :meth:`MaskLibrary.walk`.
@@ -617,10 +543,10 @@ def equal_shapes(
     for top in library.tops:
         for stack in flatten_stacks(library, top):
             for outline in stack.outlines:
-                shape_key = key(stack), np.ascontiguousarray(outline).tobytes()
+                shape_key = stack.cell, stack.layer, outline.tobytes()
                 single = dataclasses.replace(stack, outlines=outline[None])
                 stacks.setdefault(shape_key, []).append(single)
-    return stacks
+    return stacks.values()
 
 
 def _turned(outlines: Array, turn: Orientation) -> Array:

@@ -25,7 +25,7 @@ _CIRCLE_CORNERS = 64  # of the polygon that stands for a true circle
 _POSITIONS = ("placement_x", "placement_y", "x", "y", "text_x", "text_y")
 
 
-@dataclass(slots=True)
+@dataclass
 class ReadBudget:
     """Placements and copies of a whole file: at most ``limit``, ``used`` so far."""
 
@@ -71,7 +71,7 @@ class CellReader:
             if count:
                 numbers, x, y, turn = (row.copy() for row in out[:, :count])
                 self._count(c, count)
-                self.cell.held.add(numbers, x, y, turn.astype(np.uint8))
+                self.cell.add(numbers, x, y, turn.astype(np.uint8))
                 m["placement_x"], m["placement_y"], _, m["child"] = state.tolist()
             self.relative = bool(state[2])
             if not has_moved:

@@ -19,21 +19,13 @@ DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -
 class ByteCursor:
     """A position in the bytes of a file, or in those of one decompressed block of it."""
 
-    def __init__(
-        self,
-        path: str,
-        data: Array,
-        *,
-        at: int = 0,
-        end: int | None = None,
-        block: int = -1,
-    ) -> None:
+    def __init__(self, path: str, data: Array, *, block: int = -1) -> None:
         self.path = path
         self.data = data
-        self.at = at
+        self.at = 0
         self.block = block
-        self.end = len(data) if end is None else end
-        self.begin = at  # of the latest record
+        self.end = len(data)
+        self.begin = 0  # of the latest record
 
     def fail(self, text: str) -> MaskFileError:
         """An error that says where: the byte in the file, or in a compressed block that

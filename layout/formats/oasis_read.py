@@ -13,7 +13,7 @@ from layout.formats.files import CONTEXT_CELL, map_bytes
 from layout.formats.library import MaskCell, MaskLibrary
 from layout.formats.oasis_cells import CellReader, ReadBudget
 from layout.formats.oasis_cursor import ByteCursor
-from layout.formats.open_cell import Child, OpenCell, PlacementSums
+from layout.formats.open_cell import OpenCell
 from metalens.core.arrays import Array
 
 LIMIT = 2**29
@@ -127,11 +127,10 @@ class _Reader:
     def _record(self, c: ByteCursor, kind: int) -> None:
         """Read one record of the file level, or pass it to the open cell."""
         if kind in (oasis.CELL_REF, oasis.CELL):
-            self._begin_cell(
-                c.within(c.unsigned())
-                if kind == oasis.CELL_REF
-                else c.string(name=True)
-            )
+            is_named = kind == oasis.CELL
+            key = c.string(name=True) if is_named else c.within(c.unsigned())
+            self.cells.append(OpenCell(key, self.keep))
+            self.cell = CellReader(self.cells[-1], self.budget)
         elif kind == oasis.CBLOCK:
             self._block(c)
         elif kind in (oasis.PROPERTY, oasis.PROPERTY_REPEAT):
@@ -154,11 +153,6 @@ class _Reader:
             self.end_at = c.begin
         elif kind != oasis.PAD:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
-
-    def _begin_cell(self, key: Child) -> None:
-        """Open a cell, by its number or its name."""
-        self.cells.append(OpenCell(key, PlacementSums(self.keep)))
-        self.cell = CellReader(self.cells[-1], self.budget)
 
     def _block(self, c: ByteCursor) -> None:
         """Unpack a CBLOCK and read its records; sizes are checked first."""

@@ -7,15 +7,35 @@ import numpy as np
 from metalens.core.arrays import Array
 
 # corners of the compact trapezoids as (x, y), each a sum of w and h: "w-h" or "2h"
-_CORNERS = (
-    "0,0 0,h w-h,h w,0", "0,0 0,h w,h w-h,0", "0,0 h,h w,h w,0", "h,0 0,h w,h w,0",
-    "0,0 h,h w-h,h w,0", "h,0 0,h w,h w-h,0", "0,0 h,h w,h w-h,0", "h,0 0,h w-h,h w,0",
-    "0,0 0,h w,h-w w,0", "0,0 0,h-w w,h w,0", "0,0 0,h w,h w,w", "0,w 0,h w,h w,0",
-    "0,0 0,h w,h-w w,w", "0,w 0,h-w w,h w,0", "0,0 0,h-w w,h w,w", "0,w 0,h w,h-w w,0",
-    "0,0 0,w w,0", "0,0 0,w w,w", "0,0 w,w w,0", "0,w w,w w,0",
-    "0,0 h,h 2h,0", "0,h 2h,h h,0", "0,0 0,2w w,w", "0,w w,2w w,0",
-    "0,0 0,h w,h w,0", "0,0 0,w w,w w,0",
-)  # fmt: skip
+_TABLE = """
+0,0 0,h w-h,h w,0
+0,0 0,h w,h w-h,0
+0,0 h,h w,h w,0
+h,0 0,h w,h w,0
+0,0 h,h w-h,h w,0
+h,0 0,h w,h w-h,0
+0,0 h,h w,h w-h,0
+h,0 0,h w-h,h w,0
+0,0 0,h w,h-w w,0
+0,0 0,h-w w,h w,0
+0,0 0,h w,h w,w
+0,w 0,h w,h w,0
+0,0 0,h w,h-w w,w
+0,w 0,h-w w,h w,0
+0,0 0,h-w w,h w,w
+0,w 0,h w,h-w w,0
+0,0 0,w w,0
+0,0 0,w w,w
+0,0 w,w w,0
+0,w w,w w,0
+0,0 h,h 2h,0
+0,h 2h,h h,0
+0,0 0,2w w,w
+0,w w,2w w,0
+0,0 0,h w,h w,0
+0,0 0,w w,w w,0
+"""
+_CORNERS = _TABLE.split("\n")[1:-1]
 KINDS = len(_CORNERS)
 
 

@@ -7,9 +7,8 @@ for the same mask.
 import itertools
 import struct
 import zlib
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from layout.formats.library import (
     QUARTERS,
     CellPlacements,
     CellReference,
-    MaskCell,
     MaskLibrary,
     Orientation,
     library_of,
@@ -56,7 +54,10 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     number = {name: k for k, name in enumerate(library.cells)}
     head = oasis.start_record(library.unit_nm)
     layers = b"".join(
-        layer_name(layer, name) for layer, name in sorted(library.layer_names.items())
+        bytes([oasis.LAYERNAME])
+        + oasis.oasis_string(name)
+        + b"".join(b"\x03" + oasis.unsigned_integer(n) for n in layer)  # exactly n
+        for layer, name in sorted(library.layer_names.items())
     )
     checksum, written = 0, 0
     with (
@@ -67,31 +68,15 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
             file.write(piece)
             checksum = zlib.crc32(piece, checksum)
             written = written + len(piece)
-        table = b"".join(cell_name(k, name) for name, k in number.items())
+        table = b"".join(
+            bytes([oasis.CELLNAME_REF])
+            + oasis.oasis_string(name)
+            + oasis.unsigned_integer(k)
+            for name, k in number.items()
+        )
         file.write(table)
         offsets = (written, 0, 0, 0, len(head) if layers else 0, 0)
         file.write(oasis.end_record(offsets, zlib.crc32(table, checksum)))
-
-
-def cell_name(number: int, name: str) -> bytes:
-    """Record of a cell's name.
-
-    Args:
-        number: that references use.
-        name: of the cell.
-    """
-    return (
-        bytes([oasis.CELLNAME_REF])
-        + oasis.oasis_string(name)
-        + oasis.unsigned_integer(number)
-    )
-
-
-def layer_name(layer: LayerNumber, name: str) -> bytes:
-    """Record of the name of a layer and datatype."""
-    exactly = b"\x03"
-    numbers = b"".join(exactly + oasis.unsigned_integer(n) for n in layer)
-    return bytes([oasis.LAYERNAME]) + oasis.oasis_string(name) + numbers
 
 
 def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
@@ -101,10 +86,11 @@ def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
         for layer, polygons in cell.polygons.items():
             shapes = b"".join(polygon_element(layer, points) for points in polygons)
             yield oasis.compressed_block(shapes, _LEVEL)
-        yield b"".join(
-            _copies(element, number[element.child]) for element in cell.references
-        )
-        yield from _placements(cell, number)
+        for one in cell.references:
+            if isinstance(one, CellReference):
+                yield _copies(one, number[one.child])
+            else:
+                yield from _placements(one, number[one.child])
         if cell.pillars is not None:
             yield from _pillars(cell.pillars.numbered(number))
 
@@ -181,39 +167,16 @@ def _placement(
     return head + oasis.unsigned_integer(number) + size + place
 
 
-def _placements(cell: MaskCell, number: dict[str, int]) -> Iterator[bytes]:
-    """Placements of a cell: those of quarter turns relative to each other."""
-    placed = cell.kept()
-    numbers = np.array([number[name] for name in placed.children], np.int64)
-    quarter = placed.turn < len(QUARTERS)
-    yield b"".join(
-        _placement(
-            int(numbers[placed.child[n]]),
-            placed.turns[int(placed.turn[n])],
-            int(placed.x[n]),
-            int(placed.y[n]),
-        )
-        for n in np.flatnonzero(~quarter).tolist()
-    )
-    where = slice(None) if quarter.all() else np.flatnonzero(quarter)
-    yield from _listed(numbers, placed, where)
-
-
-def _listed(
-    numbers: Array, placed: CellPlacements, chosen: slice | Array
-) -> Iterator[bytes]:
-    """Compressed blocks of placements of quarter turns.
-
-    Args:
-        numbers: (children,) reference number of each child.
-        placed: placements.
-        chosen: which of them.
-    """
-    columns = placed.child, placed.x, placed.y, placed.turn
-    child, x, y, turn = (column[chosen] for column in columns)
-    for first in range(0, len(x), _AT_ONCE):
-        block = slice(first, first + _AT_ONCE)
-        yield _block(numbers[child[block]], x[block], y[block], turn[block], _LEVEL)
+def _placements(placed: CellPlacements, number: int) -> Iterator[bytes]:
+    """Placements in one orientation: of a quarter turn in compressed blocks."""
+    if placed.turn not in QUARTERS:
+        places = zip(placed.x.tolist(), placed.y.tolist(), strict=True)
+        yield b"".join(_placement(number, placed.turn, *place) for place in places)
+        return
+    for first in range(0, placed.count, _AT_ONCE):
+        x, y = (v[first : first + _AT_ONCE] for v in placed.places())
+        child, turn = np.full((2, len(x)), [[number], [QUARTERS.index(placed.turn)]])
+        yield _block(child, x, y, turn, _LEVEL)
 
 
 def _block(child: Array, x: Array, y: Array, turn: Array, level: int) -> bytes:
@@ -226,40 +189,33 @@ def _block(child: Array, x: Array, y: Array, turn: Array, level: int) -> bytes:
 
 def _pillars(lattice: PillarArray) -> Iterator[bytes]:
     """Placements, tile by tile, of the cells that a lattice numbers from 1 on."""
-
-    def jobs() -> Iterator[Callable[[], bytes]]:
-        steps = lattice.pitch, lattice.down
-        is_large = lattice.rows * lattice.columns >= _LARGE
-        level = _FAST_LEVEL if is_large else _LEVEL
+    is_large = lattice.rows * lattice.columns >= _LARGE
+    level = _FAST_LEVEL if is_large else _LEVEL
+    tiles = range(0, lattice.columns, _TILE_COLUMNS)
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="mask") as pool:
         for first, block in lattice.blocks(_TILE_ROWS):
-            y = lattice.y0 - first * lattice.down
-            for left in range(0, lattice.columns, _TILE_COLUMNS):
-                tile = block[:, left : left + _TILE_COLUMNS]
-                x = lattice.x0 + left * lattice.pitch
-                yield partial(_tile, tile, steps, x, y, level)
-
-    yield from _in_order(jobs())
+            yield from pool.map(partial(_tile, lattice, first, block, level), tiles)
 
 
-def _tile(tile: Array, steps: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
-    """Compressed block of the pillars of a tile of sites; empty for none."""
+def _tile(
+    lattice: PillarArray, first: int, block: Array, level: int, left: int
+) -> bytes:
+    """Compressed block of the pillars of a tile of sites; empty for none.
+
+    Args:
+        lattice: of the pillars.
+        first: row of the block.
+        block: (rows, columns) class numbers.
+        level: of deflate.
+        left: first column of the tile.
+    """
+    tile = block[:, left : left + _TILE_COLUMNS]
     row, column = np.nonzero(tile)
     if not len(row):
         return b""
-    x, y = x0 + column * steps[0], y0 - row * steps[1]
+    x = lattice.x0 + (left + column) * lattice.pitch
+    y = lattice.y0 - (first + row) * lattice.down
     return _block(tile[row, column].astype(np.int64) - 1, x, y, 0 * row, level)
-
-
-def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[bytes]:
-    """Results of the jobs in their order, a few of them worked on at once."""
-    waiting: deque[Future[bytes]] = deque()
-    with ThreadPoolExecutor(_THREADS, thread_name_prefix="mask") as pool:
-        for job in jobs:
-            waiting.append(pool.submit(job))
-            if len(waiting) > ahead:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 @compile_loop
@@ -293,8 +249,7 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
     Returns:
         Bytes used.
     """
-    out[0] = 15  # XYABSOLUTE
-    at, last_x, last_y = 1, 0, 0
+    at, last_x, last_y = 0, 0, 0
     for n in range(x.shape[0]):
         move_x = n == 0 or x[n] != last_x
         move_y = n == 0 or y[n] != last_y
@@ -315,4 +270,5 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
             out[at] = 16  # XYRELATIVE
             at += 1
         last_x, last_y = x[n], y[n]
-    return at
+    out[at] = 15  # XYABSOLUTE, as each cell begins
+    return at + 1

@@ -24,10 +24,16 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
         record is something else.
     """
     nothing = np.empty(0, np.int32)
-    if len(data) - at < 28 or bytes(data[at : at + 5]) != b"\0\x04\x0a\0\0":
+    size = int(data[at + 5]) + 20 if len(data) - at > 28 else 0
+    fixed = bytes([0, 4, 10, 0, 0, size - 20, 18, 6]) if 24 < size < 276 else b"-"
+    record = bytes(data[at : at + size])
+    if (
+        record[:8] != fixed
+        or record[-16:-12] != b"\0\x0c\x10\3"
+        or record[-4:] != b"\0\4\x11\0"
+    ):
         return [], nothing, nothing, nothing, at
-    size = int(data[at + 5]) + 20
-    most = min(_RUN, (len(data) - at) // max(size, 1))
+    most = min(_RUN, (len(data) - at) // size)
     out = np.empty((3, most), np.int32)
     first = np.empty(min(_MOST_NAMES, most), np.int64)
     slots = np.full(4 << len(first).bit_length(), -1, np.int32)
@@ -45,7 +51,7 @@ def _srefs(
 
     Args:
         data: bytes of the file.
-        at: first byte of the run.
+        at: first byte of the run, a plain record.
         size: bytes of each record, from SREF to ENDEL.
         out: (3, n) output: index of the name, x and y of each.
         slots: hash table of the names: index, or -1.
@@ -60,35 +66,10 @@ def _srefs(
     for n in range(out.shape[1]):
         start = at + n * size
         coordinates = start + size - 16
-        if not (
-            data[start] == 0
-            and data[start + 1] == 4
-            and data[start + 2] == 10
-            and data[start + 3] == 0
-            and data[start + 4] == 0
-        ):
-            return n, names
-        if not (
-            data[start + 5] == size - 20
-            and size > 24
-            and data[start + 6] == 18
-            and data[start + 7] == 6
-        ):
-            return n, names
-        if not (
-            data[coordinates] == 0
-            and data[coordinates + 1] == 12
-            and data[coordinates + 2] == 16
-            and data[coordinates + 3] == 3
-        ):
-            return n, names
-        if not (
-            data[coordinates + 12] == 0
-            and data[coordinates + 13] == 4
-            and data[coordinates + 14] == 17
-            and data[coordinates + 15] == 0
-        ):
-            return n, names
+        for i in range(size):
+            is_fixed = i < 8 or size - 16 <= i < size - 12 or i >= size - 4
+            if is_fixed and data[start + i] != data[at + i]:
+                return n, names
         key = 0
         for i in range(start + 8, coordinates):
             key = (key * 131 + int(data[i])) & 0x7FFFFFFF

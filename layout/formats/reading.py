@@ -35,7 +35,8 @@ def read_mask(
             f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
         )
     start = map_bytes(path)[:64].tobytes()
-    other = reading.foreign_format(path) or _text_format(start)
+    texts = (name for form, name in _OTHER_FORMATS.items() if re.match(form, start))
+    other = reading.foreign_format(path) or next(texts, "")
     if other:
         raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
     is_oasis = start.startswith(oasis.MAGIC)
@@ -43,9 +44,3 @@ def read_mask(
     return reader(
         path, limit=placement_limit(path) if limit is None else limit, keep=keep
     )
-
-
-def _text_format(start: bytes) -> str:
-    """Which text format a file that begins so has; empty for none."""
-    named = (name for form, name in _OTHER_FORMATS.items() if re.match(form, start))
-    return next(named, "")

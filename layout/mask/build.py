@@ -8,7 +8,7 @@ from typing import Literal
 from layout.mask import cells, die, shaped, tone
 from layout.mask.plan import MaskPlan, PillarArray, PillarClass, pillar_classes
 from layout.process import names
-from layout.process.process import LayerNumber, LayerTable, Process
+from layout.process.process import Process
 from metalens.cell.shapes import Circle
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -21,7 +21,7 @@ Furniture = Literal[
 ]  # marks, label and test structures, or the opening of the lens alone
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class DrawnMask:
     """The plan of a lens before any correction.
 
@@ -79,9 +79,12 @@ def draw_mask(
     diameters = source.diameters if isinstance(source, Lens) else source
     pitch, row_pitch = (pitch_units(step, process) for step in diameters.steps_um)
     drawn_classes, classes = _drawn(source, process)
-    rows, columns = drawn_classes.sites.shape
+    rows, columns = drawn_classes.shape
     x0, y0, axis = _origin((rows, columns), (pitch, row_pitch), process.rules.grid_nm)
-    sites = drawn_classes.sites.upside_down()
+
+    def upside_down(first: int, end: int) -> Array:
+        return drawn_classes.source(rows - end, rows - first)[::-1]
+
     lattice = PillarArray(
         "LENS",
         rows,
@@ -89,8 +92,7 @@ def draw_mask(
         pitch,
         x0,
         y0,
-        sites.source,
-        sites.array,
+        upside_down,
         row_pitch,
         diameters.lattice.centred,
     )
@@ -100,8 +102,6 @@ def draw_mask(
         lattices=(lattice,),
         unit_nm=UNIT_NM,
         grid=process.rules.grid_nm,
-        layer_names={process.layers.pillar: _word(source)},
-        doses={process.layers.pillar: 1.0},
         axis=axis,
     )
     radius_um = diameters.radius_um + diameters.pitch_um / 2
@@ -114,15 +114,26 @@ def draw_mask(
         drawn_plan = die.open_aperture(drawn_plan, process, radius_um=radius_um)
     if process.tone == "negative":
         drawn_plan = tone.reverse_tone(drawn_plan, process)
-    check_layers(drawn_plan, process.layers)
+    drawn_plan = _name_layers(drawn_plan, source, process)
     return DrawnMask(drawn_plan, drawn_classes, radius_um)
 
 
-def _word(source: Lens | DiameterMap) -> str:
-    """What the drawn shapes of a lens are called."""
-    return (
-        "opening" if isinstance(source, Lens) and source.cell.shape.hole else "pillar"
-    )
+def _name_layers(
+    plan: MaskPlan, source: Lens | DiameterMap, process: Process
+) -> MaskPlan:
+    """The plan with names and doses of the layers that it draws on; dose 1 but in the
+    dose test.
+    """
+    layers = process.layers
+    kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
+    kinds[layers.labels[0]] = "label"
+    if isinstance(source, Lens) and source.cell.shape.hole:
+        kinds[layers.pillar[0]] = "opening"
+    test = {p.layer: p.dose for p in plan.classes if p.role == "dose"}
+    names = {layer: kinds[layer[0]] for layer in plan.layers}
+    names |= {layer: f"dose_test_dose_{dose:.2f}" for layer, dose in test.items()}
+    doses = dict.fromkeys(plan.layers - {layers.outline}, 1.0) | test
+    return plan.replace(layer_names=names, doses=doses)
 
 
 def die_surroundings(
@@ -133,7 +144,7 @@ def die_surroundings(
     size_um: tuple[float, float],
     clear_um: float,
     label: str,
-) -> DrawnMask:
+) -> MaskPlan:
     """Marks, label, dose test and witness cells around a die of other things.
 
     Args:
@@ -163,7 +174,7 @@ def die_surroundings(
         lattices=framed.lattices[:0:-1],
         figures=(dataclasses.replace(aperture, polygons=openings), *figures),
     )
-    return dataclasses.replace(lens_mask, plan=frame)
+    return _name_layers(frame, source, process)
 
 
 def wafer_mark(
@@ -173,7 +184,7 @@ def wafer_mark(
     name: str,
     mark_um: float,
     width_um: float,
-) -> DrawnMask:
+) -> MaskPlan:
     """An alignment cross of a wafer, with witness cells.
 
     Args:
@@ -190,7 +201,7 @@ def wafer_mark(
     mark = die.add_wafer_mark(
         lens_mask.plan, process, mark_um=mark_um, width_um=width_um
     )
-    return dataclasses.replace(lens_mask, plan=mark)
+    return _name_layers(mark, source, process)
 
 
 def _drawn(
@@ -204,7 +215,14 @@ def _drawn(
     drawn_classes = cells.quantise_diameters(
         source.diameters if isinstance(source, Lens) else source, process
     )
-    return drawn_classes, _plain_classes(drawn_classes.diameters_nm, process)
+    rules = process.rules
+    return drawn_classes, pillar_classes(
+        drawn_classes.diameters_nm,
+        layer=process.layers.pillar,
+        grid=rules.grid_nm,
+        unit_nm=UNIT_NM,
+        vertices=rules.vertices,
+    )
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:
@@ -237,56 +255,6 @@ def _origin(
     x0 = math.floor(-half_x / grid) * grid
     y0 = math.ceil(half_y / grid) * grid
     return x0, y0, (x0 + half_x, y0 - half_y)
-
-
-def _plain_classes(diameters: Array, process: Process) -> tuple[PillarClass, ...]:
-    """Classes of round pillars: polygons of the drawn diameters, nm."""
-    rules = process.rules
-    return pillar_classes(
-        diameters,
-        layer=process.layers.pillar,
-        grid=rules.grid_nm,
-        unit_nm=UNIT_NM,
-        vertices=rules.vertices,
-        shape=rules.shape,
-    )
-
-
-def check_layers(plan: MaskPlan, layers: LayerTable) -> None:
-    """Refuse datatypes of the doses that are layers of something else.
-
-    Args:
-        plan: with its doses.
-        layers: of the process.
-
-    Raises:
-        ProcessError: such a datatype.
-    """
-    fixed = {
-        getattr(layers, field.name): field.name for field in dataclasses.fields(layers)
-    }
-    kind_of_number = {
-        getattr(layers, field.name)[0]: field.name
-        for field in dataclasses.fields(layers)
-    }
-    kind_of_layer: dict[LayerNumber, str] = {}
-    drawn: list[tuple[LayerNumber, str]] = [
-        (pillar.layer, pillar.role) for pillar in plan.classes
-    ]
-    drawn += [
-        (layer, kind_of_number[layer[0]])
-        for figure in plan.figures
-        for layer in figure.polygons
-        if layer[0] in kind_of_number
-    ]
-    for layer, kind in drawn:
-        first_kind = kind_of_layer.setdefault(layer, kind)
-        if fixed.get(layer, kind) != kind or first_kind != kind:
-            other = first_kind if first_kind != kind else fixed[layer]
-            raise ProcessError(
-                f"layer {layer[0]}/{layer[1]} is a dose of the {kind} layer and the {other} layer; give "
-                f"{kind} and {other} different layer numbers"
-            )
 
 
 def _label(source: Lens | DiameterMap, radius_um: float) -> str:

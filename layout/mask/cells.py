@@ -2,13 +2,15 @@
 becomes a class number.
 """
 
-from collections.abc import Iterator
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.class_store import ScratchArray, hold_on_disk
-from layout.mask.plan import BLOCK_SITES, MOST_CLASSES
+from layout.mask.class_store import hold_on_disk
+from layout.mask.plan import BLOCK_SITES, MOST_CLASSES, RowSource
 from layout.process import isolation
 from layout.process.process import Process
 from metalens.core.arrays import Array
@@ -19,60 +21,87 @@ from metalens.lens import DiameterMap
 _FINE = 16  # table entries for one nanometre of designed diameter
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class DrawnClasses:
     """Quantised drawn pillars.
 
-    sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
-    whole nm, thinnest first. counts: (k,) pillars of each class.
+    shape: (y, x) of the sites.
+    source: class numbers of rows, uint8 or uint16, 0 for no pillar.
+    diameters_nm: (k,) size of each class.
+    counts: (k,) pillars of each class.
     """
 
-    sites: ScratchArray
+    shape: tuple[int, int]
+    source: RowSource
     diameters_nm: Array
     counts: Array
 
     @property
     def classes(self) -> Array:
         """All class numbers (y, x)."""
-        return self.sites.source(0, self.sites.shape[0])
+        return self.source(0, self.shape[0])
 
 
 def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses:
     """Drawn diameters (bias taken off) rounded to the diameter step of the process, as
-    classes; blocks of rows.
+    classes, thinnest first.
 
     Raises:
         ProcessError: more than 65 535 classes, a drawn pillar below one step, or one as
-            wide as the pitch
-            (row and column named).
+            wide as the pitch (row and column named).
         LensError: no pillar at all.
     """
-    counts = np.zeros(1 << 16, np.int64)
+    drawn = classify_keys(diameters, lambda: drawn_blocks(diameters, process))
+    sizes_nm = drawn.diameters_nm * process.rules.diameter_step_nm
+    return dataclasses.replace(drawn, diameters_nm=sizes_nm)
 
-    def count_blocks() -> Iterator[tuple[int, Array]]:
-        for first, block in drawn_blocks(diameters, process):
-            block_counts = np.bincount(block.ravel())
-            counts[: len(block_counts)] += block_counts
-            yield first, block
 
-    drawn = hold_on_disk(
-        diameters.diameter_um.shape, np.dtype(np.uint16), count_blocks()
-    )
-    if counts[1:].sum() == 0:
+def classify_keys(
+    diameters: DiameterMap, keys: Callable[[], Iterator[tuple[int, Array]]]
+) -> DrawnClasses:
+    """A class for each distinct key of the pillars; the keys stand for the diameters.
+
+    Args:
+        diameters: of the lens.
+        keys: starts anew an iterator of (first row, (rows, columns) keys); 0 for no
+            pillar. Keys of uint16 are looked up in a table.
+
+    Raises:
+        ProcessError: more than 65 535 classes.
+        LensError: no pillar at all.
+    """
+    counts: Counter[int] = Counter()
+    for _, block in keys():
+        if block.dtype == np.uint16:
+            numbers = np.bincount(block.ravel())
+            values = np.flatnonzero(numbers)
+            numbers = numbers[values]
+        else:
+            values, numbers = np.unique(block, return_counts=True)
+        counts.update(dict(zip(values.tolist(), numbers.tolist(), strict=True)))
+    counts.pop(0, None)
+    if not counts:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
-    used = np.flatnonzero(counts)
-    used = used[used > 0]
-    if len(used) > MOST_CLASSES:
+    if len(counts) > MOST_CLASSES:
         raise ProcessError(
-            f"{len(used)} different diameters, at most {MOST_CLASSES}; raise diameter_step_nm"
+            f"{len(counts)} classes of pillars, at most {MOST_CLASSES}; raise "
+            "diameter_step_nm or angle_step_deg"
         )
-    lookup = np.zeros(len(counts), np.uint8 if len(used) <= 255 else np.uint16)
-    lookup[used] = np.arange(1, len(used) + 1)
-    blocks = ((first, lookup.take(block)) for first, block in drawn.blocks())
-    step = process.rules.diameter_step_nm
-    return DrawnClasses(
-        hold_on_disk(drawn.shape, lookup.dtype, blocks), used * step, counts[used]
+    used = np.array(sorted(counts))
+    dtype = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
+
+    def numbered(block: Array) -> Array:
+        return np.searchsorted(used, block, side="right").astype(dtype)
+
+    table = numbered(np.arange(1 << 16))
+    rows, columns = diameters.diameter_um.shape
+    blocks = (
+        (first, table.take(block) if block.dtype == np.uint16 else numbered(block))
+        for first, block in keys()
     )
+    source = hold_on_disk((rows, columns), dtype, blocks)
+    numbers = np.array([counts[key] for key in used.tolist()])
+    return DrawnClasses((rows, columns), source, used, numbers)
 
 
 def drawn_blocks(

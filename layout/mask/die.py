@@ -57,7 +57,7 @@ def add_die_frame(
     die = _outline(process, unit, radius_um)
     classes, lattices, windows = _tests(plan, process, unit, radius_um, die)
     crosses, mark_windows = marks.alignment_crosses(process, unit, die)
-    scales = marks.vernier_scales(process, unit, die)
+    scales, scale_openings = marks.vernier_scales(process, unit, die)
     letters, label_window = _label(process, unit, die, label)
     _refuse_overlaps(
         {
@@ -65,7 +65,7 @@ def add_die_frame(
             "WITNESS": windows[1:],
             "MARKS": mark_windows,
             "VERNIERS": [
-                marks.bounding_box(shape) for shape in (*scales.drawn, *scales.openings)
+                marks.bounding_box(shape) for shape in (*scales, *scale_openings)
             ],
             "LABEL": [label_window],
         },
@@ -77,16 +77,12 @@ def add_die_frame(
     openings += [
         unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)
     ]
-    openings += scales.openings
+    openings += scale_openings
     layers = process.layers
     figures = (
         FigureCell("APERTURE", {layers.aperture: tuple(openings)}),
         FigureCell("MARKS", {layers.marks: crosses}),
-        *(
-            [FigureCell("VERNIERS", {layers.marks: scales.drawn})]
-            if scales.drawn
-            else []
-        ),
+        *([FigureCell("VERNIERS", {layers.marks: scales})] if scales else []),
         FigureCell("LABEL", {layers.labels: letters}),
         FigureCell("OUTLINE", {layers.outline: (die.polygon,)}),
     )
@@ -94,12 +90,6 @@ def add_die_frame(
         classes=(*plan.classes, *classes),
         lattices=(*plan.lattices, *lattices),
         figures=(*plan.figures, *figures),
-        layer_names={**plan.layer_names, **_layer_names(process, classes)},
-        doses={
-            **plan.doses,
-            **{pillar.layer: pillar.dose for pillar in classes},
-            **_plain_doses(process),
-        },
     )
 
 
@@ -117,11 +107,7 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
         "APERTURE",
         {layer: (aperture_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
     )
-    return plan.replace(
-        figures=(*plan.figures, figure),
-        layer_names={**plan.layer_names, layer: "aperture"},
-        doses={**plan.doses, layer: 1.0},
-    )
+    return plan.replace(figures=(*plan.figures, figure))
 
 
 def add_wafer_mark(
@@ -144,11 +130,7 @@ def add_wafer_mark(
         _variant(pillar, "witness", layers.witness)
         for pillar in _spread(sizes, _ON_WAFER)
     ]
-    sites = _blocks(
-        np.arange(len(witnesses))[None] + len(plan.classes) + 1,
-        _BLOCK,
-        plan.lattices[0],
-    )
+    sites = _blocks(np.arange(len(witnesses))[None] + 1, _BLOCK, plan.lattices[0])
     middle = unit(mark_um / 4)
     lattice = _centred("WITNESS", sites, plan, middle)
     lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
@@ -160,18 +142,8 @@ def add_wafer_mark(
         FigureCell("APERTURE", {layers.aperture: (window,)}),
         FigureCell("MARKS", {layers.marks: marks.wafer_cross(unit, mark_um, width_um)}),
     )
-    names = {
-        layers.aperture: "aperture",
-        layers.marks: "marks",
-        layers.witness: "witness",
-    }
-    return plan.replace(
-        classes=(*plan.classes, *_same_length(witnesses, plan)),
-        lattices=(lattice,),
-        figures=figures,
-        layer_names=names,
-        doses={layers.aperture: 1.0, layers.marks: 1.0, layers.witness: 1.0},
-    )
+    classes = tuple(_named(witnesses, plan))
+    return plan.replace(classes=classes, lattices=(lattice,), figures=figures)
 
 
 def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
@@ -259,7 +231,8 @@ def _tests(
         ("WITNESS", witness_map, centre_x),
     ):
         lattice = _centred(name, sites, plan, x)
-        box = _extent(lattice)
+        reach = max(lattice.constant, lattice.down) // 2
+        box = MarkBox(*lattice.box).grown(reach)
         if (
             min(abs(box.left), abs(box.right)) < least_x
             or max(abs(box.left), abs(box.right)) > largest_x
@@ -275,7 +248,7 @@ def _tests(
             )
         lattices.append(lattice)
         windows.append(box.grown(unit(CLEAR_UM / 2)))
-    return _same_length([*doses, *witnesses], plan), lattices, windows
+    return _named([*doses, *witnesses], plan), lattices, windows
 
 
 def _refuse_overlaps(
@@ -331,14 +304,9 @@ def _variant(
     return dataclasses.replace(pillar, role=role, layer=layer, dose=dose, goal=dose)
 
 
-def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass]:
+def _named(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass]:
     """Classes with names as long as those of the lens: a letter and a running number."""
-    length = len(plan.classes[0].name)
-    digits = length - 1
-    if len(classes) >= 10**digits:
-        raise ProcessError(
-            f"{len(classes)} test classes, names of {length} characters; take fewer"
-        )
+    digits = len(plan.classes[0].name) - 1
     return [
         dataclasses.replace(pillar, name=f"{_LETTERS[pillar.role]}{number:0{digits}}")
         for number, pillar in enumerate(classes)
@@ -408,12 +376,6 @@ def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
     )
 
 
-def _extent(lattice: PillarArray) -> MarkBox:
-    """Box around a lattice, half a lattice constant beyond its outer sites."""
-    reach = max(lattice.constant, lattice.down) // 2
-    return MarkBox(*lattice.box).grown(reach)
-
-
 def _label(
     process: Process, unit: DatabaseUnits, die: MarkBox, default: str
 ) -> tuple[tuple[Array, ...], MarkBox]:
@@ -443,32 +405,7 @@ def _label(
         raise ProcessError(
             f"label {text!r} does not fit on the die; shorten die.label or raise die.margin_um"
         )
-    width = font.text_width(text, square)
+    width = (6 * len(text) - 1) * square
     x, y = -(width // 2) // unit.grid * unit.grid, die.bottom + inset
     box = MarkBox(x, y, x + width, y + 7 * square).grown(unit(CLEAR_UM / 2))
     return font.text_rectangles(text, x=x, y=y, square=square), box
-
-
-def _layer_names(
-    process: Process, classes: Sequence[PillarClass]
-) -> dict[tuple[int, int], str]:
-    """{layer: name} of the dose array and of all that is around the lens."""
-    layers = process.layers
-    dose_names = {
-        pillar.layer: f"dose_test_dose_{pillar.dose:.2f}"
-        for pillar in classes
-        if pillar.layer[0] == layers.dose[0]
-    }
-    return dose_names | {
-        layers.aperture: "aperture",
-        layers.marks: "marks",
-        layers.labels: "label",
-        layers.witness: "witness",
-        layers.outline: "outline",
-    }
-
-
-def _plain_doses(process: Process) -> dict[tuple[int, int], float]:
-    """Of the figures that are written, before any correction."""
-    layers = process.layers
-    return {layers.aperture: 1.0, layers.marks: 1.0, layers.labels: 1.0}

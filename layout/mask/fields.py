@@ -7,15 +7,16 @@ from typing import Literal
 import numpy as np
 
 from layout.mask.cells import DrawnClasses, quantise_diameters
-from layout.mask.plan import BLOCK_SITES, FigureCell, MaskPlan
+from layout.mask.plan import FigureCell, MaskPlan, row_blocks
 from layout.process.process import Process, WriteField
+from layout.shapes import rectilinear
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 from metalens.lens import DiameterMap
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class FieldPlan:
     """Fields of a lens, as blocks of lattice rows and columns.
 
@@ -59,14 +60,8 @@ class FieldPlan:
         """(x, y) sides of the largest field."""
         return float(np.diff(self.x_um).max()), float(np.diff(self.y_um).max())
 
-    def of(self, row: Array, column: Array) -> Array:
-        """Field of sites, counted along x first."""
-        across = np.searchsorted(self.columns, column, side="right") - 1
-        down = np.searchsorted(self.rows, row, side="right") - 1
-        return np.asarray(down * (len(self.columns) - 1) + across)
-
     def blocks(self) -> list[tuple[slice, slice]]:
-        """(rows, columns) of the sites of each field, in the order of :meth:`of`."""
+        """(rows, columns) of the sites of each field, counted along x first."""
         spans = [
             [
                 slice(*np.clip(pair, 0, count))
@@ -107,9 +102,8 @@ def split_write_fields(
         if pillar_classes is None
         else pillar_classes
     )
-    occupied_rows = np.zeros(classes.sites.shape[0], bool)
-    occupied_columns = np.zeros(classes.sites.shape[1], bool)
-    for first, block in classes.sites.blocks():
+    occupied_rows, occupied_columns = (np.zeros(n, bool) for n in classes.shape)
+    for first, block in row_blocks(classes.source, classes.shape):
         occupied_rows[first : first + len(block)] = block.any(1)
         occupied_columns |= block.any(0)
     rows = _edges(settings, occupied_rows, field_rows)
@@ -119,33 +113,21 @@ def split_write_fields(
     ) / 2  # below 0 where borders cut pillars
     counts = _counted(classes, rows, columns)
     return FieldPlan(
-        rows,
-        columns,
-        classes.sites.shape,
-        pitch,
-        settings.mode,
-        counts,
-        clearance,
-        row_pitch,
+        rows, columns, classes.shape, pitch, settings.mode, counts, clearance, row_pitch
     )
 
 
 def _counted(classes: DrawnClasses, rows: Array, columns: Array) -> Array:
     """(y fields, x fields) pillars in each field."""
-    down = np.clip(rows, 0, classes.sites.shape[0]).tolist()
-    across = np.clip(columns, 0, classes.sites.shape[1]).tolist()
-    step = max(1, BLOCK_SITES // max(1, classes.sites.shape[1]))
+    down, across = (
+        np.clip(edges, 0, count).tolist()
+        for edges, count in zip((rows, columns), classes.shape, strict=True)
+    )
     counts = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
     for field_row, (first, end) in enumerate(itertools.pairwise(down)):
-        column_counts = np.zeros(classes.sites.shape[1], np.int64)
-        for begin in range(first, end, step):
-            column_counts += np.count_nonzero(
-                classes.sites.source(begin, min(begin + step, end)), axis=0
-            )
-        counts[field_row] = [
-            column_counts[left:right].sum()
-            for left, right in itertools.pairwise(across)
-        ]
+        per_column = np.count_nonzero(classes.source(first, end), axis=0)
+        for column, (left, right) in enumerate(itertools.pairwise(across)):
+            counts[field_row, column] = per_column[left:right].sum()
     return counts
 
 
@@ -181,26 +163,18 @@ def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
     """
     lattice = plan.lattices[0]
 
-    def borders(sites: Array, last_site: int, step: int) -> list[int]:
-        return [
-            int(site) * step - step // 2
-            for site in np.unique(np.clip(sites, 0, last_site))
-        ]
+    bottom = lattice.y0 - (lattice.rows - 1) * lattice.down
 
-    xs = [
-        lattice.x0 + border
-        for border in borders(split.columns, lattice.columns, lattice.pitch)
-    ]
-    first_row = lattice.y0 - (lattice.rows - 1) * lattice.down
-    ys = [
-        first_row + border for border in borders(split.rows, lattice.rows, lattice.down)
-    ]
+    def borders(origin: int, sites: Array, last_site: int, step: int) -> list[int]:
+        lines = origin + np.unique(np.clip(sites, 0, last_site)) * step - step // 2
+        return [int(line) // plan.grid * plan.grid for line in lines]
+
+    xs = borders(lattice.x0, split.columns, lattice.columns, lattice.pitch)
+    ys = borders(bottom, split.rows, lattice.rows, lattice.down)
     boxes = tuple(
-        np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
-        // plan.grid
-        * plan.grid
-        for (left, right), (bottom, top) in itertools.product(
-            itertools.pairwise(xs), itertools.pairwise(ys)
+        rectilinear.box_corners(np.array([left, low, right, high]))
+        for (low, high), (left, right) in itertools.product(
+            itertools.pairwise(ys), itertools.pairwise(xs)
         )
     )
     layer = process.layers.fields

@@ -2,13 +2,14 @@
 boxes in boxes for its two steps.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from layout.mask import font
 from layout.mask.plan import MaskPlan
 from layout.process.process import Process
+from layout.shapes import rectilinear
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -18,10 +19,11 @@ _SHARE = 0.375  # of the pitch, width of a bar
 _BAR_UM, _LONG_UM = 12.0, 16.0  # length of a bar, of the middle one
 _INNER_UM, _OUTER_UM = 10.0, 20.0  # sides of the boxes
 _GAP_UM = 2.0  # from the film's edge to the bars of a vernier
+_QUARTER = np.array([[0, 1], [-1, 0]])  # turn, counter-clockwise
 _FINE = 5  # a fine cross has a fifth of the arms and of the width of a coarse one
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MarkBox:
     """A rectangle in database units."""
 
@@ -33,13 +35,8 @@ class MarkBox:
     @property
     def polygon(self) -> Array:
         """Its corners."""
-        return np.array(
-            [
-                [self.left, self.bottom],
-                [self.right, self.bottom],
-                [self.right, self.top],
-                [self.left, self.top],
-            ]
+        return rectilinear.box_corners(
+            np.array([self.left, self.bottom, self.right, self.top])
         )
 
     def grown(self, by: int) -> "MarkBox":
@@ -79,14 +76,6 @@ class DatabaseUnits:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class VernierScales:
-    """Verniers and boxes: drawn with the pillars, opened with the aperture."""
-
-    drawn: tuple[Array, ...]
-    openings: tuple[Array, ...]
-
-
 def alignment_crosses(
     process: Process, unit: DatabaseUnits, die: MarkBox
 ) -> tuple[tuple[Array, ...], list[MarkBox]]:
@@ -115,18 +104,11 @@ def alignment_crosses(
         fine_y = y - sign_y * (arm + unit(CLEAR_UM) + fine)
         for centre, reach, half in (((x, y), arm, width), ((x, fine_y), fine, thin)):
             shapes.append(cross_polygon(*centre, reach, half))
-            boxes.append(
-                MarkBox(
-                    centre[0] - reach,
-                    centre[1] - reach,
-                    centre[0] + reach,
-                    centre[1] + reach,
-                ).grown(unit(CLEAR_UM / 2))
-            )
-    square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
+            boxes.append(bounding_box(shapes[-1]).grown(unit(CLEAR_UM / 2)))
+    square = max(2, arm // 10 // unit.grid * 2) * unit.grid
     left = die.left + inset + arm + unit(CLEAR_UM)
     bottom = die.top - inset - arm
-    shapes.append(_letter_f(left, bottom, square))
+    shapes += font.text_rectangles("F", x=left, y=bottom, square=square)
     boxes.append(
         MarkBox(left, bottom, left + 5 * square, bottom + 7 * square).grown(
             unit(CLEAR_UM / 2)
@@ -139,22 +121,9 @@ def cross_polygon(x: int, y: int, arm: int, half: int) -> Array:
     """(12, 2) corners of a cross at (x, y): arms of length ``arm`` from its middle,
     twice ``half`` wide.
     """
-    w, a = half, arm
-    corners = [
-        (w, w),
-        (w, a),
-        (-w, a),
-        (-w, w),
-        (-a, w),
-        (-a, -w),
-        (-w, -w),
-        (-w, -a),
-        (w, -a),
-        (w, -w),
-        (a, -w),
-        (a, w),
-    ]
-    return np.add(corners, (x, y))
+    upper = np.array([(half, half), (half, arm), (-half, arm)])
+    quarters = [upper @ np.linalg.matrix_power(_QUARTER, k) for k in range(4)]
+    return np.asarray(np.concatenate(quarters) + np.array([x, y]))
 
 
 def wafer_cross(
@@ -173,10 +142,7 @@ def wafer_cross(
     inner = arm // _FINE // unit.grid * unit.grid * 2
     thin = _thin(half, unit)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
-    turn = np.array([[0, 1], [-1, 0]])
-    bars = [upright]
-    for _ in range(3):
-        bars.append(bars[-1] @ turn)
+    bars = [upright @ np.linalg.matrix_power(_QUARTER, k) for k in range(4)]
     return (*bars, cross_polygon(0, 0, inner // 2, thin))
 
 
@@ -187,8 +153,9 @@ def _thin(half: int, unit: DatabaseUnits) -> int:
 
 def vernier_scales(
     process: Process, unit: DatabaseUnits, die: MarkBox
-) -> VernierScales:
-    """Verniers along x and y and a box in a box, left of the upper right cross.
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Verniers along x and y and a box in a box, left of the upper right cross: drawn
+    with the pillars, and opened with the aperture.
 
     Args:
         process: pitch and step of the verniers, and whether there are any.
@@ -200,7 +167,7 @@ def vernier_scales(
             below the grid.
     """
     if not process.die.verniers:
-        return VernierScales((), ())
+        return (), ()
     pitch = unit(process.die.vernier_pitch_um)
     step = unit(process.die.vernier_step_nm * 1e-3)
     if step < unit.grid:
@@ -239,77 +206,38 @@ def vernier_scales(
             f"the die is too narrow for VERNIERS: {need_um:.0f} um are needed; raise die.margin_um or die.size_um, or set "
             "die.verniers = false"
         )
-    drawn = []
-    openings = []
-    for centre, is_vertical in ((horizontal, False), (vertical, True)):
+    drawn: list[Array] = []
+    openings: list[Array] = []
+    for centre, turn in ((horizontal, np.eye(2, dtype=int)), (vertical, _QUARTER)):
         bars, windows = _vernier(unit, pitch, step)
-        drawn += [_placed(bar, centre, is_vertical) for bar in bars]
-        openings += [_placed(bar, centre, is_vertical) for bar in windows]
-    x, y = box_centre
-    half_inner = unit(_INNER_UM / 2)
-    drawn.append(
-        MarkBox(x - half_inner, y - half_inner, x + half_inner, y + half_inner).polygon
-    )
-    openings.append(
-        MarkBox(x - half_outer, y - half_outer, x + half_outer, y + half_outer).polygon
-    )
-    return VernierScales(tuple(drawn), tuple(openings))
+        drawn += [bar @ turn + np.array(centre) for bar in bars]
+        openings += [bar @ turn + np.array(centre) for bar in windows]
+    for shapes, half in ((drawn, unit(_INNER_UM / 2)), (openings, half_outer)):
+        shapes.append(MarkBox(*box_centre, *box_centre).grown(half).polygon)
+    return tuple(drawn), tuple(openings)
 
 
 def _vernier(
     unit: DatabaseUnits, pitch: int, step: int
 ) -> tuple[list[Array], list[Array]]:
-    """Bars of a vernier about (0, 0), in database units.
+    """Bars of a vernier about (0, 0), in database units; the middle one is longer.
 
     The drawn bars, ``pitch`` apart, stand above the axis. The bars opened in the film,
-    ``pitch + step`` apart, are below it.
+    ``pitch + step`` apart, are below it. An upright scale has its drawn bars on the
+    left.
 
     Returns:
         Drawn bars; openings, the last of which is the window around the drawn bars.
     """
     half = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid)
     gap = unit(_GAP_UM)
-    drawn = [
-        MarkBox(x - half, gap, x + half, gap + long).polygon
-        for x, long in _bars(unit, pitch)
-    ]
-    openings = [
-        MarkBox(x - half, -gap - long, x + half, -gap).polygon
-        for x, long in _bars(unit, pitch + step)
-    ]
-    reach = BARS * pitch + pitch // 2
-    return drawn, [
-        *openings,
-        unit.snapped(MarkBox(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon,
-    ]
-
-
-def _bars(unit: DatabaseUnits, pitch: int) -> Iterator[tuple[int, int]]:
-    """(middle, length) of the bars, from the left."""
+    drawn = []
+    openings = []
     for n in range(-BARS, BARS + 1):
-        yield n * pitch, unit(_BAR_UM if n else _LONG_UM)
-
-
-def _placed(shape: Array, at: tuple[int, int], upright: bool) -> Array:
-    """A shape of a scale where the scale stands; the upright one runs upwards, drawn
-    bars on its left.
-    """
-    turned = shape @ np.array([[0, 1], [-1, 0]]) if upright else shape
-    return np.asarray(turned + at, np.int64)
-
-
-def _letter_f(x: int, y: int, s: int) -> Array:
-    """(10, 2) corners of an F, 5 by 7 squares of side s, from (x, y) up."""
-    corners = [
-        (0, 0),
-        (1, 0),
-        (1, 3),
-        (4, 3),
-        (4, 4),
-        (1, 4),
-        (1, 6),
-        (5, 6),
-        (5, 7),
-        (0, 7),
-    ]
-    return np.add(np.multiply(corners, s), (x, y))
+        end = gap + unit(_BAR_UM if n else _LONG_UM)
+        x, opened_x = n * pitch, n * (pitch + step)
+        drawn.append(MarkBox(x - half, gap, x + half, end).polygon)
+        openings.append(MarkBox(opened_x - half, -end, opened_x + half, -gap).polygon)
+    reach = BARS * pitch + pitch // 2
+    window = MarkBox(-reach, 0, reach, 2 * gap + unit(_LONG_UM))
+    return drawn, [*openings, unit.snapped(window).polygon]

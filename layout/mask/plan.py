@@ -13,6 +13,7 @@ import numpy as np
 from layout.process import names
 from layout.process.process import LayerNumber
 from layout.shapes import polygon
+from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -31,7 +32,23 @@ RowSource = Callable[
 ]  # (first row, end row) -> (rows, columns) class numbers
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+def row_blocks(
+    source: RowSource, shape: tuple[int, int], rows: int | None = None
+) -> Iterator[tuple[int, Array]]:
+    """(first row, class numbers) of blocks of rows.
+
+    Args:
+        source: of the class numbers.
+        shape: rows and columns.
+        rows: in a block; None: about a million sites.
+    """
+    size = rows or max(1, BLOCK_SITES // max(1, shape[1]))
+    for first in range(0, shape[0], size):
+        block = source(first, min(first + size, shape[0]))
+        yield first, np.ascontiguousarray(block)
+
+
+@dataclass(frozen=True, eq=False)
 class PillarClass:
     """All pillars of one diameter (and dose): one cell of the mask.
 
@@ -74,7 +91,7 @@ class PillarClass:
         return self.drawn or (self.outline,)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class PillarArray:
     """Pillars on a lattice, written as one cell.
 
@@ -84,7 +101,6 @@ class PillarArray:
     x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row *
         down.
     source: (first row, end row) to (rows, columns) class numbers, 0 for no pillar.
-    array: all class numbers, where they are in memory.
     row_pitch: from row to row, 0 for that of the columns.
     centred: every other site stays empty (a hexagonal lattice: the pitch is half its
         constant).
@@ -98,7 +114,6 @@ class PillarArray:
     x0: int
     y0: int
     source: RowSource
-    array: Array | None = None
     row_pitch: int = 0
     centred: bool = False
     unit_um: float = 1e-3
@@ -128,21 +143,9 @@ class PillarArray:
             pitch: database units.
             x0: of the first column.
             y0: of the first row.
-
-        Raises:
-            ProcessError: class numbers of another type.
         """
-        if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
-            raise ProcessError(
-                f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 "
-                "(rows, columns)"
-            )
-
-        def source(first: int, end: int) -> Array:
-            return classes[first:end]
-
         rows, columns = classes.shape
-        return cls(name, rows, columns, pitch, x0, y0, source, classes)
+        return cls(name, rows, columns, pitch, x0, y0, lambda a, b: classes[a:b])
 
     @property
     def down(self) -> int:
@@ -160,14 +163,11 @@ class PillarArray:
         Args:
             rows: in a block; None: about a million sites.
         """
-        size = rows or max(1, BLOCK_SITES // max(1, self.columns))
-        for first in range(0, self.rows, size):
-            block = self.source(first, min(first + size, self.rows))
-            yield first, np.ascontiguousarray(block)
+        yield from row_blocks(self.source, (self.rows, self.columns), rows)
 
     def whole(self) -> Array:
         """All class numbers (rows, columns)."""
-        return self.source(0, self.rows) if self.array is None else self.array
+        return self.source(0, self.rows)
 
     def counts(self, classes: int) -> Array:
         """(classes + 1,) sites of each class number.
@@ -223,7 +223,7 @@ class PillarArray:
         return (self.y0 - rows * self.down) * self.unit_um
 
     @property
-    def box(self) -> tuple[int, int, int, int]:
+    def box(self) -> IntBox:
         """Left, bottom, right, top of the sites, database units."""
         right = self.x0 + (self.columns - 1) * self.pitch
         return self.x0, self.y0 - (self.rows - 1) * self.down, right, self.y0
@@ -257,7 +257,7 @@ class PillarArray:
         return block[row, column], x, self.y0 - (first + row) * self.down
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class FigureCell:
     """A cell of fixed polygons, such as marks or the label.
 
@@ -277,7 +277,7 @@ class FigureCell:
                     )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class MaskPlan:
     """Everything that goes into a mask file.
 
@@ -344,14 +344,7 @@ class MaskPlan:
 
 
 def pillar_classes(
-    diameters: Array,
-    *,
-    layer: LayerNumber,
-    grid: int,
-    unit_nm: float,
-    vertices: int,
-    shape: str,
-    prefix: str = "D",
+    diameters: Array, *, layer: LayerNumber, grid: int, unit_nm: float, vertices: int
 ) -> tuple[PillarClass, ...]:
     """One class for each drawn diameter (database units, whole), thinnest first;
     equally long names.
@@ -362,18 +355,14 @@ def pillar_classes(
         grid: step of the coordinates, database units.
         unit_nm: database unit.
         vertices: of the polygons, at most.
-        shape: ``round`` or ``shot``.
-        prefix: first letter of the names.
     """
     digits = max((len(str(int(diameter))) for diameter in diameters), default=1)
     classes = []
     for diameter in diameters:
-        points = polygon.pillar_polygon(
-            int(diameter) / grid, vertices=vertices, shape=shape
-        )
+        points = polygon.pillar_polygon(int(diameter) / grid, vertices=vertices)
         classes.append(
             PillarClass(
-                f"{prefix}{int(diameter):0{digits}}",
+                f"D{int(diameter):0{digits}}",
                 float(diameter) * unit_nm,
                 int(diameter),
                 layer,

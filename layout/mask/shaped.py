@@ -2,21 +2,20 @@
 turn.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from layout.mask.cells import DrawnClasses, with_isolation
-from layout.mask.class_store import hold_on_disk
-from layout.mask.plan import MOST_CLASSES, PillarClass
+from layout.mask.cells import DrawnClasses, classify_keys, with_isolation
+from layout.mask.plan import PillarClass
 from layout.process.process import Process
 from layout.shapes import polygon, region
 from metalens.cell import Cell
 from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop, rotate_corners
 from metalens.core.arrays import Array
-from metalens.core.errors import LensError, ProcessError
+from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 from metalens.lens import DiameterMap, Lens
 from metalens.library.axes import cell_of_sizes
@@ -42,30 +41,14 @@ def shape_classes(
     diameters = source.diameters
     cell = source.cell
     turns = _turns(cell, diameters, process)
-    counts: dict[int, int] = {}
-    for _, block in _keys(diameters, process, turns):
-        for key, count in zip(*np.unique(block, return_counts=True), strict=True):
-            counts[int(key)] = counts.get(int(key), 0) + int(count)
-    used = np.array(sorted(key for key in counts if key), np.int64)
-    if not len(used):
-        raise LensError("empty lens: the map holds no pillar; check the aperture")
-    if len(used) > MOST_CLASSES:
-        raise ProcessError(
-            f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
-        )
-    dtype: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
-    sorted_keys = np.r_[0, used]
-    numbered = (
-        (first, np.searchsorted(sorted_keys, block).astype(dtype))
-        for first, block in _keys(diameters, process, turns)
+    drawn = classify_keys(diameters, lambda: _keys(diameters, process, turns))
+    classes = tuple(
+        _class(source, int(key), process, turns, unit_nm) for key in drawn.diameters_nm
     )
-    sites = hold_on_disk(diameters.diameter_um.shape, dtype, numbered)
-    classes = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
     widths_nm = np.array(
         [2 * float(np.hypot(*pillar.outline.T).max()) * unit_nm for pillar in classes]
     )
-    class_counts = np.array([counts[int(key)] for key in used])
-    return DrawnClasses(sites, widths_nm, class_counts), classes
+    return dataclasses.replace(drawn, diameters_nm=widths_nm), classes
 
 
 def _turns(cell: Cell, diameters: DiameterMap, process: Process) -> int:
@@ -229,9 +212,7 @@ def _gridded(
             raise ProcessError(
                 f"class {name}: a circle of {diameter_steps * step_nm:.3g} nm; need four steps of the grid"
             )
-        return polygon.pillar_polygon(
-            diameter_steps, vertices=process.rules.vertices, shape=process.rules.shape
-        )
+        return polygon.pillar_polygon(diameter_steps, vertices=process.rules.vertices)
     corners = (
         rotate_corners(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
     )

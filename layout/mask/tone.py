@@ -3,23 +3,25 @@ nothing else.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from layout.mask.plan import UNDRAWN, FigureCell, MaskPlan, PillarArray, PillarClass
-from layout.process.process import LayerNumber, Process
+from layout.process.process import Process
 from layout.shapes import rectilinear, region
+from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
-
-_WINDOW_UM = 5.0  # around marks and labels, on their own layer
 
 
 def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     """The mask that leaves standing what a plan draws: its gaps are drawn.
 
-    The layers of a second step (aperture) stay as they are.
+    Between the lattices, and up to the outline of the die (a lattice constant without
+    one), a frame on the layer of the pillars leaves out marks and labels. The layers of
+    a second step (aperture) stay as they are.
 
     Args:
         plan: of the standing pillars.
@@ -45,15 +47,33 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
         for lattice in plan.lattices
         for box in _empty(lattice, square[0], square[3])
     ]
-    figures = _surroundings(plan, process, boxes) or [
-        _rim(boxes, plan.lattices[0].constant, process)
+    layers = process.layers  # those that the exposure of the pillars does not see
+    others = {layers.aperture, layers.outline, layers.fields}
+    unexposed = [figure for figure in plan.figures if set(figure.polygons) <= others]
+    margin = plan.lattices[0].constant
+    outlines = [
+        f.polygons[process.layers.outline] for f in unexposed if f.name == "OUTLINE"
     ]
+    die = [*itertools.chain(*outlines)] or [
+        rectilinear.box_corners(
+            np.array([*(box.min(0) - margin), *(box.max(0) + margin)])
+        )
+        for box in boxes
+    ]
+    standing = [
+        shape
+        for figure in plan.figures
+        if figure.name not in UNDRAWN and figure not in unexposed
+        for shapes in figure.polygons.values()
+        for shape in shapes
+    ]
+    frame = region.without_holes(
+        region.subtract_contours(die, [*boxes, *standing]), grid=plan.grid
+    )
+    figures = [*unexposed, FigureCell("FRAME", {process.layers.pillar: tuple(frame)})]
     if clear:
         figures.append(FigureCell("CLEAR", {process.layers.pillar: tuple(clear)}))
-    unexposed = [
-        figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)
-    ]
-    return plan.replace(classes=classes, figures=(*unexposed, *figures), standing=plan)
+    return plan.replace(classes=classes, figures=tuple(figures), standing=plan)
 
 
 def lattice_box(lattice: PillarArray, grid: int) -> Array:
@@ -68,12 +88,7 @@ def lattice_box(lattice: PillarArray, grid: int) -> Array:
     return rectilinear.box_corners(np.add(lattice.box, _square(lattice, grid)))
 
 
-def _unexposed(process: Process) -> set[LayerNumber]:
-    """Layers that the exposure of the pillars does not see."""
-    return {process.layers.aperture, process.layers.outline, process.layers.fields}
-
-
-def _square(lattice: PillarArray, grid: int) -> tuple[int, int, int, int]:
+def _square(lattice: PillarArray, grid: int) -> IntBox:
     """Left, bottom, right, top of the lattice square about a site, on the grid; squares
     of neighbours abut.
     """
@@ -83,9 +98,7 @@ def _square(lattice: PillarArray, grid: int) -> tuple[int, int, int, int]:
     return left, bottom, left + lattice.constant, bottom + lattice.down
 
 
-def _around(
-    pillar: PillarClass, square: tuple[int, int, int, int], grid: int
-) -> PillarClass:
+def _around(pillar: PillarClass, square: IntBox, grid: int) -> PillarClass:
     """A pillar class that draws its lattice square without the pillar.
 
     Args:
@@ -136,85 +149,3 @@ def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
     y = lattice.y0 - runs[:, [3, 1]] * lattice.down + top_of
     boxes = np.column_stack([x[:, 0], y[:, 0], x[:, 1], y[:, 1]])
     return [rectilinear.box_corners(box) for box in boxes]
-
-
-def _surroundings(
-    plan: MaskPlan, process: Process, boxes: list[Array]
-) -> list[FigureCell]:
-    """Figures around the lattices of a negative tone: windows, and the die frame.
-
-    The window of a figure is a box 5 um wider than each of its shapes, without the
-    shapes, on the layer of the figure. The frame is the die without lattices, windows
-    and shapes.
-
-    Returns:
-        Figures; none where the plan has no outline of a die.
-    """
-    die = [
-        outline
-        for figure in plan.figures
-        if figure.name == "OUTLINE"
-        for outline in figure.polygons[process.layers.outline]
-    ]
-    if not die:
-        return []
-    margin = round(_WINDOW_UM * 1e3 / plan.unit_nm / plan.grid) * plan.grid
-    drawn = [
-        f
-        for f in plan.figures
-        if f.name not in UNDRAWN and not set(f.polygons) <= _unexposed(process)
-    ]
-    standing = [
-        shape
-        for figure in drawn
-        for shapes in figure.polygons.values()
-        for shape in shapes
-    ]
-    covered = list(boxes)
-    figures = []
-    for figure in drawn:
-        polygons = {}
-        for layer, shapes in figure.polygons.items():
-            window = region.overlap_contours(
-                region.subtract_contours(
-                    [_grown(shape, margin) for shape in shapes], covered
-                ),
-                die,
-            )
-            polygons[layer] = tuple(
-                region.without_holes(
-                    region.subtract_contours(window, standing), grid=plan.grid
-                )
-            )
-            covered += [_grown(shape, margin) for shape in shapes]
-        figures.append(FigureCell(figure.name, polygons))
-    frame = region.without_holes(
-        region.subtract_contours(die, [*covered, *standing]), grid=plan.grid
-    )
-    return [*figures, FigureCell("FRAME", {process.layers.pillar: tuple(frame)})]
-
-
-def _rim(boxes: list[Array], width: int, process: Process) -> FigureCell:
-    """A frame around lattices of their own, four rectangles each."""
-    shapes: list[Array] = []
-    for box in boxes:
-        (left, bottom), (right, top) = box.min(0).tolist(), box.max(0).tolist()
-        x0 = left - width
-        y0 = bottom - width
-        x1 = right + width
-        y1 = top + width
-        sides = (
-            (x0, y0, x1, bottom),
-            (x0, top, x1, y1),
-            (x0, bottom, left, top),
-            (right, bottom, x1, top),
-        )
-        shapes += [rectilinear.box_corners(np.array(side)) for side in sides]
-    return FigureCell("RIM", {process.layers.pillar: tuple(shapes)})
-
-
-def _grown(shape: Array, margin: int) -> Array:
-    """Box around a shape, wider by a margin on all sides."""
-    return rectilinear.box_corners(
-        np.array([*(shape.min(0) - margin), *(shape.max(0) + margin)])
-    )

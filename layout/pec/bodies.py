@@ -18,18 +18,17 @@ _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
 COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ExposureTable:
     """What each entry exposes at unit dose; entry 0 is no pillar.
 
-    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur. goal:
+    area_um2: (entries,), 0 for those that do not occur. goal:
     (entries,) exposure of the edge that is sought, over the threshold. own: (entries,)
     exposure at the edge by the pillar itself, less what the far field counts for it.
     slope: (entries,) fall of the exposure per um that the edges move out. count:
     (entries,) pillars of each.
     """
 
-    drawn: DrawnKinds
     area_um2: Array
     goal: Array
     own: Array
@@ -48,13 +47,14 @@ class ExposureTable:
         return np.divide(self.area_um2, self.own, out=none, where=self.used)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ScatterRanges:
     """The point exposure split by how far its Gaussians reach.
 
     far: at least six times as wide as the distance of neighbours, summed on nodes over
     the whole die. middle: reach neighbours only, summed on the sites of each lattice.
     near: reach no neighbour.
+    close: middle and near as they are, which are summed over the exact shapes.
 
     Widths of far and middle are widened by the mean pillar. A disc adds R^2 / 2 to the
     squared width of a Gaussian, and its edge, where the exposure is evaluated, R^2. Any
@@ -65,6 +65,7 @@ class ScatterRanges:
     far: PointExposure
     middle: PointExposure
     near: PointExposure
+    close: PointExposure
 
 
 def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
@@ -110,7 +111,10 @@ def split_ranges(
         )
 
     return ScatterRanges(
-        widened(far, wider), widened(middle, wider), widened(~far & ~middle, 0.0)
+        widened(far, wider),
+        widened(middle, wider),
+        widened(~far & ~middle, 0.0),
+        widened(~far, 0.0),
     )
 
 
@@ -172,7 +176,7 @@ def exposure_table(
             f"a pillar of {thin:.0f} nm gives its own edge an exposure of {own[used].min():.3f} only, less than its "
             "neighbours do: the core of the point exposure (alpha_um) is too wide for these pillars"
         )
-    return ExposureTable(kinds, area, goal, own, slope, number)
+    return ExposureTable(area, goal, own, slope, number)
 
 
 def _neighbour_bound(middle: PointExposure, body: PillarArray) -> float:

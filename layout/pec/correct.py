@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.build import check_layers
 from layout.mask.class_store import hold_on_disk
 from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarClass
 from layout.pec import bodies, psf
@@ -17,7 +16,7 @@ from layout.pec.marks import ExposedMarks, cut_marks
 from layout.pec.nodes import RadialConvolution, ScatterBackground, gaussian_convolution
 from layout.pec.pillar_exposure import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.psf import THRESHOLD, PointExposure
-from layout.process.process import ExposureSettings, LayerNumber, LayerTable
+from layout.process.process import ExposureSettings, LayerNumber
 from layout.shapes import rectilinear
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -30,16 +29,13 @@ NONE = 255  # dose class of a site without pillar
 
 
 def correct_plans(
-    plans: Sequence[MaskPlan],
-    exposure: ExposureSettings,
-    layers: LayerTable | None = None,
+    plans: Sequence[MaskPlan], exposure: ExposureSettings
 ) -> list[tuple[MaskPlan, "DoseLadder"]]:
     """Plans that are written in one job, with a dose for every shape.
 
     Args:
         plans: each with the lens, if any, as its first lattice.
         exposure: point exposure, tolerance and number of doses.
-        layers: whose numbers no dose may take; None: not checked.
 
     Returns:
         The dosed plans, every dose rounded to the nearest of one geometric series for
@@ -48,21 +44,17 @@ def correct_plans(
     Raises:
         ProcessError: a negative tone; no pillar; no or an unreadable point exposure;
             pillars finer than its core; a lens too large for a middle range of the
-            point exposure; datatypes of the doses that are layers of something else.
+            point exposure.
     """
     wanted = [solve_doses(plan, exposure) for plan in plans]
     ladder = dose_ladder([doses.spans(exposure) for doses in wanted], exposure)
-    dosed = [apply_dose_classes(doses, ladder) for doses in wanted]
-    for plan in dosed:
-        if layers is not None:
-            check_layers(plan, layers)
-    return [(plan, ladder) for plan in dosed]
+    return [(apply_dose_classes(doses, ladder), ladder) for doses in wanted]
 
 
 # doses
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class DoseLadder:
     """Doses of a job, in equal steps of the logarithm.
 
@@ -106,7 +98,7 @@ def dose_ladder(
     return DoseLadder(least * span ** ((np.arange(count) + 0.5) / count), needed)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class WantedDoses:
     """Doses that give every edge of a plan its exposure, before they are rounded.
 
@@ -167,31 +159,26 @@ class WantedDoses:
         """
         table = self.table
         tolerance = settings.tolerance
-        least = np.inf
-        largest = 0.0
-        finest = 0.0
-
-        def update(dose: Array, ratio: Array) -> None:
-            nonlocal least, largest, finest
-            least = min(least, float(dose.min(initial=np.inf)))
-            largest = max(largest, float(dose.max(initial=0.0)))
-            finest = max(finest, float(ratio.max(initial=0.0)))
-
+        ends = []
         for number, lattice in enumerate(self.lattices):
             for first, block in lattice.blocks():
                 kind = block[block > 0]
-                dose = self.of_pillars(number, first, block)[block > 0]
-                goal = THRESHOLD * table.goal[kind]
-                allowed_per_dose = _SOFTEST_UM * table.slope[kind] / 2 / goal
-                ratio = dose * table.own[kind] / goal
-                update(dose, ratio / np.minimum(tolerance, allowed_per_dose * dose))
-        point = (
-            self.ranges.near if len(self.ranges.near.widths_um) else self.ranges.middle
-        )
+                if len(kind):
+                    dose = self.of_pillars(number, first, block)[block > 0]
+                    goal = THRESHOLD * table.goal[kind]
+                    allowed_per_dose = _SOFTEST_UM * table.slope[kind] / 2 / goal
+                    allowed = np.minimum(tolerance, allowed_per_dose * dose)
+                    ratio = dose * table.own[kind] / goal / allowed
+                    ends.append((dose.min(), dose.max(), ratio.max()))
         dose = self.marks.doses(self.background.far)
-        allowed_change = np.minimum(tolerance, straight_edge_error(point) * dose)
-        update(dose, dose * self.marks.own / THRESHOLD / allowed_change)
-        return least, largest, finest
+        if len(dose):
+            near, middle = self.ranges.near, self.ranges.middle
+            point = near if len(near.widths_um) else middle
+            allowed = np.minimum(tolerance, straight_edge_error(point) * dose)
+            ratio = dose * self.marks.own / THRESHOLD / allowed
+            ends.append((dose.min(), dose.max(), ratio.max()))
+        least, largest, finest = np.array(ends).T
+        return float(least.min()), float(largest.max()), float(finest.max())
 
 
 def straight_edge_error(point: PointExposure) -> float:
@@ -235,10 +222,8 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
     table = bodies.exposure_table(
         kinds, goal, counts, point=point, ranges=ranges, body=densest
     )
-    is_close = point.widths_um < bodies.COARSE * densest.nearest_um
-    close = PointExposure(point.widths_um[is_close], point.weights[is_close])
     tolerance = min(exposure.tolerance, straight_edge_error(point))
-    marks = cut_marks(plan, lattices, kinds.area_um2, close, ranges.far, tolerance)
+    marks = cut_marks(plan, lattices, kinds.area_um2, ranges, tolerance)
     background = _backgrounds(lattices, table, ranges, marks)
     return WantedDoses(plan, lattices, table, ranges, background, marks)
 
@@ -392,7 +377,7 @@ def apply_dose_classes(doses: WantedDoses, ladder: DoseLadder) -> MaskPlan:
         ladder: of all that is written in one job.
     """
     plan = doses.plan
-    classes, lookup, names = _classes(doses, ladder)
+    classes, lookup = _classes(doses, ladder)
     lattices = tuple(
         _redrawn(doses, ladder, number, lookup) for number in range(len(plan.lattices))
     )
@@ -409,21 +394,18 @@ def apply_dose_classes(doses: WantedDoses, ladder: DoseLadder) -> MaskPlan:
     )
     kinds: dict[int, str] = {}
     for (number, _), name in plan.layer_names.items():
-        kinds.setdefault(number, name)
+        kinds.setdefault(number, name.partition("_dose_")[0])
+    dosed = {pillar.layer: pillar.dose for pillar in classes} | mark_doses
     titles = {
         layer: layer_title(kinds.get(layer[0], "shape"), dose)
-        for layer, dose in mark_doses.items()
+        for layer, dose in dosed.items()
     }
     return plan.replace(
         classes=classes,
         lattices=lattices,
         figures=figures,
-        doses={
-            **other_doses,
-            **{pillar.layer: pillar.dose for pillar in classes},
-            **mark_doses,
-        },
-        layer_names={**other_names, **names, **titles},
+        doses=other_doses | dosed,
+        layer_names=other_names | titles,
     )
 
 
@@ -439,7 +421,7 @@ def layer_title(kind: str, level: float) -> str:
 
 def _classes(
     doses: WantedDoses, ladder: DoseLadder
-) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
+) -> tuple[tuple[PillarClass, ...], Array]:
     """Split each pillar class by the dose classes that its pillars need.
 
     Args:
@@ -447,8 +429,8 @@ def _classes(
         ladder: of all that is written in one job.
 
     Returns:
-        New classes of one outline and dose each, (old class, dose class) -> number of
-        the new class, and names of their layers.
+        New classes of one outline and dose each, the datatype raised by the dose class,
+        and (old class, dose class) -> number of the new class.
     """
     plan = doses.plan
     occurs = np.zeros((len(plan.classes) + 1, NONE + 1), bool)
@@ -457,25 +439,20 @@ def _classes(
             occurs[block, doses.classes(number, first, block, ladder)] = True
     used = np.argwhere(occurs[:, :NONE])
     bases: dict[str, LayerNumber] = {}
-    datatypes: dict[str, set[int]] = {}
     for pillar in plan.classes:
         bases[pillar.role] = min(pillar.layer, bases.get(pillar.role, pillar.layer))
-    for k, j in used.tolist():
-        datatypes.setdefault(plan.classes[k - 1].role, set()).add(j)
     lookup = np.zeros(occurs.shape, np.uint8 if len(used) <= 255 else np.uint16)
     classes = []
-    names = {}
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
         old = plan.classes[k - 1]
-        role = old.role
-        dose = float(ladder.factors[j])
-        layer = (bases[role][0], bases[role][1] + sorted(datatypes[role]).index(j))
-        names[layer] = layer_title({"dose": "dose_test"}.get(role, role), dose)
+        base, datatype = bases[old.role]
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
+        dose = float(ladder.factors[j])
+        layer = base, datatype + j
         classes.append(dataclasses.replace(old, name=name, layer=layer, dose=dose))
         lookup[k, j] = n
-    return tuple(classes), lookup, names
+    return tuple(classes), lookup
 
 
 def _redrawn(
@@ -496,7 +473,7 @@ def _redrawn(
             yield first, lookup[block, doses.classes(number, first, block, ladder)]
 
     sites = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
-    return sites.within(lattice)
+    return dataclasses.replace(lattice, source=sites)
 
 
 def _figures(
@@ -514,17 +491,6 @@ def _figures(
     plan = wanted_doses.plan
     marks = wanted_doses.marks
     level = ladder.nearest(marks.doses(wanted_doses.background.far))
-    rows = np.column_stack([marks.figure, level, marks.boxes[:, [1, 3]]])
-    order = np.lexsort((marks.boxes[:, 0], *rows.T))
-    rows, boxes = rows[order], marks.boxes[order]
-    follows = boxes[1:, 0] == boxes[:-1, 2]  # in a row, of equal dose
-    is_first = np.r_[True, ~(follows & (rows[1:] == rows[:-1]).all(1))]
-    first = np.flatnonzero(is_first[: len(rows)])
-    last = np.r_[first[1:], len(rows)][: len(first)] - 1
-    joined = np.hstack([boxes[first, :2], boxes[last, 2:]])
-    figure_of_box, level = rows[first, :2], rows[first, 2]
-    layer_numbers = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
-    layer_of_box = np.array([layer_numbers[f][k] for f, k in figure_of_box.tolist()])
     doses: dict[LayerNumber, float] = {}
     figures = list(plan.figures)
     for figure_number, figure in enumerate(plan.figures):
@@ -532,16 +498,11 @@ def _figures(
             continue
         shapes: dict[LayerNumber, tuple[Array, ...]] = {}
         for layer_index, layer in enumerate(figure.polygons):
-            in_layer = (figure_of_box == (figure_number, layer_index)).all(1)
-            for offset, dose_class in enumerate(
-                np.unique(level[layer_of_box == layer[0]]).tolist()
-            ):
-                boxes = joined[in_layer & (level == dose_class)]
-                if len(boxes):
-                    dosed_layer = (layer[0], layer[1] + offset)
-                    shapes[dosed_layer] = tuple(
-                        rectilinear.box_corners(box) for box in boxes
-                    )
-                    doses[dosed_layer] = float(ladder.factors[dose_class])
+            in_layer = (marks.figure == (figure_number, layer_index)).all(1)
+            for dose_class in np.unique(level[in_layer]).tolist():
+                boxes = marks.boxes[in_layer & (level == dose_class)]
+                dosed_layer = (layer[0], layer[1] + dose_class)
+                shapes[dosed_layer] = tuple(map(rectilinear.box_corners, boxes))
+                doses[dosed_layer] = float(ladder.factors[dose_class])
         figures[figure_number] = dataclasses.replace(figure, polygons=shapes)
     return tuple(figures), doses

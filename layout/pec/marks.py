@@ -2,12 +2,14 @@
 along their edges.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from layout.mask.plan import EXPOSED, MaskPlan, PillarArray
+from layout.pec.bodies import ScatterRanges
 from layout.pec.nodes import NodeGrid
 from layout.pec.polygon_edges import ExposedPolygons, exposure_at_edges, sample_edges
 from layout.pec.psf import THRESHOLD, PointExposure
@@ -23,7 +25,7 @@ CHANGE = 0.4
 _INWARD = 0.1  # grid steps, from an edge to a place in the cell that it bounds
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ExposedMarks:
     """Marks and labels in pieces of one dose each, as masses on the nodes of a die.
 
@@ -32,8 +34,8 @@ class ExposedMarks:
     figure: (pieces, 2) number of the figure, and of the layer in it.
     own: (pieces,) exposure of the edges by the close Gaussians of all marks of dose 1.
     points: (n, 2) points on the edges, um; piece: (n,) piece of each.
-    spots: (m, 2) points that represent the pieces on the nodes, um, their areas (m,) in
-        um^2, and the piece of each (m,).
+    middles, areas: (pieces, 2) um and (pieces,) um^2, which represent the pieces on the
+        nodes.
     """
 
     grid: NodeGrid
@@ -42,12 +44,13 @@ class ExposedMarks:
     own: Array
     points: Array
     piece: Array
-    spots: tuple[Array, Array, Array]
+    middles: Array
+    areas: Array
 
     def deposited(self, dose: Array) -> Array:
         """(y, x) masses of doses (pieces,)."""
-        points, area, piece = self.spots
-        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
+        x, y = self.middles.T
+        return self.grid.deposit(x, y, self.areas * dose)
 
     def doses(self, field: Array) -> Array:
         """(pieces,) doses that give the edges their exposure on a background.
@@ -72,8 +75,7 @@ def cut_marks(
     plan: MaskPlan,
     lattices: Sequence[PillarArray],
     area_um2: Array,
-    close: PointExposure,
-    far: PointExposure,
+    ranges: ScatterRanges,
     tolerance: float,
 ) -> ExposedMarks:
     """Cut the exposed figures of a plan into pieces of one dose each.
@@ -86,14 +88,14 @@ def cut_marks(
         plan: with marks and labels of horizontal and vertical edges.
         lattices: of pillars, in um.
         area_um2: (classes + 1,) of the pillars.
-        close: Gaussians that are summed over the shapes.
-        far: Gaussians that are summed on nodes.
+        ranges: Gaussians that are summed over the shapes, and those on nodes.
         tolerance: relative, of the exposure.
 
     Raises:
         ProcessError: more than 500 000 cells, or a slanted edge.
     """
     step_um = plan.grid * plan.unit_nm * nm
+    close, far = ranges.close, ranges.far
     narrowest_um = float(far.widths_um.min(initial=1e3))
     drawn = [
         ((number, layer), polygon)
@@ -136,21 +138,43 @@ def cut_marks(
         cells, cell_of_sample, inside, background, CHANGE * tolerance * THRESHOLD
     )
 
-    middles, areas = _middles(cells, step_um)
-    count = len(cells)
-    own = np.full(count, close.weights.sum() / 2)  # as an edge through its middle has
-    bounding = np.unique(cell_of_sample)
-    exposure = exposure_at_edges(samples.at_um, marks, close.terms)
-    own[bounding] = mean_by_piece(exposure, cell_of_sample, count)[bounding]
-    inner = np.setdiff1d(np.arange(count), bounding)
+    exposed = expose_pieces(
+        grid, *_middles(cells, step_um), (samples.at_um, cell_of_sample), marks, close
+    )
+    boxes = cells * plan.grid
+    figure = np.array(figures, int).reshape(-1, 2)[figure_of_box[box[parent]]]
+    return dataclasses.replace(exposed, boxes=boxes, figure=figure)
+
+
+def expose_pieces(
+    grid: NodeGrid,
+    middles: Array,
+    areas: Array,
+    edges: tuple[Array, Array],
+    shapes: ExposedPolygons,
+    close: PointExposure,
+) -> ExposedMarks:
+    """Pieces with what their edges receive; one without points on an edge receives as
+    an edge through its middle.
+
+    Args:
+        grid: nodes.
+        middles: (pieces, 2) um.
+        areas: (pieces,) um^2.
+        edges: (n, 2) points on the edges, um, and (n,) piece of each.
+        shapes: all, at dose 1.
+        close: Gaussians that are summed over the shapes.
+    """
+    at_edges, piece_of_point = edges
+    count = len(areas)
+    exposure = exposure_at_edges(at_edges, shapes, close.terms)
+    own = mean_by_piece(exposure, piece_of_point, count)
+    inner = np.setdiff1d(np.arange(count), piece_of_point)
+    own[inner] = close.weights.sum() / 2
+    points = np.concatenate([at_edges, middles[inner]])
+    none = np.empty((0, 4), np.int64)
     return ExposedMarks(
-        grid,
-        cells * plan.grid,
-        np.array(figures, int).reshape(-1, 2)[figure_of_box[box[parent]]],
-        own,
-        np.concatenate([samples.at_um, middles[inner]]),
-        np.r_[cell_of_sample, inner],
-        (middles, areas, np.arange(count)),
+        grid, none, none, own, points, np.r_[piece_of_point, inner], middles, areas
     )
 
 

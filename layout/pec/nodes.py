@@ -17,7 +17,7 @@ MOST_NODES = 40_000_000
 _PER_WIDTH = 6  # nodes along the 1/e radius of the narrowest Gaussian
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class NodeAxis:
     """Nodes at ``origin_um + k spacing_um``, k from 0 to ``count - 1``."""
 
@@ -46,7 +46,7 @@ class NodeAxis:
         return first, np.stack([*inner, *outer], -1)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class NodeGrid:
     """Nodes of a die."""
 
@@ -163,7 +163,7 @@ def _gather(
                     out[f, yn[row] + i, node] += yw[row, i] * line[f, node]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ScatterBackground:
     """Exposure of a die by all that scatters far.
 
@@ -225,7 +225,7 @@ def _interpolate(
             out[row, column] = total
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class RadialConvolution:
     """Convolution with a radial kernel on a grid of nodes, zero outside, by FFT.
 

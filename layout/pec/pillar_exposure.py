@@ -217,7 +217,7 @@ def _level(
     margin = min(2 * narrowest, size)
     x, y = (
         np.arange(low - margin, high + margin + pixel, pixel)
-        for low, high in zip(*_box(corners), strict=True)
+        for low, high in zip(corners.min(0), corners.max(0), strict=True)
     )
     line_y, weight, crossing_x = _lines(contours, narrowest)
     image = np.zeros((len(y), len(x)))
@@ -276,11 +276,6 @@ def _above(image: Array, slope_y: Array, slope_x: Array, level: float) -> float:
                 share = overlap**2 / (2 * larger * smaller)
             total += 1 - share if excess > 0 else share
     return total
-
-
-def _box(corners: Array) -> tuple[Array, Array]:
-    """(2,) lowest and (2,) highest x and y."""
-    return corners.min(0), corners.max(0)
 
 
 def _erf(x: Array) -> Array:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.shapes import region
+from layout.shapes import polygon, region
+from layout.shapes.moments import polygon_moments
 from metalens.core.arrays import Array
 from metalens.core.units import nm
 
@@ -15,7 +16,7 @@ _FAR = 5.0  # ranges at which a polygon no longer counts: exp(-25)
 ACROSS_UM = 4 * nm  # for the slope across an edge
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ExposedPolygons:
     """Shapes that are no pillars: corners (counter-clockwise, um), relative doses and
     layer numbers, one each.
@@ -26,7 +27,7 @@ class ExposedPolygons:
     layer: Array
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class EdgeSamples:
     """Points on the outer edges of shapes: (n, 2) places, (n, 2) outward normals, (n,)
     layer numbers.
@@ -62,38 +63,21 @@ def sample_edges(
             np.rint(corners / unit_um) for corners, other in drawn if other == layer
         ]
         for contour in region.union_contours(outlines):
-            corners = contour[_turns(contour)]
-            start, end = corners * unit_um, np.roll(corners, -1, axis=0) * unit_um
-            for corner, next_corner in zip(start, end, strict=True):
-                length = float(np.hypot(*(next_corner - corner)))
-                straight = length - 4 * range_um  # corners round off within two ranges
-                if straight <= 0:
-                    continue
-                count = max(1, int(straight / step_um))
-                fraction = (
-                    2 * range_um + (np.arange(count) + 0.5) / count * straight
-                ) / length
-                positions.append(corner + fraction[:, None] * (next_corner - corner))
-                normals.append(
-                    np.tile(
-                        [
-                            (next_corner - corner)[1] / length,
-                            -(next_corner - corner)[0] / length,
-                        ],
-                        (count, 1),
-                    )
-                )
-                layers.append(np.full(count, layer))
+            start = contour[polygon.corner_turns(contour) != 0] * unit_um
+            edge = np.roll(start, -1, axis=0) - start
+            length = np.hypot(*edge.T)
+            straight = length - 4 * range_um  # corners round off within two ranges
+            counts = np.maximum((straight / step_um).astype(int), straight > 0)
+            number = np.repeat(np.arange(len(start)), counts)
+            place = np.arange(len(number)) - (np.cumsum(counts) - counts)[number]
+            inner = (place + 0.5) / counts[number] * straight[number]
+            along = (2 * range_um + inner) / length[number]
+            positions.append(start[number] + along[:, None] * edge[number])
+            normals.append((edge[:, ::-1] * (1, -1) / length[:, None])[number])
+            layers.append(np.full(len(number), layer))
     return EdgeSamples(
         np.concatenate(positions), np.concatenate(normals), np.concatenate(layers)
     )
-
-
-def _turns(contour: Array) -> Array:
-    """(n,) which points are corners, not on the way between two others."""
-    step_in = contour - np.roll(contour, 1, axis=0)
-    step_out = np.roll(contour, -1, axis=0) - contour
-    return np.asarray(step_in[:, 0] * step_out[:, 1] != step_in[:, 1] * step_out[:, 0])
 
 
 def exposure_at_edges(
@@ -220,25 +204,13 @@ def equivalent_spots(
     """
     parts: list[Array] = [np.empty((0, 3))]
     for corners, dose in zip(polygons.corners, polygons.dose.tolist(), strict=True):
-        next_corners = np.roll(corners, -1, axis=0)
-        mass = (
-            dose
-            * float(
-                (
-                    corners[:, 0] * next_corners[:, 1]
-                    - next_corners[:, 0] * corners[:, 1]
-                ).sum()
-            )
-            / 2
-        )
+        area, first, _ = polygon_moments([corners])
         low, high = corners.min(0), corners.max(0)
-        is_small = bool((high - low).max() <= step_um)
-        points = (
-            corners.mean(0)[None] if is_small else _inside(corners, low, high, step_um)
-        )
-        parts.append(
-            np.column_stack([points, np.full(len(points), mass / len(points))])
-        )
+        points = (first / area)[None]
+        if (high - low).max() > step_um:
+            points = _inside(corners, low, high, step_um)
+        mass = np.full(len(points), dose * area / len(points))
+        parts.append(np.column_stack([points, mass]))
     spots = np.concatenate(parts)
     return spots[:, 0], spots[:, 1], spots[:, 2]
 

@@ -14,7 +14,7 @@ from metalens.fabrication import read_csv
 THRESHOLD = 0.5  # exposure at the edge of a wide area of dose 1
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class PointExposure:
     """f(r) = sum weights exp(-r^2 / widths^2) / (pi widths^2).
 
@@ -61,14 +61,12 @@ def point_exposure(exposure: ExposureSettings) -> PointExposure:
         raise ProcessError(
             f"no point exposure is given: [exposure] needs {exposure.missing}"
         )
-    third = (
-        ([], []) if exposure.gamma_um is None else ([exposure.gamma_um], [exposure.nu])
-    )
-    weights = np.array([1.0, exposure.eta, *third[1]])
-    return PointExposure(
-        np.array([exposure.alpha_um, exposure.beta_um, *third[0]]),
-        weights / weights.sum(),
-    )
+    widths = [exposure.alpha_um, exposure.beta_um]
+    weights = [1.0, exposure.eta]
+    if exposure.gamma_um is not None:
+        widths.append(exposure.gamma_um)
+        weights.append(exposure.nu)
+    return PointExposure(np.array(widths), np.array(weights) / sum(weights))
 
 
 def fit_point_spread(

@@ -15,14 +15,13 @@ from layout.pec.correct import (
     solve_background,
     straight_edge_error,
 )
-from layout.pec.marks import CHANGE, MOST_CELLS, ExposedMarks, mean_by_piece
+from layout.pec.marks import CHANGE, MOST_CELLS, expose_pieces
 from layout.pec.nodes import NodeGrid
 from layout.pec.polygon_edges import (
     EdgeSamples,
     ExposedPolygons,
     enclosed_points,
     equivalent_spots,
-    exposure_at_edges,
     sample_edges,
 )
 from layout.pec.psf import THRESHOLD, PointExposure
@@ -105,30 +104,16 @@ def _correct_polygons(
                 edge = points_along_edges(own)
             pieces.append(piece)
             points.append(edge)
-    count = len(pieces)
-    piece_of_point = np.repeat(np.arange(count), list(map(len, points)))
+    piece_of_point = np.repeat(np.arange(len(pieces)), list(map(len, points)))
     at = np.concatenate(points)
     moments = [polygon_moments([c * unit for c in piece])[:2] for piece in pieces]
     area = np.array([each for each, _ in moments])
     middle = np.array([first / each for each, first in moments])
-    own_exposure = np.full(count, near.weights.sum() / 2)
-    bounding = np.unique(piece_of_point)
-    by_near = exposure_at_edges(at, shapes, near.terms)
-    own_exposure[bounding] = mean_by_piece(by_near, piece_of_point, count)[bounding]
-    inner = np.setdiff1d(np.arange(count), bounding)
-    marks = ExposedMarks(
-        grid,
-        np.empty((0, 4)),
-        np.empty((0, 2)),
-        own_exposure,
-        np.concatenate([at, middle[inner]]),
-        np.r_[piece_of_point, inner],
-        (middle, area, np.arange(count)),
-    )
+    marks = expose_pieces(grid, middle, area, (at, piece_of_point), shapes, near)
     none = np.zeros(grid.shape)
     dose = marks.doses(solve_background(grid.convolution(far), none, none, marks=marks))
     change = np.minimum(exposure.tolerance, straight_edge_error(near) * dose)
-    finest = float((dose * own_exposure / THRESHOLD / change).max())
+    finest = float((dose * marks.own / THRESHOLD / change).max())
     ladder = dose_ladder([(float(dose.min()), float(dose.max()), finest)], exposure)
     polygons: dict[LayerNumber, list[Array]] = {}
     doses: dict[LayerNumber, float] = {}

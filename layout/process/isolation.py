@@ -42,7 +42,11 @@ def isolation_map(
         np.exp(-((np.arange(-n, n + 1) * step / range_um) ** 2)).astype(np.float32)
         for n, step in ((isolation_halo(step, range_um), step) for step in steps_um)
     )
-    total = _full(along_x, along_y, centred)
+    weights = np.outer(along_y, along_x)
+    if centred:  # a neighbour is an even number of rows and columns away
+        away = np.add.outer(*(np.arange(n) - n // 2 for n in weights.shape))
+        weights = weights[away % 2 == 0]
+    total = float(weights.sum(dtype=float)) - 1
     if total < _LEAST:
         raise ProcessError(
             f"bias.range_um = {range_um:g}: neighbours on steps of {steps_um[0]:.4g} and {steps_um[1]:.4g} um do not "
@@ -63,24 +67,3 @@ def isolation_halo(step_um: float, range_um: float) -> int:
         range_um: of the bias of isolated pillars.
     """
     return max(1, int(np.ceil(3 * range_um / step_um)))
-
-
-def _full(along_x: Array, along_y: Array, centred: bool) -> float:
-    """Sum of the weights of all neighbours of a site.
-
-    On a centred lattice only places whose row and column are both odd or both even
-    count: (sum + alternating sum) / 2. The site itself is left out.
-
-    Args:
-        along_x: weights of the columns about the site.
-        along_y: weights of the rows about the site.
-        centred: whether every other place alone is a site.
-    """
-    all_places = float(along_x.sum()) * float(along_y.sum())
-    if not centred:
-        return all_places - 1
-    x, y = (
-        float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2)
-        for w in (along_x, along_y)
-    )
-    return float((all_places + x * y) / 2 - 1)

@@ -35,21 +35,14 @@ def printable_limits(
     rules = process.rules
     pitch_nm = pitch_um / nm
     smallest_nm = max(4 * rules.grid_nm, rules.diameter_step_nm)
-    sizes_nm = np.arange(
-        smallest_nm,
-        min(pitch_nm, smallest_nm + _MOST_STEPS * rules.diameter_step_nm),
-        1,
-    )
-    drawn_nm = np.unique(
-        -(-sizes_nm // rules.diameter_step_nm) * rules.diameter_step_nm
-    )
+    step = rules.diameter_step_nm
+    first = -(-smallest_nm // step)
+    drawn_nm = np.arange(first, min(first + _MOST_STEPS, pitch_nm / step)) * step
     drawn_nm = drawn_nm[
         (drawn_nm >= 0.5 * rules.minimum_feature_nm) & (drawn_nm < pitch_nm)
     ]
     shapes = [
-        polygon.pillar_polygon(
-            float(diameter) / rules.grid_nm, vertices=rules.vertices, shape=rules.shape
-        )
+        polygon.pillar_polygon(float(diameter) / rules.grid_nm, vertices=rules.vertices)
         for diameter in drawn_nm
     ]
     half_width_nm = np.array([points[:, 0].max() for points in shapes]) * rules.grid_nm
@@ -74,7 +67,6 @@ def printable_limits(
             f"{path}: no pillar keeps {rules.minimum_feature_nm:g} nm and leaves {rules.minimum_gap_nm:g} nm on a "
             f"pitch of {pitch_nm:.4g} nm; widen the pitch or change the process"
         )
-    step = rules.diameter_step_nm
     isolated_nm = process.bias.isolated_nm
     low = float(
         process.made_diameter_nm(drawn_nm[is_printable][0] - 0.45 * step)

@@ -17,25 +17,7 @@ from metalens.fabrication import Bias, Spread, with_table
 LayerNumber = tuple[int, int]  # layer, datatype
 
 
-@dataclass(frozen=True, slots=True)
-class KeepOutZone:
-    """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand.
-
-    x_um, y_um: lower left corner. width_um, height_um: of the rectangle. name: in the
-    report.
-    """
-
-    x_um: float = field(metadata={"signed": True})
-    y_um: float = field(metadata={"signed": True})
-    width_um: float
-    height_um: float
-    name: str = "zone"
-
-    def __post_init__(self) -> None:
-        _positive(self, "width_um", "height_um")
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DesignRules:
     """What can be printed, and on which grid.
 
@@ -48,12 +30,10 @@ class DesignRules:
     pillars each.
     angle_step_deg: step of the turns of pillars that are turned one by one, a divisor
     of 180: one class each.
-    vertices: of a pillar polygon, 8 to 64, a multiple of 4.
-    shape: ``round``: equal-area polygon of ``vertices``; ``shot``: only horizontal,
+    vertices: of a pillar polygon, 8 to 64, a multiple of 4; 8: only horizontal,
     vertical and diagonal edges.
     maximum_density, density_window_um: share of the area that pillars may cover in any
     window of that size.
-    exclusion: zones without pillars.
     """
 
     minimum_feature_nm: float = 80.0
@@ -63,14 +43,12 @@ class DesignRules:
     diameter_step_nm: int = 2
     angle_step_deg: float = 1.0
     vertices: int = 32
-    shape: Literal["round", "shot"] = "round"
     maximum_density: float = 0.75
     density_window_um: float = 20.0
-    exclusion: tuple[KeepOutZone, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse values out of range, and steps that do not divide each other."""
-        _positive(
+        check_positive(
             self,
             "minimum_feature_nm",
             "minimum_gap_nm",
@@ -98,7 +76,7 @@ class DesignRules:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LayerTable:
     """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array.
 
@@ -116,22 +94,25 @@ class LayerTable:
     outline: LayerNumber = (10, 0)
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond 16 bits, and numbers used twice."""
-        name_of_layer: dict[LayerNumber, str] = {}
+        """Refuse numbers beyond 16 bits, and layer numbers used twice: their datatypes
+        are doses.
+        """
+        name_of_layer: dict[int, str] = {}
         for entry in dataclasses.fields(self):
             number = getattr(self, entry.name)
             if not all(0 <= n <= 65535 for n in number):
                 raise ProcessError(
                     f"layer {entry.name} = {list(number)}: need numbers from 0 to 65535"
                 )
-            if number in name_of_layer:
+            other = name_of_layer.setdefault(number[0], entry.name)
+            if other != entry.name:
                 raise ProcessError(
-                    f"layers {name_of_layer[number]} and {entry.name} are both {list(number)}; give each its own"
+                    f"layers {other} and {entry.name} are both on number {number[0]}, "
+                    "whose datatypes are doses; give each its own number"
                 )
-            name_of_layer[number] = entry.name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class EtchProfile:
     """Shape of what is made.
 
@@ -148,13 +129,9 @@ class EtchProfile:
             raise ProcessError(
                 f"sidewall_deg = {self.sidewall_deg}: need an angle within +-45"
             )
-        if not (self.corner_radius_nm >= 0 and math.isfinite(self.corner_radius_nm)):
-            raise ProcessError(
-                f"corner_radius_nm = {self.corner_radius_nm}: need a finite length >= 0"
-            )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ExposureSettings:
     """Electron exposure: base dose, point-exposure function, dose classes.
 
@@ -190,19 +167,8 @@ class ExposureSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range, and settings that contradict each other."""
-        _positive(self, "base_uC_cm2", "tolerance", "maximum_classes")
-        _positive(
-            self,
-            *(
-                n
-                for n in ("alpha_um", "beta_um", "gamma_um")
-                if getattr(self, n) is not None
-            ),
-        )
-        for name in ("eta", "nu"):
-            value = getattr(self, name)
-            if value is not None and not (value >= 0 and math.isfinite(value)):
-                raise ProcessError(f"{name} = {value}: need a finite ratio >= 0")
+        check_positive(self, "base_uC_cm2", "tolerance", "maximum_classes")
+        check_positive(self, "alpha_um", "beta_um", "gamma_um")
         if (
             self.beta_um is not None
             and self.alpha_um is not None
@@ -249,7 +215,7 @@ class ExposureSettings:
         return self.known if self.correct is None else self.correct
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WriteField:
     """Write fields of the e-beam tool.
 
@@ -265,14 +231,10 @@ class WriteField:
     stitching_nm: float = 20.0
 
     def __post_init__(self) -> None:
-        _positive(self, "size_um")
-        if not (self.stitching_nm >= 0 and math.isfinite(self.stitching_nm)):
-            raise ProcessError(
-                f"stitching_nm = {self.stitching_nm}: need a finite length >= 0"
-            )
+        check_positive(self, "size_um")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DieSettings:
     """The die around the aperture.
 
@@ -285,7 +247,6 @@ class DieSettings:
     vernier_pitch_um: from bar to bar of the scale that is drawn with the pillars.
     vernier_step_nm: by how much the pitch of the other scale, opened with the aperture,
     is longer: what a bar reads.
-    thickness_um: of the substrate.
     label: text on the die; left out: made from the lens.
     margin_um: around the aperture, where no size is given.
     """
@@ -298,17 +259,16 @@ class DieSettings:
     verniers: bool = True
     vernier_pitch_um: float = 8.0
     vernier_step_nm: float = 50.0
-    thickness_um: float = 500.0
     label: str = ""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        _positive(
+        check_positive(
             self,
+            "size_um",
             "margin_um",
             "mark_um",
             "mark_width_um",
-            "thickness_um",
             "vernier_pitch_um",
             "vernier_step_nm",
         )
@@ -316,17 +276,9 @@ class DieSettings:
             raise ProcessError(
                 f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for bars that can be seen"
             )
-        if self.size_um is not None and not all(0 < s < math.inf for s in self.size_um):
-            raise ProcessError(
-                f"size_um = {list(self.size_um)}: need two finite lengths above 0"
-            )
-        if not 0 <= self.street_um < math.inf:
-            raise ProcessError(
-                f"street_um = {self.street_um}: need a finite length >= 0"
-            )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Process:
     """A fabrication process.
 
@@ -416,17 +368,19 @@ class Process:
         return np.asarray(2 * area / (math.pi * np.maximum(written_nm, 1e-9)))
 
 
-def load_process(path: str | Path) -> Process:
+def load_process(path: str | Path | None) -> Process:
     """Read PROCESS.toml; CSV files that it names lie beside it.
 
     Args:
-        path: of PROCESS.toml.
+        path: of PROCESS.toml; None: the defaults.
 
     Raises:
         ConfigError: missing file, unknown key, wrong type or impossible value, with
             file and key.
         ProcessError: a bias table that is unreadable or impossible.
     """
+    if path is None:
+        return Process()
     path = Path(path)
     process = config.load(path, Process)
     return resolve_process(process, path.parent)
@@ -448,9 +402,13 @@ def resolve_process(process: Process, folder: str | Path) -> Process:
     return process
 
 
-def _positive(record: Any, *names: str) -> None:
-    """Refuse fields of a record that are not finite and above 0."""
+def check_positive(record: Any, *names: str) -> None:
+    """Refuse fields of a record, numbers or several, that are not finite and above 0;
+    None is left out.
+    """
     for name in names:
         value = getattr(record, name)
-        if not (value > 0 and math.isfinite(value)):
+        if value is not None and not all(
+            0 < v < math.inf for v in np.atleast_1d(value)
+        ):
             raise ProcessError(f"{name} = {value}: need a finite value above 0")

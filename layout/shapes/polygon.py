@@ -16,9 +16,7 @@ _EITHER = 0.24  # of a grid step: both half widths are tried within this of a ha
 _REGULAR = math.sqrt(math.pi / (8 * (math.sqrt(2) - 1)))  # half width of an octagon
 
 
-def pillar_polygon(
-    diameter: float, *, vertices: int = 32, shape: str = "round"
-) -> Array:
+def pillar_polygon(diameter: float, *, vertices: int = 32) -> Array:
     """(n, 2) polygon of the area of a circle, in whole grid steps about its site.
 
     Counter-clockwise, convex, symmetric under the square, not closed.
@@ -29,9 +27,8 @@ def pillar_polygon(
     Args:
         diameter: in grid steps; any real number, at least 4.
         vertices: at most so many, a multiple of 4 from 8 to 64; fewer where the grid
-            makes some coincide.
-        shape: ``round``, or ``shot``: an octagon of horizontal, vertical and diagonal
-            edges (three trapezoids).
+            makes some coincide. Eight have horizontal, vertical and diagonal edges
+            alone (three trapezoids).
 
     Raises:
         ProcessError: a diameter below 4 grid steps, or vertices out of range.
@@ -42,7 +39,7 @@ def pillar_polygon(
         )
     if vertices % 4 or not 8 <= vertices <= 64:
         raise ProcessError(f"{vertices} vertices: need a multiple of 4 from 8 to 64")
-    return _pillar(float(diameter), 8 if shape == "shot" else vertices)
+    return _pillar(float(diameter), vertices)
 
 
 @functools.lru_cache(maxsize=70000)
@@ -193,7 +190,7 @@ def eightfold_images(eighth: Array) -> Array:
         turns.append(np.column_stack([-last[:, 1], last[:, 0]]))
     points = np.concatenate(turns)
     points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
-    return np.ascontiguousarray(points[_turn(points) != 0])
+    return np.ascontiguousarray(points[corner_turns(points) != 0])
 
 
 def disc_polygon(
@@ -217,8 +214,12 @@ def disc_polygon(
     return np.asarray(np.rint(points / grid) * grid, np.int64)
 
 
-def _turn(points: Array) -> Array:
-    """(n,) cross product of the edges at each corner; 0 where it is flat."""
+def corner_turns(points: Array) -> Array:
+    """Cross product of the edges at each corner, (n,); 0 where it is flat.
+
+    Args:
+        points: (n, 2) corners.
+    """
     step_in = points - np.roll(points, 1, axis=0)
     step_out = np.roll(points, -1, axis=0) - points
     return np.asarray(step_in[:, 0] * step_out[:, 1] - step_in[:, 1] * step_out[:, 0])

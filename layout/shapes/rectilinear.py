@@ -1,7 +1,6 @@
 """Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
 
 import itertools
-import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -9,8 +8,7 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-_SLICES = 64  # of a polygon, at most
-_SLICE = 5000  # units
+IntBox = tuple[int, int, int, int]  # left, bottom, right, top
 
 
 def split_rectilinear(points: Array) -> Array:
@@ -24,8 +22,8 @@ def split_rectilinear(points: Array) -> Array:
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
     """
-    start = np.asarray(points, np.int64)
-    end = np.roll(np.asarray(points, np.int64), -1, axis=0)
+    start = points
+    end = np.roll(points, -1, axis=0)
     if ((start != end).all(axis=1)).any():
         raise ProcessError(
             "a shape with slanted edges where horizontal and vertical ones are needed"
@@ -44,45 +42,7 @@ def split_rectilinear(points: Array) -> Array:
                 crossings[::2].tolist(), crossings[1::2].tolist(), strict=True
             )
         ]
-    return np.array(rectangles, np.int64).reshape(-1, 4)
-
-
-def covering_rectangles(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon, or boxes around slices of any other.
-
-    Slices are 5 um high or more.
-
-    Args:
-        shape: (n, 2) corners.
-    """
-    step = np.roll(shape, -1, axis=0) - shape
-    if not (step != 0).all(1).any():
-        return split_rectilinear(shape)
-    low, high = int(shape[:, 1].min()), int(shape[:, 1].max())
-    ends = np.linspace(low, high, min(_SLICES, max(1, (high - low) // _SLICE)) + 1)
-    start = shape.astype(float)
-    y0, y1 = start[:, 1], start[:, 1] + step[:, 1]
-    rise = np.where(step[:, 1] == 0, 1, step[:, 1])
-    boxes = []
-    for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-        inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
-        fractions = [np.clip((y - y0) / rise, 0, 1) for y in (bottom, top)]
-        fractions = [
-            np.where(step[:, 1] == 0, whole, fraction)
-            for whole, fraction in zip((0.0, 1.0), fractions, strict=True)
-        ]
-        x = np.concatenate(
-            [(start[:, 0] + fraction * step[:, 0])[inside] for fraction in fractions]
-        )
-        boxes.append(
-            [
-                math.floor(x.min()),
-                math.floor(bottom),
-                math.ceil(x.max()),
-                math.ceil(top),
-            ]
-        )
-    return np.array(boxes, np.int64)
+    return np.array(rectangles, points.dtype).reshape(-1, 4)
 
 
 def merge_runs(rows: Iterable[Array]) -> Array:

@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from layout.shapes.rectilinear import box_corners
+from layout.shapes.rectilinear import box_corners, split_rectilinear
 from metalens.core.arrays import Array
+
+_SLICES = 64  # of a polygon, at most
+_SLICE = 5000  # units
 
 
 def union_contours(polygons: Iterable[Array]) -> list[Array]:
@@ -31,18 +34,6 @@ def subtract_contours(contours: Iterable[Array], taken: Iterable[Array]) -> list
     return _contours(_section(contours, filled=False) - _section(taken))
 
 
-def overlap_contours(
-    contours: Iterable[Array], polygons: Iterable[Array]
-) -> list[Array]:
-    """Contours (outlines and holes) of what ``contours`` share with ``polygons``."""
-    return _contours(_section(contours, filled=False) ^ _section(polygons))
-
-
-def overlap_area(contours: Iterable[Array], polygons: Iterable[Array]) -> float:
-    """Area that ``contours`` (outlines and holes) share with ``polygons``."""
-    return float((_section(contours, filled=False) ^ _section(polygons)).area())
-
-
 def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
     """The same area as polygons without holes, which any mask file holds.
 
@@ -60,6 +51,33 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
 def separate_areas(polygons: Iterable[Array]) -> list[list[Array]]:
     """Outline and holes of each connected area of the union of polygons."""
     return [_contours(part) for part in _section(polygons).decompose()]
+
+
+def covering_rectangles(shape: Array) -> Array:
+    """(n, 4) rectangles of a rectilinear polygon, or boxes around slices of any other.
+
+    Slices are 5 um high or more.
+
+    Args:
+        shape: (n, 2) corners, nm.
+    """
+    if not np.diff(shape, axis=0, append=shape[:1]).all(1).any():
+        return split_rectilinear(shape)
+    section = _section([shape])
+    if section.is_empty():
+        return np.empty((0, 4), np.int64)
+    left, bottom, right, top = section.bounds()
+    slices = min(_SLICES, max(1, int(top - bottom) // _SLICE))
+    ends = np.linspace(bottom, top, slices + 1).tolist()
+    boxes = np.array(
+        [
+            (
+                section ^ _section([box_corners(np.array([left, low, right, high]))])
+            ).bounds()
+            for low, high in itertools.pairwise(ends)
+        ]
+    )
+    return np.hstack([np.floor(boxes[:, :2]), np.ceil(boxes[:, 2:])]).astype(np.int64)
 
 
 def halve_area(contours: list[Array], axis: int) -> list[list[Array]]:
@@ -133,8 +151,6 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
 
     With one hole, a cut that would leave the grid goes from corner to corner instead.
     """
-    from manifold3d import CrossSection
-
     for part in section.decompose():
         contours = _contours(part)
         if len(contours) < 2:
@@ -149,16 +165,8 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
             continue
         left, bottom, right, top = part.bounds()
         for low, high in ((left - 1, cut_x), (cut_x, right + 1)):
-            box = np.array(
-                [
-                    [low, bottom - 1],
-                    [high, bottom - 1],
-                    [high, top + 1],
-                    [low, top + 1],
-                ],
-                float,
-            )
-            yield from _cut(part ^ CrossSection([box]), grid)
+            box = box_corners(np.array([low, bottom - 1, high, top + 1]))
+            yield from _cut(part ^ _section([box]), grid)
 
 
 def _ends_exactly(x: int, contour: Array, grid: int) -> bool:
@@ -176,28 +184,25 @@ def _ends_exactly(x: int, contour: Array, grid: int) -> bool:
 def _bridged(outer: Array, hole: Array) -> tuple[Array, Array]:
     """Two polygons that share the area between an outline and its hole.
 
-    Both cuts lead from a corner of the outline to a corner of the hole. The first is
-    the shortest that meets no edge. The second ends as far from it along the hole as
+    Both cuts are edges of a triangulation from a corner of the outline to one of the
+    hole. The first is the shortest. The second ends as far from it along the hole as
     possible, and is the shortest of those.
 
     Args:
         outer: (n, 2) corners, counter-clockwise.
         hole: (m, 2) corners, clockwise.
     """
-    i, j = (v.ravel() for v in np.indices((len(outer), len(hole))))
-    is_visible = _free(outer[i], hole[j], (outer, hole))
-    i, j = i[is_visible], j[is_visible]
+    triangles = triangulate_region([outer, hole])
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    i, j = edges[(edges[:, 0] < len(outer)) & (edges[:, 1] >= len(outer))].T
+    j = j - len(outer)
     length = ((outer[i] - hole[j]) ** 2).sum(1)
     first = int(length.argmin())
     separation = np.abs(j - j[first])
     separation = np.minimum(separation, len(hole) - separation)
-    is_candidate = (i != i[first]) & (separation > 0)
-    ends = np.stack([outer[i[first]], hole[j[first]]])
-    is_candidate[is_candidate] = _free(
-        outer[i[is_candidate]], hole[j[is_candidate]], (ends,)
-    )
     last = min(
-        np.flatnonzero(is_candidate).tolist(), key=lambda n: (-separation[n], length[n])
+        np.flatnonzero((i != i[first]) & (separation > 0)).tolist(),
+        key=lambda n: (-separation[n], length[n]),
     )
     return (
         np.concatenate(
@@ -212,33 +217,3 @@ def _bridged(outer: Array, hole: Array) -> tuple[Array, Array]:
 def _between(contour: Array, first: int, last: int) -> Array:
     """Corners from one to another, both included, the way that the contour runs."""
     return np.roll(contour, -first, axis=0)[: (last - first) % len(contour) + 1]
-
-
-def _free(start: Array, end: Array, contours: Sequence[Array]) -> Array:
-    """(n,) whether segments meet no edge of some contours.
-
-    Edges that share an end with the segment do not count.
-
-    Args:
-        start: (n, 2) whole points.
-        end: (n, 2) whole points.
-        contours: (m, 2) corners each.
-    """
-    free = np.ones(len(start), bool)
-    for contour in contours:
-        for p, q in zip(contour, np.roll(contour, -1, axis=0), strict=True):
-            shares_end = [
-                (start == point).all(1) | (end == point).all(1) for point in (p, q)
-            ]
-            sides = [np.sign(_cross(end - start, point - start)) for point in (p, q)]
-            edge_sides = [np.sign(_cross(q - p, point - p)) for point in (start, end)]
-            meets = (sides[0] * sides[1] <= 0) & (edge_sides[0] * edge_sides[1] <= 0)
-            low, high = np.minimum(start, end), np.maximum(start, end)
-            meets &= ((low <= np.maximum(p, q)) & (high >= np.minimum(p, q))).all(1)
-            free &= ~(meets & ~(shares_end[0] | shares_end[1]))
-    return free
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors (..., 2)."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -14,7 +14,7 @@ from metalens.propagate import PropagationCase, make_case, paths
 _ON_AXIS = (0.0, 0.0)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class FocusWindow:
     """Where on the sensor the light is evaluated.
 
@@ -28,13 +28,8 @@ class FocusWindow:
     wavelength_um: float
     depths_um: Array
 
-    @property
-    def cell_um2(self) -> float:
-        """Area of one sample."""
-        return float((self.x_um[1] - self.x_um[0]) * (self.y_um[1] - self.y_um[0]))
 
-
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class FocusSums:
     """Sums over the pillars of a lens, prepared for one window.
 
@@ -132,9 +127,9 @@ def check_study_lens(lens: Lens) -> None:
         )
 
 
-def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> FocusSums:
+def prepare_focus(lens: Lens, window: FocusWindow) -> FocusSums:
     """Basis for a lens and a window; as many nodes as the phase between them turns, and
-    ``margin`` more.
+    12 more.
 
     Accuracy:
         float32 sums, about 1e-5 of the largest amplitude of the window.
@@ -162,34 +157,28 @@ def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> Focus
     )
     curvature = paths.reference_depth(case)
     x, y = lens.diameters.x_um, lens.diameters.y_um
-    count_x = (
-        _count(case, float(x[-1]), float(abs(window.x_um).max()), curvature) + margin
-    )
-    count_y = (
-        _count(case, float(y[-1]), float(abs(window.y_um).max()), curvature) + margin
-    )
+    count_x = _count(case, float(x[-1]), float(abs(window.x_um).max()), curvature)
+    count_y = _count(case, float(y[-1]), float(abs(window.y_um).max()), curvature)
     (nodes_x, onto_x), (nodes_y, onto_y) = _basis(x, count_x), _basis(y, count_y)
     return FocusSums(window, case, x, y, nodes_x, nodes_y, onto_x, onto_y, curvature)
 
 
-def focus_window(
-    lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0
-) -> FocusWindow:
+def focus_window(lens: Lens, *, depths_um: Array | None = None) -> FocusWindow:
     """A window around the axis that holds the blur at all depths.
 
     Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
+    Six diffraction widths surround the blur.
 
     Args:
         lens: as designed.
         depths_um: of the source; None: the source distance of the design.
-        rings: diffraction widths around the blur.
     """
     depths = np.array(
         [lens.source_distance_um] if depths_um is None else depths_um, float
     )
     step = reach.diffraction_um(lens) / 4
     blur = max(reach.blur_um(lens, depth) for depth in depths)
-    half = int(np.ceil((blur + 2 * rings * step) / step))
+    half = int(np.ceil((blur + 12 * step) / step))
     axis = np.arange(-half, half + 1) * step
     return FocusWindow(axis, axis, lens.sensor_distance_um, lens.wavelength_um, depths)
 
@@ -197,10 +186,10 @@ def focus_window(
 def _count(
     case: PropagationCase, edge_um: float, reach_um: float, curvature: float
 ) -> int:
-    """Number of Chebyshev nodes along an axis, before any margin.
+    """Number of Chebyshev nodes along an axis.
 
     With the phase amplitude a = k * max|d path / dx| * edge, over the depths and less
-    the carrier, the series needs a + 4 a^(1/3) terms (decay of Bessel functions).
+    the carrier, the series needs a + 4 a^(1/3) terms (decay of Bessel functions), and 12 more.
 
     Args:
         case: the lens with its films.
@@ -218,7 +207,7 @@ def _count(
     ]
     slope = max(float(abs(np.gradient(path, x)).max()) for path in differences)
     turns = case.wavenumber * slope * edge_um
-    return int(np.ceil(turns + 4 * turns ** (1 / 3)))
+    return int(np.ceil(turns + 4 * turns ** (1 / 3))) + 12
 
 
 def _basis(sites_um: Array, count: int) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.study.focus import FocusSums
-from layout.study.pillars import PillarKindsOfLens, classify_pillars
+from layout.study.pillars import Curve, classify_pillars
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
 from metalens.fabrication import Draw, ResponseRates, Spread, State, draw_lenses
@@ -25,16 +25,16 @@ _DEGREE = 10  # of the dependence on the local bias
 _SAMPLES = 160
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class SpreadModel:
     """Sums over the pillars of a lens for all draws of its process.
 
-    pillars: their kinds (sizes to 0.05 nm), with the sensitivities of t. count:
-    (kinds,) pillars of each. basis: (rank, kinds) B_k, orthonormal over pillars.
+    curve: t of the kinds of pillars (sizes to 0.05 nm). count: (kinds,) pillars of
+    each. basis: (rank, kinds) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
 
-    pillars: PillarKindsOfLens
+    curve: Curve
     focus: FocusSums
     count: Array
     basis: Array
@@ -58,7 +58,7 @@ class SpreadModel:
             bias = state.bias_um(x, y)
             mean_bias = (bias.max() + bias.min()) / 2
             half_range = (bias.max() - bias.min()) / 2 + 1e-9
-            curves = self.pillars.curve(mean_bias + half_range * knots, state)
+            curves = self.curve(mean_bias + half_range * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
             coefficients = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
             at_nodes = np.polynomial.chebyshev.chebval(
@@ -89,14 +89,14 @@ def reduce_spread(
         spread: of the process.
         seed: of the random draws.
     """
-    index, count, pillars = classify_pillars(lens, sens)
+    index, count, curve = classify_pillars(lens, sens)
     states = [draw.state() for draw in draw_lenses(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     radius = np.sqrt(rng.uniform(0, 1, _SAMPLES))
     angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
     u, v = radius * np.cos(angle), radius * np.sin(angle)
     curves = [
-        pillars.curve(state.bias_um(x, y), state)[0]
+        curve(state.bias_um(x, y), state)[0]
         for state, x, y in zip(states, u, v, strict=True)
     ]
     weight = np.sqrt(count)
@@ -110,47 +110,31 @@ def reduce_spread(
     columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
     bounds = [len(index) * i // _PARTS for i in range(_PARTS + 1)]
     parts = [
-        (start, index[start:stop], _turned(lens, slice(start, stop)))
+        (start, index[start:stop], np.asarray(lens.geometric_rad(slice(start, stop))))
         for start, stop in itertools.pairwise(bounds)
     ]
     moments = functools.reduce(
         np.add, executor.gather_parallel(_summed, (focus, columns), parts)
     )
-    return SpreadModel(pillars, focus, count, basis, moments, lens.diameters.radius_um)
+    return SpreadModel(curve, focus, count, basis, moments, lens.diameters.radius_um)
 
 
-def _turned(lens: Lens, rows: slice) -> Array | None:
-    """(rows, x) factor by which the rotation of each pillar turns circular light.
-
-    None where no pillar is rotated.
-    """
-    return (
-        np.exp(1j * np.asarray(lens.geometric_rad(rows))).astype(np.complex64)
-        if lens.hand
-        else None
-    )
-
-
-def _summed(
-    about: tuple[FocusSums, Array], part: tuple[int, Array, Array | None]
-) -> Array:
+def _summed(about: tuple[FocusSums, Array], part: tuple[int, Array, Array]) -> Array:
     """(rank, nodes y, nodes x) sums over rows of pillars.
 
     Args:
         about: sums of the window, and the (rank, 1 + kinds) basis.
-        part: first row; (rows, x) kind of each site; (rows, x) factor of its rotation.
+        part: first row; (rows, x) kind of each site; geometric phase of the rotation
+            of each, or of all.
     """
-    (focus, columns), (first, index, rotation) = about, part
+    (focus, columns), (first, index, phase_rad) = about, part
+    turn = np.broadcast_to(np.exp(1j * phase_rad).astype(np.complex64), index.shape)
     moments = np.zeros(
         (len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex
     )
     for start in range(0, len(index), _BAND):
         band = slice(start, start + _BAND)
-        amplitudes = (
-            columns[:, index[band]]
-            if rotation is None
-            else columns[:, index[band]] * rotation[band]
-        )
+        amplitudes = columns[:, index[band]] * turn[band]
         moments += focus.project(
             amplitudes, slice(first + start, first + start + amplitudes.shape[1])
         )
@@ -172,7 +156,7 @@ def reduction_error(model: SpreadModel, lenses: Sequence[Draw]) -> float:
         bias = state.bias_um(
             radius * np.cos(draw.turn_rad), radius * np.sin(draw.turn_rad)
         )
-        curves = model.pillars.curve(bias, state)
+        curves = model.curve(bias, state)
         weights = (curves * model.count) @ model.basis.conj().T
         relative_square = (
             (abs(curves - weights @ model.basis) ** 2)

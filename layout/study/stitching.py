@@ -1,5 +1,6 @@
 """What misplaced write fields do to the point-spread function."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,14 +9,11 @@ from layout.mask.fields import FieldPlan
 from layout.process.process import Process
 from layout.study.focus import FocusSums, FocusWindow, focus_window, prepare_focus
 from metalens.core.arrays import Array
-from metalens.fabrication import designed_transmission
 from metalens.lens import Lens
 from metalens.psf import find_peak
 
-_BAND = 64
 
-
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class StitchReport:
     """Change of the PSF over random field offsets, uniform within +- ``stitching_nm``.
 
@@ -88,33 +86,15 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, A
         plan: write fields.
         focus: sums of a window.
     """
-    moments = []
-    for rows, columns in plan.blocks():
-        if not lens.diameters.diameter_um[rows, columns].any():
-            continue
-        field_sum = np.zeros((len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
-        for start in range(rows.start, rows.stop, _BAND):
-            band = slice(start, min(start + _BAND, rows.stop))
-            field_sum += focus.project(
-                _amplitude(lens, band, columns)[None], band, columns
-            )[0]
-        moments.append(field_sum)
-    return len(moments), np.stack(moments)
-
-
-def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    """(rows, columns) complex64 transmissions of the pillars of a block; 0 for none."""
-    diameters = lens.diameters.diameter_um[rows].astype(float)
-    lengths = lens.diameters.length_um
-    if lens.pairs is not None and lengths is not None:
-        return lens.pairs.amplitude(
-            diameters, lengths[rows], lens.wavelength_um, lens.light
-        )[:, columns].astype(np.complex64)
-    sizes = np.where(diameters > 0, diameters, lens.proxy.domain_um[0])
-    t = designed_transmission(lens.proxy, sizes, lens.wavelength_um) * np.exp(
-        1j * lens.geometric_rad(rows)
+    amplitude = (lens.transmission() * np.exp(1j * lens.phase_rad())).astype(
+        np.complex64
     )
-    return np.where(diameters > 0, t, 0)[:, columns].astype(np.complex64)
+    moments = [
+        focus.project(amplitude[None, rows, columns], rows, columns)[0]
+        for rows, columns in plan.blocks()
+        if amplitude[rows, columns].any()
+    ]
+    return len(moments), np.stack(moments)
 
 
 def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array, Array]:
@@ -132,27 +112,20 @@ def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array,
         (y, x) amplitude, and (5, fields, y, x) derivatives by x, y, xx, yy and xy in
         units of the step.
     """
-    h = step_um
-
-    def light_at(x: float, y: float) -> Array:
-        return np.asarray(focus.light(moments, (x, y))[:, 0])
-
-    unmoved = light_at(0, 0)
-    plus_x = light_at(h, 0)
-    minus_x = light_at(-h, 0)
-    plus_y = light_at(0, h)
-    minus_y = light_at(0, -h)
-    mixed = (
-        light_at(h, h) + light_at(-h, -h) - plus_x - minus_x - plus_y - minus_y
-    ) / 2 + unmoved
+    f = {
+        (i, j): np.asarray(focus.light(moments, (i * step_um, j * step_um))[:, 0])
+        for i, j in itertools.product((-1, 0, 1), repeat=2)
+        if i * j >= 0
+    }
+    along_x, along_y = f[1, 0] + f[-1, 0], f[0, 1] + f[0, -1]
     terms = [
-        (plus_x - minus_x) / 2,
-        (plus_y - minus_y) / 2,
-        plus_x + minus_x - 2 * unmoved,
-        plus_y + minus_y - 2 * unmoved,
-        mixed,
+        (f[1, 0] - f[-1, 0]) / 2,
+        (f[0, 1] - f[0, -1]) / 2,
+        along_x - 2 * f[0, 0],
+        along_y - 2 * f[0, 0],
+        (f[1, 1] + f[-1, -1] - along_x - along_y) / 2 + f[0, 0],
     ]
-    return unmoved.sum(0), np.stack(terms)
+    return f[0, 0].sum(0), np.stack(terms)
 
 
 def _centroid(psf: Array, window: FocusWindow) -> Array:

@@ -29,7 +29,7 @@ STEPS = 50
 _BATCH = 25
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ToleranceOutcome:
     """Quantities of the study for draws of the process; the first axis counts them.
 
@@ -48,26 +48,24 @@ class ToleranceOutcome:
     psf: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CauseEffect:
     """One cause at its standard deviation; for each number the worse of both signs.
 
-    phase_rad: rms change of the pillars' phases about their mean. transmission: rms
-    change of |T|. strehl, efficiency, information (summed over the depths): relative
-    change. psf: relative L2 change.
+    phase_rad: rms change of the pillars' phases about their mean. strehl, efficiency,
+    information (summed over the depths): relative change. psf: relative L2 change.
     """
 
     cause: str
     deviation: float
     phase_rad: float
-    transmission: float
     strehl: float
     efficiency: float
     psf: float
     information: float
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ToleranceReport:
     """Result of :func:`analyse_tolerance`.
 
@@ -224,37 +222,29 @@ def _outcome_of(
     """
     model, reference, step_um = about
     window = model.focus.window
+    sample_um2 = float(np.diff(window.x_um[:2])[0] * np.diff(window.y_um[:2])[0])
     incident = model.count.sum() * model.focus.case.area_um2
     psf = abs(model.focus.light(model.drawn(lenses))) ** 2
     at_design = psf[:, 0]
     normalised = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
     steps = (normalised[:, 1::2] - normalised[:, ::2]) / step_um
     peaks = [find_peak(image) for image in at_design]
-    powers = [_focused_power(*pair) for pair in zip(at_design, peaks, strict=True)]
+    powers = [  # within a circle of three FWHM about the peak
+        encircled_power(image, peak, 1.5 * fwhm(image, 1.0))
+        for image, peak in zip(at_design, peaks, strict=True)
+    ]
     return (
         np.array([peak for *_, peak in peaks]) / find_peak(reference)[2],
-        np.array(powers) * window.cell_um2 / incident,
+        np.array(powers) * sample_um2 / incident,
         np.sqrt(((at_design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
         (steps**2).sum((2, 3)),
         at_design[:, len(window.y_um) // 2] / reference.max(),
     )
 
 
-def _focused_power(light: Array, peak: tuple[float, float, float]) -> float:
-    """Sum of (y, x) samples within a circle of three FWHM about the peak."""
-    return encircled_power(light, peak, 1.5 * fwhm(light, 1.0))
-
-
 def _part(outcome: ToleranceOutcome, rows: slice) -> ToleranceOutcome:
     """The outcome of some draws."""
-    fields = (
-        outcome.strehl,
-        outcome.efficiency,
-        outcome.psf_change,
-        outcome.information,
-        outcome.psf,
-    )
-    return ToleranceOutcome(*(values[rows] for values in fields))
+    return ToleranceOutcome(*(values[rows] for values in vars(outcome).values()))
 
 
 def _effect(
@@ -272,7 +262,6 @@ def _effect(
         nominal: outcome of the designed lens.
     """
     ((cause, deviation),) = signs[1].amounts.items()
-    changes = [_pillar_change(model, draw.state()) for draw in signs]
 
     def worst(values: Array, reference: Array) -> float:
         return float(abs(values / reference - 1).max())
@@ -280,8 +269,7 @@ def _effect(
     return CauseEffect(
         cause=cause,
         deviation=deviation,
-        phase_rad=max(phase for phase, _ in changes),
-        transmission=max(transmission for _, transmission in changes),
+        phase_rad=max(_phase_change_rad(model, draw.state()) for draw in signs),
         strehl=worst(outcome.strehl, nominal.strehl),
         efficiency=worst(outcome.efficiency, nominal.efficiency),
         psf=float(outcome.psf_change.max()),
@@ -289,8 +277,8 @@ def _effect(
     )
 
 
-def _pillar_change(model: SpreadModel, state: State) -> tuple[float, float]:
-    """Rms change of phase about its mean, rad, and rms change of |t|, over the pillars.
+def _phase_change_rad(model: SpreadModel, state: State) -> float:
+    """Rms change of phase about its mean over the pillars.
 
     Pillars are evaluated at 64 places spread evenly over the aperture (golden angle).
 
@@ -301,13 +289,9 @@ def _pillar_change(model: SpreadModel, state: State) -> tuple[float, float]:
     radius = np.sqrt((np.arange(64) + 0.5) / 64)
     angle = np.arange(64) * np.pi * (3 - np.sqrt(5))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    designed = model.pillars.curve(np.zeros(1), State.of())
-    changed = model.pillars.curve(state.bias_um(u, v), state)
+    designed = model.curve(np.zeros(1), State.of())
+    changed = model.curve(state.bias_um(u, v), state)
     weight = np.broadcast_to(model.count, changed.shape) / (model.count.sum() * len(u))
     ratio = changed / designed * np.exp(1j * state.phase_rad(u, v))[:, None]
     ratio = ratio * np.exp(-1j * np.angle((ratio * weight).sum()))
-    phase = np.angle(ratio)
-    change = abs(changed) - abs(designed)
-    return float(np.sqrt((phase**2 * weight).sum())), float(
-        np.sqrt((change**2 * weight).sum())
-    )
+    return float(np.sqrt((np.angle(ratio) ** 2 * weight).sum()))

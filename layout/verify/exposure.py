@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.formats.library import (
-    NOTHING,
     MaskLibrary,
     PolygonStack,
     flatten_polygons,
@@ -30,11 +29,11 @@ from metalens.core.units import nm
 
 _SAMPLES = 1000  # pillars whose exposure is summed exactly, on masks up to ...
 _PRODUCTS = 4e9  # ... so many products of samples and sites
-_NEIGHBOURS = 5  # sites on each side whose shapes are summed exactly
+_CLOSE = 1e5  # products that the exact exposure by one shape costs
 _FAR = 6.0  # ranges between two shapes at which a Gaussian is below exp(-36)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class WrittenMask:
     """What a written mask exposes with the pillars.
 
@@ -52,7 +51,7 @@ class WrittenMask:
     undosed: tuple[LayerNumber, ...]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ExposedRows:
     """Predicted sizes in some rows of a lattice, (rows, columns) each.
 
@@ -75,7 +74,6 @@ def verify_exposure(
     doses: Mapping[LayerNumber, float],
     process: Process,
     *,
-    height_um: float = 0.0,
     keep: Callable[[ExposedRows], None] | None = None,
 ) -> ExposureReport:
     """Expose and etch a mask that was read back, in simulation.
@@ -85,7 +83,6 @@ def verify_exposure(
         plan: mask with the places of the pillars.
         doses: its dose table.
         process: point exposure, bias, etch and layers.
-        height_um: of the pillars, for their feet.
         keep: called with the rows of all lattices, in turn; memory is bounded.
 
     Accuracy: the field on nodes to some 1e-4 (the result states the difference from
@@ -111,19 +108,21 @@ def verify_exposure(
             rows.exposure[row, column],
             scene.size_um[pillar_class] / nm,
             rows.resist_nm[row, column],
-            rows.made_nm[row, column],
         )
         y = body.rows_um(rows.first, len(rows.classes))
         tally.take((body.columns_um[column], y[row]), judged[pillar_class], values, box)
         if keep is not None:
             keep(rows)
-    top, foot = process.top_foot_nm(0.0, height_um / nm)
     return ExposureReport(
         pillars,
         tally,
         box,
-        _edges(scene.others, field.close, field.background.grid, field.background.far),
-        float(foot - top) / 2,
+        _edges(
+            scene.others,
+            field.ranges.close,
+            field.background.grid,
+            field.background.far,
+        ),
         process.exposure.tolerance,
         scene.undosed,
         *_sampled(scene, field),
@@ -183,7 +182,7 @@ def read_scene(
         kinds = DrawnDiscs(size_um)
     emptied = {
         lattice.name: dataclasses.replace(
-            content.cells[lattice.name], placed=NOTHING, sums=None, pillars=None
+            content.cells[lattice.name], references=(), sums={}, pillars=None
         )
         for lattice in plan.lattices
     }
@@ -230,7 +229,7 @@ def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
     return [np.asarray(contour, float) for contour in contours]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Field:
     """Exposure of the drawn edges: a background, and what each pillar adds itself.
 
@@ -238,7 +237,6 @@ class _Field:
     background: on nodes by far ranges, on sites by middle ones.
     own, slope: (classes + 1,) exposure of a pillar's edge by itself at unit dose, less
         what the node field counts for it, and its fall per um.
-    close: (range, weight) of the Gaussians that nodes do not hold.
     spots: points and masses that represent other shapes.
     """
 
@@ -246,7 +244,6 @@ class _Field:
     background: nodes.ScatterBackground
     own: Array
     slope: Array
-    close: Sequence[tuple[float, float]]
     spots: tuple[Array, Array]
 
     @classmethod
@@ -285,11 +282,9 @@ class _Field:
                 )
                 middle = correct.middle_convolution(body, ranges)
                 near.append(middle(sites).astype(np.float32))
-        is_close = point.widths_um < bodies.COARSE * densest.nearest_um
-        close = PointExposure(point.widths_um[is_close], point.weights[is_close])
         background = nodes.ScatterBackground(grid, grid.convolution(far)(mass[0]), near)
         points = np.column_stack([x, y])
-        return cls(ranges, background, own, slope, close.terms, (points, masses))
+        return cls(ranges, background, own, slope, (points, masses))
 
     def rows(self, scene: WrittenMask, number: int, first: int, block: Array) -> Array:
         """(rows, columns) exposure of the drawn edges of a block, float.
@@ -356,7 +351,7 @@ def _develop(
 
 def _edges(
     others: ExposedPolygons,
-    close: Sequence[tuple[float, float]],
+    close: PointExposure,
     grid: nodes.NodeGrid,
     far: Array,
     unit_um: float = nm,
@@ -366,10 +361,10 @@ def _edges(
     The error is (exposure - THRESHOLD) / slope, in nm; the slope is a difference across
     the edge. Close Gaussians are summed in closed form over the polygons.
     """
-    widest_close_um = max((a for a, _ in close), default=0.0)
+    widest_close_um = float(close.widths_um.max(initial=0.0))
     points = polygon_edges.sample_edges(others, widest_close_um, unit_um=unit_um)
     positions = np.concatenate([points.at_um, *polygon_edges.points_across(points)])
-    values = polygon_edges.exposure_at_edges(positions, others, close)
+    values = polygon_edges.exposure_at_edges(positions, others, close.terms)
     exposure, outside, inside = np.split(values, 3)
     x, y = points.at_um.T
     exposure = exposure + grid.sample(far, x, y)
@@ -400,7 +395,7 @@ def verify_polygons(
     dose = np.array([doses[layer] for layer, _ in drawn])
     others = ExposedPolygons(corners, dose, np.zeros(len(drawn), np.int64))
     near, _, grid, field = near_and_far(others, exposure)
-    edges = _edges(others, near.terms, grid, field, unit)
+    edges = _edges(others, near, grid, field, unit)
     shortest = 4 * float(near.widths_um.max()) / unit
     curved = [
         points_along_edges([contour * unit])
@@ -414,12 +409,12 @@ def verify_polygons(
         means = values.reshape(len(curved), -1).mean(1) / THRESHOLD
         x, y = at.reshape(len(curved), -1, 2).mean(1).T
         zeros = np.zeros(len(curved), np.int64)
-        present = edges.x_um, edges.y_um, edges.exposure, edges.shift_nm, edges.layer
-        edges = EdgeErrors(*map(np.append, present, (x, y, means, zeros, zeros)))
+        more = x, y, means, zeros, zeros
+        edges = EdgeErrors(*map(np.append, vars(edges).values(), more))
     undosed = tuple(sorted(library.layers - doses.keys()))
     tally = VerificationTally.empty()
     box = _box((), corners)
-    return ExposureReport(0, tally, box, edges, 0.0, exposure.tolerance, undosed)
+    return ExposureReport(0, tally, box, edges, exposure.tolerance, undosed)
 
 
 # direct sums
@@ -432,16 +427,20 @@ def _sampled(scene: WrittenMask, field: _Field) -> tuple[float, float]:
         Largest |exposure - 1| by direct sums over the exact shapes, relative to dose to
         size, and the largest difference of the field from these sums.
     """
-    sites = sum(body.rows * body.columns for body in scene.bodies)
-    samples = int(np.clip(_PRODUCTS / (sites + len(field.spots[0])), 16, _SAMPLES))
-    rows, columns = _some_pillars(scene, samples)
-    exact = _distant_exposure(scene, field, rows, columns)
-    by_field = np.empty(len(rows))
+    body = scene.bodies[0]
+    widest_um = float(field.ranges.close.widths_um.max(initial=0.0))
+    reach_um = _FAR * widest_um + 2 * np.sqrt(float(scene.kinds.wider_um2.max()))
+    rows, columns = (1 + int(reach_um / step) for step in (body.down_um, body.pitch_um))
+    sites = sum(each.rows * each.columns for each in scene.bodies)
+    products = sites + len(field.spots[0]) + _CLOSE * rows * columns
+    places = _some_pillars(scene, int(np.clip(_PRODUCTS / products, 16, _SAMPLES)))
+    exact = _distant_exposure(scene, field, *places)
+    by_field = np.empty(len(exact))
     for n, (row, column) in enumerate(
-        zip(rows.tolist(), columns.tolist(), strict=True)
+        zip(*map(np.ndarray.tolist, places), strict=True)
     ):
-        exact[n] += _close_exposure(scene, field, row, column)
-        block = np.ascontiguousarray(scene.bodies[0].source(row, row + 1))
+        exact[n] += _close_exposure(scene, field, (row, column), (rows, columns))
+        block = np.ascontiguousarray(body.source(row, row + 1))
         by_field[n] = field.rows(scene, 0, row, block)[0, column]
     worst_exposure = np.abs(exact / THRESHOLD - 1).max(initial=0.0)
     worst_field = np.abs(by_field - exact).max(initial=0.0) / THRESHOLD
@@ -449,29 +448,27 @@ def _sampled(scene: WrittenMask, field: _Field) -> tuple[float, float]:
 
 
 def _some_pillars(scene: WrittenMask, samples: int) -> tuple[Array, Array]:
-    """Rows and columns of at most ``samples`` dosed pillars, evenly over the first
+    """Rows and columns of some ``samples`` dosed pillars, evenly over the first
     lattice.
     """
     body = scene.bodies[0]
     occupied = scene.dose > 0
     total = int(body.counts(len(occupied) - 1)[occupied].sum())
-    wanted = np.unique(np.linspace(0, max(total - 1, 0), samples).astype(int))
-    chosen = [np.empty((0, 2), np.int64)]
+    stride = max(1, -(-total // samples))
+    chosen = [np.empty(0, np.int64)]
     passed = 0
     for first, block in body.blocks():
         sites = np.flatnonzero(occupied[block])
-        low, high = np.searchsorted(wanted, [passed, passed + len(sites)])
-        row, column = np.divmod(sites[wanted[low:high] - passed], body.columns)
-        chosen.append(np.column_stack([first + row, column]))
+        chosen.append(first * body.columns + sites[-passed % stride :: stride])
         passed += len(sites)
-    rows, columns = np.concatenate(chosen).T
+    rows, columns = np.divmod(np.concatenate(chosen), body.columns)
     return rows, columns
 
 
 def _distant_exposure(
     scene: WrittenMask, field: _Field, rows: Array, columns: Array
 ) -> Array:
-    """(samples,) exposure by far and middle ranges, every shape as points.
+    """(samples,) exposure by far ranges, every shape as points.
 
     sum of dose * area * weight / (pi w^2) * exp(-r^2 / w^2), with widths w that the
     size of the mean pillar has widened.
@@ -487,16 +484,14 @@ def _distant_exposure(
     mass_of_class = (scene.dose * scene.kinds.area_um2).astype(np.float32)
     points, masses = field.spots
     total = np.zeros(len(at_x))
-    for width, weight in [*field.ranges.far.terms, *field.ranges.middle.terms]:
-        sums = np.zeros(len(at_x))
+    for width, weight in field.ranges.far.terms:
+        bell = _bell(points[:, 0], at_x, width) * _bell(points[:, 1], at_y, width)
+        sums = masses @ bell
         for body in scene.bodies:
             bell_x = _bell(body.columns_um, at_x, width)
             for first, block in body.blocks():
                 bell_y = _bell(body.rows_um(first, len(block)), at_y, width)
                 sums += ((mass_of_class[block] @ bell_x) * bell_y).sum(0, dtype=float)
-        if (width, weight) in field.ranges.far.terms:
-            bell = _bell(points[:, 0], at_x, width)
-            sums += masses @ (bell * _bell(points[:, 1], at_y, width))
         total += weight / (np.pi * width**2) * sums
     return total
 
@@ -508,38 +503,37 @@ def _bell(positions: Array, centres: Array, width: float) -> Array:
     )
 
 
-def _close_exposure(scene: WrittenMask, field: _Field, row: int, column: int) -> float:
-    """Exposure of the edges of a pillar by itself and by the shapes within 5 sites.
-
-    Close Gaussians are summed over the exact shapes, in place of the middle ranges of
-    :func:`_distant_exposure`.
+def _close_exposure(
+    scene: WrittenMask, field: _Field, site: tuple[int, int], span: tuple[int, int]
+) -> float:
+    """Exposure of the edges of a pillar by itself and by the shapes around it; close
+    Gaussians are summed over the exact shapes.
 
     Args:
         scene: lattices with doses.
         field: Gaussians by reach.
-        row, column: site of the pillar on the first lattice.
+        site: row and column of the pillar on the first lattice.
+        span: rows and columns on each side that are in reach.
     """
     body, kinds = scene.bodies[0], scene.kinds
-    top, left = max(row - _NEIGHBOURS, 0), max(column - _NEIGHBOURS, 0)
-    below = min(row + _NEIGHBOURS + 1, body.rows)
-    block = body.source(top, below)[:, left : column + _NEIGHBOURS + 1]
+    row, column = site
+    top, left = (max(at - reach, 0) for at, reach in zip(site, span, strict=True))
+    below = min(row + span[0] + 1, body.rows)
+    block = body.source(top, below)[:, left : column + span[1] + 1]
+    pillar = int(block[row - top, column - left])
     i, j = np.nonzero(scene.dose[block] > 0)
+    is_other = (i != row - top) | (j != column - left)
+    i, j = i[is_other], j[is_other]
     entry = block[i, j]
     # rows run towards -y
     offset = np.column_stack(
         [(left + j - column) * body.pitch_um, (row - top - i) * body.down_um]
     )
-    distance = np.hypot(*offset.T)
-    middle = field.ranges.middle.density(distance)
-    total = -float((scene.dose * kinds.area_um2)[entry] @ middle)
-    pillar = int(block[row - top, column - left])
-    total += float(scene.dose[pillar] * field.own[pillar])
+    total = float(scene.dose[pillar] * field.own[pillar])
     edge = kinds.edge_points_um(pillar)
-    radius = float(np.hypot(*edge.T).max() + np.sqrt(kinds.wider_um2.max()))
-    for width, weight in field.close:
-        is_reached = (distance > 0) & (distance < radius + _FAR * width)
-        for kind in np.unique(entry[is_reached]).tolist():
-            places = edge[:, None] - offset[is_reached & (entry == kind)]
+    for kind in np.unique(entry).tolist():
+        places = edge[:, None] - offset[entry == kind]
+        for width, weight in field.ranges.close.terms:
             exposure = kinds.exposure_at(kind, places, width)
             total += weight * float(scene.dose[kind] * exposure.sum(-1).mean())
     return total

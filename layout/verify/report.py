@@ -1,5 +1,5 @@
-"""Report on the exposure of a written mask: extremes, a map and a histogram over
-millions of pillars.
+"""Report on the exposure of a written mask: extremes and a map over millions of
+pillars.
 """
 
 from dataclasses import dataclass
@@ -16,13 +16,9 @@ MOST_NM = 1.0  # by which a width in the resist may differ from the drawn one
 # all keep so many times it.
 EDGE_SHARE, EDGE_TIMES = 0.99, 2.0
 _SIDE = 160  # points of the map, each way
-_WIDEST_NM, _BIN_NM = (
-    8.0,
-    1 / 16,
-)  # of the histogram; what is beyond counts in its last bins
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class EdgeErrors:
     """Edges of marks, labels and other shapes that are no pillars.
 
@@ -38,47 +34,38 @@ class EdgeErrors:
     layer: Array
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class VerificationTally:
     """Sums over judged pillars (the dose test is not judged) of a part of the mask.
 
-    ends: largest |exposure - 1|, largest |resist - drawn|, least and largest made
-    diameter, nm. total, count: (y, x) map: sum of resist less drawn, and number of
-    pillars. bins: (n,) pillars by that difference.
+    worst: largest |exposure - 1|, largest |resist - drawn| in nm. total, count: (y, x)
+    map: sum of resist less drawn, and number of pillars.
     """
 
-    ends: Array
+    worst: Array
     total: Array
     count: Array
-    bins: Array
 
     @classmethod
     def empty(cls) -> "VerificationTally":
         """Of nothing."""
-        bins = np.zeros(2 * round(_WIDEST_NM / _BIN_NM), np.int64)
-        return cls(
-            np.array([0.0, 0.0, np.inf, -np.inf]),
-            np.zeros((_SIDE, _SIDE)),
-            np.zeros((_SIDE, _SIDE)),
-            bins,
-        )
+        return cls(np.zeros(2), *np.zeros((2, _SIDE, _SIDE)))
 
     def take(
         self,
         place: tuple[Array, Array],
         judged: Array,
-        values: tuple[Array, Array, Array, Array],
+        values: tuple[Array, Array, Array],
         box_um: Box,
     ) -> None:
-        """Add pillars at x, y; values: (n,) exposure, drawn, resist and made diameter."""
+        """Add pillars at x, y; values: (n,) exposure, drawn and resist diameter."""
         x, y = (positions[judged] for positions in place)
-        exposure, drawn, resist, made = (each[judged] for each in values)
+        exposure, drawn, resist = (each[judged] for each in values)
         if not len(x):
             return
         difference = resist - drawn
         errors = np.abs(exposure - 1).max(), np.abs(difference).max()
-        self.ends[:2] = np.maximum(self.ends[:2], errors)
-        self.ends[2:] = (min(self.ends[2], made.min()), max(self.ends[3], made.max()))
+        self.worst = np.maximum(self.worst, errors)
         column, row = (
             np.clip(
                 (positions - low) / max(high - low, 1e-9) * _SIDE, 0, _SIDE - 1
@@ -88,18 +75,14 @@ class VerificationTally:
         point = row * _SIDE + column
         for sums, weights in ((self.total, difference), (self.count, None)):
             sums += np.bincount(point, weights, _SIDE**2).reshape(_SIDE, _SIDE)
-        number = np.floor(difference / _BIN_NM).astype(np.int64) + len(self.bins) // 2
-        last = len(self.bins) - 1
-        self.bins += np.bincount(np.clip(number, 0, last), minlength=last + 1)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class ExposureReport:
     """The verdict over everything that is written.
 
     pillars: number, with the dose test. tally: sums over those that are judged. box_um:
-    left, bottom, right, top of the map. edges: of the other shapes. lean_nm: diameter
-    at the foot less that at half height. tolerance: of the exposure, relative. undosed:
+    left, bottom, right, top of the map. edges: of the other shapes. tolerance: of the exposure, relative. undosed:
     layers with shapes and no dose. sampled: largest |exposure - 1| by direct sums at
     sample pillars. error: largest difference of the exposure of all pillars from these.
     """
@@ -108,7 +91,6 @@ class ExposureReport:
     tally: VerificationTally
     box_um: Box
     edges: EdgeErrors
-    lean_nm: float
     tolerance: float = 0.01
     undosed: tuple[LayerNumber, ...] = ()
     sampled: float = 0.0
@@ -119,7 +101,7 @@ class ExposureReport:
         """Largest |exposure - 1| of the judged pillars and of all edges."""
         return float(
             max(
-                self.tally.ends[0],
+                self.tally.worst[0],
                 self.sampled,
                 np.abs(self.edges.exposure - 1).max(initial=0.0),
             )
@@ -131,7 +113,7 @@ class ExposureReport:
         edge.
         """
         return float(
-            max(self.tally.ends[1], 2 * np.abs(self.edges.shift_nm).max(initial=0.0))
+            max(self.tally.worst[1], 2 * np.abs(self.edges.shift_nm).max(initial=0.0))
         )
 
     @property
@@ -149,20 +131,10 @@ class ExposureReport:
         )
         return (
             not self.undosed
-            and max(float(self.tally.ends[0]), self.sampled) <= self.tolerance
+            and max(float(self.tally.worst[0]), self.sampled) <= self.tolerance
             and edges_ok
             and self.worst_nm <= MOST_NM
         )
-
-    @property
-    def thinnest_top_nm(self) -> float:
-        """Least diameter at the top of a judged pillar."""
-        return float(self.tally.ends[2]) - self.lean_nm
-
-    @property
-    def widest_foot_nm(self) -> float:
-        """Largest diameter at the foot of a judged pillar."""
-        return float(self.tally.ends[3]) + self.lean_nm
 
     @property
     def map_nm(self) -> Array:
@@ -176,14 +148,3 @@ class ExposureReport:
             out=np.full_like(tally.total, np.nan),
             where=tally.count > 0,
         )
-
-    @property
-    def histogram(self) -> tuple[Array, Array]:
-        """(edges / nm, pillars) of resist less drawn diameter, from the first used bin
-        to the last.
-        """
-        used = np.flatnonzero(self.tally.bins)
-        first, end = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 1)
-        return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[
-            first:end
-        ]

@@ -20,7 +20,6 @@ def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=
         grid=1,
         unit_nm=1.0,
         vertices=16,
-        shape="round",
     )
     corner = np.add(
         [[0, 0], [9000, 0], [9000, 500], [500, 500], [500, 9000], [0, 9000]],

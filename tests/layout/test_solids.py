@@ -192,7 +192,7 @@ def test_pillars_of_two_sizes_have_width_and_length_as_fabricated():
 @pytest.mark.parametrize(
     ("shape", "degrees", "words"),
     [
-        (Circle(), 17.0, "need above 0 and below the pitch"),
+        (Circle(), 17.0, "nothing of the top"),
         (Ring(0.1), 2.0, "close a hole"),
         (Rectangle(0.3), 6.0, "nothing of the top"),
         (Circle(hole=True), 1.0, "openings"),

@@ -8,7 +8,7 @@ from layout.verify.exposure import verify_exposure
 from metalens.core.units import nm
 
 
-def verify(plan, content, doses, process, *, height_um=0.0):
+def verify(plan, content, doses, process):
     """The report on a mask that was read back, and (n,) arrays, a pillar each: x_um,
     y_um; drawn_nm, resist_nm, made_nm; exposure of the drawn edge, relative to dose to
     size; layer number; judged (not of the dose test, which is wrong on purpose).
@@ -32,9 +32,7 @@ def verify(plan, content, doses, process, *, height_um=0.0):
         found["drawn_nm"].append(np.array(drawn))
         found["layer"].append(np.array([k.layer[0] for k in kinds]))
 
-    result = verify_exposure(
-        content, plan, doses, process, height_um=height_um, keep=keep
-    )
+    result = verify_exposure(content, plan, doses, process, keep=keep)
     out = SimpleNamespace(**{n: np.concatenate(found[n]) for n in names})
     out.judged = out.layer != process.layers.dose[0]
     out.report = result

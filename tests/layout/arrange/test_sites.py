@@ -15,6 +15,7 @@ from layout.formats.library import (
     PillarSites,
 )
 from layout.mask.plan import PillarArray
+from tests.referees.mask_places import places
 
 # of unequal length; the second class has no cell and does not occur
 NAMES = ("THIN", "", "WIDER_ONE", "MIDST")
@@ -56,7 +57,7 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     assert compare.mask_differences(made, content) == []
     if keep is None:
         row, column = np.nonzero(block == 3)
-        x, y = content.places("LENS")["WIDER_ONE"]
+        x, y = places(content, "LENS")["WIDER_ONE"]
         wanted = {
             (-7001 + 410 * c, 9003 - 410 * r)
             for r, c in zip(row.tolist(), column.tolist(), strict=True)

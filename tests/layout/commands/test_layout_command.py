@@ -22,6 +22,7 @@ from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
 from metalens.optics import Layers, Stop
+from tests.referees.mask_places import places
 
 FORMATS = (".oas", ".gds", ".stl")
 
@@ -111,7 +112,7 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
         layout.read_oasis(target / "mask.oas"),
         layout.read_gdsii(target / "mask.gds"),
     ):
-        assert sum(len(x) for x, _ in content.places("LENS").values()) == planned
+        assert sum(len(x) for x, _ in places(content, "LENS").values()) == planned
     page = (target / "report.html").read_text()
     assert "violations" in page
     assert f"as {planned:,} pillars ({values['pillars']:,} on the die" in page

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from layout.drc.lattice import check_plan
 from layout.drc.report import DrcReport
 from layout.mask.plan import MaskPlan, PillarArray, PillarClass, pillar_classes
-from layout.process.process import DesignRules, KeepOutZone
+from layout.process.process import DesignRules
 from layout.shapes import polygon
 from tests.referees.convex import convex_gap
 
@@ -22,12 +22,7 @@ LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
 
 def plan_of(diameters, classes, *, pitch=400, vertices=16):
     made = pillar_classes(
-        np.array(diameters),
-        layer=(1, 0),
-        grid=1,
-        unit_nm=1.0,
-        vertices=vertices,
-        shape="round",
+        np.array(diameters), layer=(1, 0), grid=1, unit_nm=1.0, vertices=vertices
     )
     lattice = PillarArray.of(
         "LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000
@@ -181,48 +176,6 @@ def test_density_is_the_share_of_the_window():
     assert found.maximum_density == pytest.approx(share, rel=1e-12)
     assert found.counts["density"] > 0
     assert check_plan(plan, DesignRules(minimum_feature_nm=1, maximum_density=0.45)).ok
-
-
-@given(
-    x=st.floats(-3.5, 1),
-    y=st.floats(-2, 2.5),
-    w=st.floats(0.01, 2),
-    h=st.floats(0.01, 2),
-)
-def test_exclusion_zones_agree_with_klayout(x, y, w, h):
-    db = pytest.importorskip("klayout.db")
-    zone = KeepOutZone(
-        round(x, 3), round(y, 3), max(round(w, 3), 0.001), max(round(h, 3), 0.001)
-    )
-    plan = plan_of([120, 260], np.indices((9, 9)).sum(0) % 3)
-    box = db.Region(
-        db.Box(
-            *(round(v * 1e3) for v in (zone.x_um, zone.y_um)),
-            *(
-                round(v * 1e3)
-                for v in (zone.x_um + zone.width_um, zone.y_um + zone.height_um)
-            ),
-        )
-    )
-    inside = 0
-    for px, py, k in sites(plan):
-        shape = db.Region(
-            db.Polygon(
-                [
-                    db.Point(px + int(a), py + int(b))
-                    for a, b in plan.classes[k - 1].outline
-                ]
-            )
-        )
-        # overlap of exact areas: scaled up, so that no cut is rounded away
-        inside += not (
-            shape.transformed(db.ICplxTrans(1000))
-            & box.transformed(db.ICplxTrans(1000))
-        ).is_empty()
-    rules = DesignRules(
-        minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, exclusion=(zone,)
-    )
-    assert check_plan(plan, rules).counts["exclusion"] == inside
 
 
 def test_structures_that_meet_are_found(make_plan):

@@ -24,39 +24,28 @@ BAR = np.array([[0, 0], [10, 0], [10, 23], [0, 23]])
 ELL = np.array([[0, 0], [90, 0], [90, 40], [31, 40], [31, 70], [0, 70]])
 
 
-def listed(placed):
-    """Every placement as (child, turn, x, y)."""
-    rows = zip(
-        placed.child.tolist(),
-        placed.turn.tolist(),
-        placed.x.tolist(),
-        placed.y.tolist(),
-        strict=True,
-    )
-    return [(placed.children[c], placed.turns[t], x, y) for c, t, x, y in rows]
-
-
-def expanded(made):
-    """Every copy of arrays as (child, turn, x, y)."""
+def listed(references):
+    """Every copy as (child, turn, x, y)."""
     return [
-        (
-            one.child,
-            one.turn,
-            one.x + i * one.across[0] + j * one.up[0],
-            one.y + i * one.across[1] + j * one.up[1],
+        (one.child, one.turn, x, y)
+        for one in references
+        for x, y in (
+            zip(one.x.tolist(), one.y.tolist(), strict=True)
+            if isinstance(one, CellPlacements)
+            else (
+                (
+                    one.x + i * one.across[0] + j * one.up[0],
+                    one.y + i * one.across[1] + j * one.up[1],
+                )
+                for i in range(one.columns)
+                for j in range(one.rows)
+            )
         )
-        for one in made
-        for i in range(one.columns)
-        for j in range(one.rows)
     ]
 
 
-def placements(child, x, y, turn):
-    return CellPlacements(
-        ("A", "B"),
-        *(np.asarray(v, np.int32) for v in (child, x, y)),
-        np.asarray(turn, np.uint8),
-    )
+def placements(child, turn, x, y):
+    return CellPlacements(child, turn, *(np.array(v, np.int32) for v in (x, y)))
 
 
 def sort_key(row):
@@ -65,7 +54,7 @@ def sort_key(row):
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-@pytest.mark.parametrize(("child", "turn"), [(0, 1), (0, 0), (1, 2)])
+@pytest.mark.parametrize(("child", "turn"), [("A", 1), ("A", 0), ("B", 2)])
 def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
     suffix, child, turn, tmp_path
 ):
@@ -73,13 +62,13 @@ def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
     later cell.
     """
     write, read = WRITERS[suffix]
-    placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
-    cells = {name: MaskCell(name, {(1, 0): [BAR]}) for name in placed.children}
+    placed = (placements(child, QUARTERS[turn], [5, -7, 130], [11, 4, -60]),)
+    cells = {name: MaskCell(name, {(1, 0): [BAR]}) for name in "AB"}
     write(
-        MaskLibrary("TOP", cells | {"TOP": MaskCell("TOP", placed=placed)}),
+        MaskLibrary("TOP", cells | {"TOP": MaskCell("TOP", references=placed)}),
         tmp_path / f"a{suffix}",
     )
-    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].references
     assert sorted(listed(found), key=sort_key) == sorted(listed(placed), key=sort_key)
 
 
@@ -88,18 +77,13 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
     """Beyond the eight quarter turns 300 angles, more than a byte numbers."""
     write, read = WRITERS[suffix]
     turns = (*QUARTERS, *(Orientation(0.5 + n / 4) for n in range(300)))
-    x = 7 * np.arange(308, dtype=np.int32)
-    placed = CellPlacements(
-        ("A",),
-        np.zeros(308, np.int32),
-        x,
-        x[::-1].copy(),
-        np.arange(308, dtype=np.int32),
-        turns,
+    placed = tuple(
+        placements("A", turn, [7 * n], [7 * (307 - n)]) for n, turn in enumerate(turns)
     )
-    cells = {"A": MaskCell("A", {(1, 0): [BAR]}), "TOP": MaskCell("TOP", placed=placed)}
+    top = MaskCell("TOP", references=placed)
+    cells = {"A": MaskCell("A", {(1, 0): [BAR]}), "TOP": top}
     write(MaskLibrary("TOP", cells), tmp_path / f"a{suffix}")
-    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].references
     for got, want in zip(
         sorted(listed(found), key=sort_key),
         sorted(listed(placed), key=sort_key),
@@ -111,14 +95,12 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
 
 
 def assembly():
-    turns = (*QUARTERS, Orientation(33.5, True, 1.5), Orientation(211.25))
-    loose = CellPlacements(
-        ("A", "B"),
-        np.array([0, 1, 0, 1, 1], np.int32),
-        np.array([5, -700, 5, 2**30, 12], np.int32),
-        np.array([-6, 41, 900, -(2**30), 13], np.int32),
-        np.array([0, 7, 9, 3, 8], np.uint8),
-        turns,
+    loose = (
+        placements("A", QUARTERS[0], [5], [-6]),
+        placements("B", QUARTERS[7], [-700], [41]),
+        placements("A", Orientation(211.25), [5], [900]),
+        placements("B", QUARTERS[3], [2**30, 77], [-(2**30), 8]),
+        placements("B", Orientation(33.5, True, 1.5), [12], [13]),
     )
     cells = {
         "A": MaskCell("A", {(1, 0): [BAR], (1, 7): [ELL - 3]}),
@@ -129,7 +111,7 @@ def assembly():
         CellReference("B", 60_000, -8, Orientation(17.0), 1, 9, (0, 0), (0, -4100)),
         CellReference("B", -60_000, 1),
     )
-    cells["TOP"] = MaskCell("TOP", placed=loose, references=copies)
+    cells["TOP"] = MaskCell("TOP", references=(*loose, *copies))
     return MaskLibrary("TOP", cells, layer_names={(1, 0): "pillar"})
 
 
@@ -139,8 +121,8 @@ def test_every_copy_comes_back(tmp_path, end):
     write(made, tmp_path / f"m{end}")
     content = read(tmp_path / f"m{end}")
     assert content.tops == ["TOP"]
-    planned = expanded(made.cells["TOP"].references) + listed(made.cells["TOP"].placed)
-    there = listed(content.cells["TOP"].placed)
+    planned = listed(made.cells["TOP"].references)
+    there = listed(content.cells["TOP"].references)
     assert sorted(there, key=sort_key) == sorted(planned, key=sort_key)
     for name in ("A", "B"):
         for layer, shapes in made.cells[name].polygons.items():
@@ -159,7 +141,7 @@ def test_an_independent_reader_finds_every_shape(tmp_path, end):
     there = db.Layout()
     there.read(str(tmp_path / f"m{end}"))
     top = there.top_cell()
-    planned = expanded(made.cells["TOP"].references) + listed(made.cells["TOP"].placed)
+    planned = listed(made.cells["TOP"].references)
     for layer, child, shape in (((1, 0), "A", BAR), ((2, 3), "B", ELL)):
         found = db.Region(top.begin_shapes_rec(there.layer(*layer)))
         found.merged_semantics = False
@@ -208,4 +190,5 @@ def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
     with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
         gdsii_write.write_gdsii(long, tmp_path / "m.gds")
     oasis_write.write_oasis(long, tmp_path / "m.oas")
-    assert len(oasis_read.read_oasis(tmp_path / "m.oas").cells["TOP"].placed.x) == 32768
+    (read,) = oasis_read.read_oasis(tmp_path / "m.oas").cells["TOP"].references
+    assert read.count == 32768

@@ -185,7 +185,7 @@ def test_arrays_are_summed_in_bounded_memory():
         )  # a twelfth of the copies at once, 13 to 60 bytes each
     finally:
         tracemalloc.stop()
-    ((count, x, y, _, _),) = sums.tolist()
+    ((count, x, y, _, _),) = sums.values()
     assert count == 12_000_000
     assert x == 7 * 3000 * (4000 * 3999 // 2)
     assert y == -5 * 4000 * (3000 * 2999 // 2)

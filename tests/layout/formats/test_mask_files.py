@@ -18,6 +18,7 @@ from layout.formats import gdsii_write, oasis_write
 from layout.formats import oasis_records as oasis_bytes
 from layout.mask.plan import FigureCell, MaskPlan, PillarArray, PillarClass
 from metalens.core.errors import MaskFileError, ProcessError
+from tests.referees.mask_places import places
 
 FORMS = [("gds", {}), ("oas", {})]
 READ = {"gds": layout.read_gdsii, "oas": layout.read_oasis}
@@ -82,7 +83,7 @@ def test_a_mask_reads_back_as_planned_and_klayout_agrees(
     assert outcome.pillars == np.count_nonzero(plan.lattices[0].whole())
     own = {
         k: sorted(zip(x.tolist(), y.tolist(), strict=True))
-        for k, (x, y) in content.places("LENS").items()
+        for k, (x, y) in places(content, "LENS").items()
     }
     assert own == planned_sites(plan)
     seen, read = klayout_sites(path, plan)
@@ -107,7 +108,7 @@ def test_any_small_map_survives_the_round_trip(make_plan, tmp_path, classes, for
     path = write(plan, tmp_path / f"m.{form[0]}", form[1])
     if classes.any():
         assert layout.compare(plan, READ[form[0]](path)).ok
-    assert {k: len(x) for k, (x, _) in READ[form[0]](path).places("LENS").items()} == {
+    assert {k: len(x) for k, (x, _) in places(READ[form[0]](path), "LENS").items()} == {
         k: len(v) for k, v in planned_sites(plan).items()
     }
 
@@ -338,7 +339,7 @@ def test_masks_of_klayout_are_read(tmp_path):
         content = READ[suffix](tmp_path / f"k.{suffix}")
         assert content.tops == ["TOP"]
         assert len(content.cells["PILLAR"].polygons[7, 3]) == 2
-        x, y = content.places("TOP")["PILLAR"]
+        x, y = places(content, "TOP")["PILLAR"]
         assert sorted(zip(x.tolist(), y.tolist(), strict=True)) == [
             (100 + 400 * i, 200 + 500 * j) for i in range(3) for j in range(2)
         ]

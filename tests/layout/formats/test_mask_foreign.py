@@ -11,8 +11,9 @@ import layout
 from layout.formats import gdsii_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
-from layout.formats.library import flatten_stacks
+from layout.formats.library import CellReference, MaskCell, flatten_stacks
 from metalens.core.errors import MaskFileError
+from tests.referees.mask_places import places
 
 db = pytest.importorskip("klayout.db")
 
@@ -158,13 +159,16 @@ def aref(columns, rows, *corners):
 
 
 def test_arrays_off_the_grid_stand_next_to_their_places():
-    x, _ = gdsii_read.parse_gdsii(
-        gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))
-    ).places("TOP")["A"]
+    x, _ = places(
+        gdsii_read.parse_gdsii(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))), "TOP"
+    )["A"]
     assert x.tolist() == [0, 333, 667]
-    x, y = gdsii_read.parse_gdsii(
-        gdsii(aref(2, 3, (7, 9), (7 + 41, 9 - 13), (7 + 20, 9 + 100)))
-    ).places("TOP")["A"]
+    x, y = places(
+        gdsii_read.parse_gdsii(
+            gdsii(aref(2, 3, (7, 9), (7 + 41, 9 - 13), (7 + 20, 9 + 100)))
+        ),
+        "TOP",
+    )["A"]
     exact = {
         (7 + 20.5 * i + 20 / 3 * j, 9 - 6.5 * i + 100 / 3 * j)
         for i in range(2)
@@ -175,9 +179,9 @@ def test_arrays_off_the_grid_stand_next_to_their_places():
     assert all(
         min(max(abs(u - p), abs(v - q)) for p, q in found) <= 0.5 for u, v in exact
     )
-    x, _ = gdsii_read.parse_gdsii(
-        gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))
-    ).places("TOP")["A"]
+    x, _ = places(
+        gdsii_read.parse_gdsii(gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))), "TOP"
+    )["A"]
     assert x.tolist() == [5, 338, 671]
 
 
@@ -188,17 +192,10 @@ def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
         + gds.xy_record(np.array([[2**31 - 20, 0]]))
     )
     content = gdsii_read.parse_gdsii(gdsii(far + gds.gdsii_record(gds.ENDEL)))
-    nested = content.cells["TOP"].placed
-    content.cells["OUTER"] = type(content.cells["TOP"])(
-        "OUTER",
-        placed=type(nested)(
-            ("TOP",),
-            *(np.array([v], np.int32) for v in (0, 100, 0)),
-            np.zeros(1, np.uint8),
-        ),
-    )
+    nested = CellReference("TOP", 100, 0)
+    content.cells["OUTER"] = MaskCell("OUTER", references=(nested,))
     with pytest.raises(MaskFileError, match="32 bits"):
-        content.places("OUTER")
+        places(content, "OUTER")
     with pytest.raises(MaskFileError, match="32 bits"):
         list(flatten_stacks(content, "OUTER"))
 

@@ -168,10 +168,10 @@ def test_placements_are_listed_from_each_to_the_next():
     x = np.array([-100, -93, -93])
     y = np.array([40, 40, 29])
     used = oasis_write.encode_list(child, x, y, np.array([0, 6, 3]), out)
-    want = "0f 11 f0 05 c9 01 50 10"  # absolute, (-100, 40), then relative
+    want = "11 f0 05 c9 01 50 10"  # (-100, 40), then relative
     # 7 to the right; turned by two quarters after a mirror; the same y is left out
     want += "11 e5 ac 02 0e"
-    want += "11 d6 05 17"  # 11 down; turned by three quarters
+    want += "11 d6 05 17 0f"  # 11 down; turned by three quarters; absolute
     assert out[:used].tobytes() == bytes.fromhex(want)
 
 

@@ -233,11 +233,10 @@ def test_placements_keep_cell_place_and_repetition(tmp_path):
     path = tmp_path / "m.oas"
     path.write_bytes(oasis(*records))
     content = layout.read_oasis(path)
-    placed = content.cells["T"].placed
-    turns = [placed.turns[n] for n in placed.turn.tolist()]
     found = sorted(
-        (int(x), int(y), t.angle_deg, t.mirrored, t.scale)
-        for x, y, t in zip(placed.x, placed.y, turns, strict=True)
+        (int(x), int(y), turn.angle_deg, turn.mirrored, turn.scale)
+        for _, turn, xs, ys in content.cells["T"].instances()
+        for x, y in zip(xs, ys, strict=True)
     )
     assert found == sorted(
         [

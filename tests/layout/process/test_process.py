@@ -110,10 +110,6 @@ def test_bias_and_exposure_tables_lie_beside_the_toml(tmp_path):
         ("[die]\nsize_um = [0, 1]\n", "size_um"),
         ("[die]\nstreet_um = -1\n", "street_um"),
         ("[spread]\nindex = -1\n", "index"),
-        (
-            "[[rules.exclusion]]\nx_um = 0\ny_um = 0\nwidth_um = 0\nheight_um = 1\n",
-            "width_um",
-        ),
         ('[bias]\ncsv = "absent.csv"\n', "cannot be read"),
     ],
 )

@@ -159,7 +159,7 @@ def test_without_a_point_exposure_nothing_is_verified():
         verify(plan, content, table, Process())
 
 
-def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
+def test_bias_of_lone_pillars_is_in_what_is_made():
     process = Process(
         exposure=ExposureSettings(**BEAM),
         bias=Bias(isolated_nm=-12.0),
@@ -167,7 +167,7 @@ def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
     )
     source = lens_map()
     plan, content, table = written(process)
-    found = verify(plan, content, table, process, height_um=0.7)
+    found = verify(plan, content, table, process)
     lens = found.layer == 1
     made = found.made_nm[lens]
     size = source.diameter_um.shape[0]
@@ -180,9 +180,6 @@ def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
     # sites
     assert np.abs(off).max() < 2.5
     assert np.abs(off).mean() < 0.8
-    assert found.report.lean_nm == pytest.approx(
-        700 * np.tan(np.deg2rad(1.0)), rel=1e-12
-    )
 
 
 def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
