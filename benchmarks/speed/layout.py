@@ -76,9 +76,7 @@ def plan(*, freeform: bool = True) -> MaskPlan:
 
 def lens_of(lattice: PillarArray) -> MaskPlan:
     """A mask of one lattice of the bench's sizes."""
-    classes = pillar_classes(
-        SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32
-    )
+    classes = pillar_classes(SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32)
     return MaskPlan("TOP", classes, (lattice,), layer_names={(1, 0): "pillar"})
 
 
