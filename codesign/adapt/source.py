@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from characterize.inference import AsBuilt
-from codesign.network import Architecture, subnet
+from codesign.network import Architecture
 from codesign.optics import PixelPsfStack
 from codesign.train import CodesignRun, RunConfig, checkpoint, evolution
 from codesign.train import run as runs
@@ -44,7 +43,8 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
     """A finished run with the network of one budget, as it was evaluated in
     result.json.
 
-    The weights are those of the network's own file, fine-tuned where the run did so.
+    Where the run fine-tuned it or its optics, weights, lens and pitch are those of the
+    network's own file.
 
     Args:
         folder: of the run.
@@ -89,7 +89,9 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         raise TrainingError(
             f"{folder}/result.json: its network is of another version ({error})"
         ) from None
-    restore_network(run, selected[0], folder)
+    if settings.run.finetune_steps or settings.search.inner_steps:
+        file = weights_file(folder, selected[0]["budget_mmacs"])
+        run.trainer.model.restore(checkpoint.load(file, settings=settings))
     return FinishedRun(run, best.architecture, selected[0])
 
 
@@ -112,29 +114,6 @@ def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
     """
     name = f"lens_{budget_mmacs:g}" if settings.search.inner_steps else "lens"
     return folder / f"{name}.h5"
-
-
-def restore_network(run: CodesignRun, row: dict[str, Any], folder: Path) -> None:
-    """Load the weights that a row of result.json was evaluated with into a run's
-    network.
-
-    Without fine-tuning those are the checkpoint's own. Networks with optics of their
-    own (``search.inner_steps``) bring lens and pitch.
-
-    Args:
-        run: run with its model. row: of result.json. folder: of the files.
-
-    Raises:
-        TrainingError: the file is missing, cut short, or of another space.
-    """
-    if not (run.settings.run.finetune_steps or run.settings.search.inner_steps):
-        return
-    state = checkpoint.load_network(weights_file(folder, row["budget_mmacs"]))
-    model = run.trainer.model
-    with torch.no_grad():
-        for name in ("coefficients_rad", "log_pitch"):
-            getattr(model, name).copy_(state.pop(f"optics.{name}"))
-    subnet.restore_weights(model.net, state)
 
 
 def is_retraining(folder: Path) -> bool:

@@ -2,6 +2,7 @@
 the optics fixed.
 """
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +25,6 @@ from codesign.train import (
     Trainer,
     assess,
     checkpoint,
-    make_model,
-    place_on_device,
 )
 from metalens import lens as lenses
 
@@ -180,18 +179,16 @@ def make_trainer(
     """
     settings = source.settings
     origin = source.run.trainer
-    model = make_model(
-        settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
-    )  # fmt: skip
-    model.net.load_state_dict(origin.model.net.state_dict())
-    with torch.no_grad():
-        model.coefficients_rad.copy_(origin.model.coefficients_rad)
-        model.log_pitch.copy_(origin.model.log_pitch)
     trainer = Trainer(
-        fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, model,
-        architecture=source.architecture, stacks=stacks,
-    )  # fmt: skip
-    place_on_device(trainer, origin.light.device)
+        fine_tuning(settings.inner, config),
+        settings.optics,
+        origin.sensor,
+        origin.scenes,
+        copy.deepcopy(origin.model),
+        architecture=source.architecture,
+        stacks=stacks,
+    )
+    trainer.light.device = origin.light.device
     return trainer
 
 

@@ -13,7 +13,6 @@ from codesign.adapt import lens_file, weights_file
 from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
-from codesign.network import Subnet
 from codesign.optics import image_formation
 from codesign.optics import stack as trained
 from codesign.train import (
@@ -230,12 +229,8 @@ def _write_results(
         costs = [candidate.macs / 1e6 for candidate in state.history]
         errors = [candidate.error for candidate in state.history]
         axes.plot(costs, errors, "o", label=f"budget {budget:g} MMACs")
-        optics = {
-            "optics.coefficients_rad": model.coefficients_rad,
-            "optics.log_pitch": model.log_pitch,
-        }
-        network = Subnet(model.net, architecture)
-        checkpoint.save_network(weights_file(folder, budget), network, beside=optics)
+        file = weights_file(folder, budget)
+        checkpoint.save(file, model.state(), settings=settings)
         if settings.search.inner_steps:
             save_lens(lens_file(folder, settings, budget), model)
         if export:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from codesign.batches import EXPERIMENT
 from codesign.network import Architecture, Supernet, exported
-from codesign.network.subnet import Subnet
 from codesign.train import CodesignRun
 from metalens.psf import pixel_count
 
@@ -33,5 +32,4 @@ def write_network_file(
         axis=inner.axis_weight > 0,
         points=inner.point_weight > 0,
     )
-    subnet = Subnet(net, architecture)
-    exported.write_onnx(path, subnet, scale, size=size, pitch_um=pitch_um)
+    exported.write_onnx(path, net, architecture, scale, size=size, pitch_um=pitch_um)

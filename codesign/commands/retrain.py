@@ -22,7 +22,6 @@ from codesign.adapt.retrained_network import (
 from codesign.adapt.source import check_lens, load_finished_run
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
-from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior_parameters, psf_error
 from codesign.train import Trainer, assess, checkpoint, device_of, place_on_device
 from metalens import lens
@@ -180,8 +179,8 @@ def _write_results(
     """Write the retrained network, the page, the picture of cases and result.json."""
     source, trainer = trained
     assess.recalibrate_network(trainer, source.architecture)
-    subnet = Subnet(trainer.model.net, source.architecture)
-    checkpoint.save_network(folder / "subnet_retrained.safetensors", subnet)
+    file = folder / "subnet_retrained.safetensors"
+    checkpoint.save(file, trainer.model.state(), settings=source.settings)
     retrain_report.write_retraining_page(folder / "report.html", story)
     store.write_bytes(
         folder / "cases.png", retrain_report.plot_error_bars(story.outcome)

@@ -3,7 +3,6 @@ from . import cost as cost
 from . import exported as exported
 from . import frozen_norm as frozen_norm
 from . import losses as losses
-from . import subnet as subnet
 from . import windows as windows
 from .architecture import Architecture as Architecture
 from .architecture import SearchSpace as SearchSpace
@@ -13,7 +12,6 @@ from .architecture import largest_architecture as largest_architecture
 from .architecture import mutate_architecture as mutate_architecture
 from .architecture import sample_architecture as sample_architecture
 from .architecture import smallest_architecture as smallest_architecture
-from .subnet import Subnet as Subnet
 from .supernet import Prediction as Prediction
 from .supernet import Supernet as Supernet
 from .supernet import recalibrate_batch_norm as recalibrate_batch_norm

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from codesign.eye import CameraRig
-from codesign.network.subnet import Subnet
+from codesign.network.architecture import Architecture
+from codesign.network.supernet import Supernet
 from metalens.core.store import replace_atomically
 
 OPSET = 17
@@ -54,9 +55,11 @@ class ExportedNetwork(nn.Module):
     (batch, 1, size, size).
     """
 
-    def __init__(self, net: Subnet, scale: OutputScale) -> None:
+    def __init__(
+        self, net: Supernet, architecture: Architecture, scale: OutputScale
+    ) -> None:
         super().__init__()
-        self.net, self.scale = net, scale
+        self.net, self.architecture, self.scale = net, architecture, scale
         self.eval()
 
     def forward(self, frames: Tensor) -> tuple[Tensor, ...]:
@@ -64,9 +67,7 @@ class ExportedNetwork(nn.Module):
         centred = frames - frames.mean((-2, -1), keepdim=True)
         size = int(frames.shape[-1])
         deviation = torch.sqrt((centred**2).sum((-2, -1), keepdim=True) / (size**2 - 1))
-        prediction = self.net.net(
-            centred / deviation.clamp_min(1e-6), self.net.architecture
-        )
+        prediction = self.net(centred / deviation.clamp_min(1e-6), self.architecture)
         unit = torch.tensor(self.scale.slip_mm)
         outputs = {
             "mask_logits": prediction.mask_logits,
@@ -90,7 +91,13 @@ class ExportedNetwork(nn.Module):
 
 
 def write_onnx(
-    path: str | Path, net: Subnet, scale: OutputScale, *, size: int, pitch_um: float
+    path: str | Path,
+    net: Supernet,
+    architecture: Architecture,
+    scale: OutputScale,
+    *,
+    size: int,
+    pitch_um: float,
 ) -> None:
     """Write an ONNX file (opset 17) of a network, for any number of square frames.
 
@@ -98,8 +105,9 @@ def write_onnx(
     describe the camera.
 
     Args:
-        path: of the file. net: network of one architecture. scale: units of the
-            outputs.
+        path: of the file. net: elastic network, with the batch statistics of the
+            architecture. architecture: whose weights the file holds, and no others.
+        scale: units of the outputs.
         size: pixels along a side of a frame. pitch_um: of the pixels.
 
     Accuracy:
@@ -109,7 +117,7 @@ def write_onnx(
     Raises:
         OSError: the target cannot be written.
     """
-    network = ExportedNetwork(net, scale)
+    network = ExportedNetwork(net, architecture, scale)
     example = torch.zeros(2, 1, size, size)
     names = scale.outputs
     with replace_atomically(path) as part:

@@ -2,13 +2,12 @@
 
 import contextlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from metalens.core import config
 from metalens.core.errors import TrainingError
@@ -50,61 +49,11 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
         "state": state,
         "settings": config.dumps(settings),
     }
-    _write(Path(path), tensors, ABOUT, json.dumps(about, default=keep_tensor))
-
-
-def save_network(
-    path: str | Path, net: nn.Module, *, beside: Mapping[str, Tensor] | None = None
-) -> None:
-    """Write the weights of a network, and the tensors ``beside``, to a file.
-
-    The same weights give the same bytes.
-
-    Args:
-        path: of the file. net: network. beside: further tensors by name.
-
-    Raises:
-        OSError: the target cannot be written, the disk is full (the old file stays).
-    """
-    _write(
-        Path(path),
-        {
-            name: tensor.detach().contiguous()
-            for name, tensor in {**net.state_dict(), **(beside or {})}.items()
-        },
-        "kind",
-        "subnet",
-    )
-
-
-def load_network(path: str | Path) -> dict[str, Tensor]:
-    """Weights by name of :func:`save_network`.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        TrainingError: no such file, or not a network.
-    """
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            if (file.metadata() or {}).get("kind") != "subnet":
-                raise TrainingError(f"{path}: not the weights of a run's network")
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
-        raise TrainingError(
-            f"{path}: missing, truncated or no network ({error}); finish the run again"
-        ) from error
-
-
-def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None:
-    """Write tensors and one metadata entry to a safetensors file, atomically.
-
-    One entry, since the writer puts several in random order.
-    """
+    content = json.dumps(about, default=keep_tensor)
     with replace_atomically(path) as part:
         try:
-            save_file(tensors, str(part), metadata={key: value})
+            # one entry, since the writer puts several in random order
+            save_file(tensors, str(part), metadata={ABOUT: content})
         except SafetensorError as error:
             raise OSError(f"{path}: cannot be written ({error})") from error
 

@@ -110,6 +110,21 @@ class TrainedModel:
         """Pixel pitch, always above 0."""
         return self.log_pitch.exp()
 
+    def state(self) -> dict[str, Any]:
+        """Weights, lens and pitch, for :meth:`restore`."""
+        return {
+            "net": self.net.state_dict(),
+            "coefficients_rad": self.coefficients_rad.detach(),
+            "log_pitch": self.log_pitch.detach(),
+        }
+
+    @torch.no_grad()
+    def restore(self, state: dict[str, Any]) -> None:
+        """Copy what :meth:`state` returned into this model."""
+        self.net.load_state_dict(state["net"])
+        self.coefficients_rad.copy_(state["coefficients_rad"])
+        self.log_pitch.copy_(state["log_pitch"])
+
     def hold(self, finest_um: float, coarsest_um: float) -> float | None:
         """Clamp the pitch to a range in place; the limit that it was clamped to, in um.
 
@@ -425,34 +440,29 @@ class Trainer:
         for batch in compute_ahead(batch_of, range(self.step, end), workers=workers):
             yield self._advance(batch)
 
-    def state(self) -> dict[str, object]:
+    def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, for :meth:`restore`."""
         return {
-            "net": self.model.net.state_dict(),
-            "coefficients_rad": self.model.coefficients_rad.detach(),
-            "log_pitch": self.model.log_pitch.detach(),
+            **self.model.state(),
             "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
             "light": self.light.state(),
             "pitch_held_um": self.pitch_held_um,
             "counters": [self.step, self.skipped, self.bad_run],
         }
 
-    def restore(self, state: dict[str, object]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state` returned: parameters, moments, counters and the
         image.
         """
-        self.model.net.load_state_dict(state["net"])  # type: ignore[arg-type]
-        with torch.no_grad():
-            self.model.coefficients_rad.copy_(state["coefficients_rad"])  # type: ignore[arg-type]
-            self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
+        self.model.restore(state)
         for name, optimiser in self.optimisers.items():
-            saved: dict[str, Any] = state["optimisers"][name]  # type: ignore[index]
+            saved = state["optimisers"][name]
             moments = {int(k): v for k, v in saved["state"].items()}
             optimiser.load_state_dict({**saved, "state": moments})
             align_moments(optimiser)
-        self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
-        self.light.restore(state["light"])  # type: ignore[arg-type]
-        self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
+        self.step, self.skipped, self.bad_run = state["counters"]
+        self.light.restore(state["light"])
+        self.pitch_held_um = state["pitch_held_um"]
 
     def _advance(self, batch: FrameBatch) -> LogRecord:
         """One training step on a batch, with the learning rates at this part of the

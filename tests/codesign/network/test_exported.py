@@ -13,7 +13,6 @@ import torch
 from codesign.eye import CameraRig
 from codesign.network import architecture as arch
 from codesign.network import exported
-from codesign.network.subnet import Subnet
 from codesign.network.supernet import Supernet, recalibrate_batch_norm
 
 SPACE = arch.SearchSpace()
@@ -58,7 +57,7 @@ def graphs(net, tmp_path_factory):
         )
         recalibrate_batch_norm(net, chosen, [_frames(4, size)])
         path = tmp_path_factory.mktemp("graph") / "n.onnx"
-        exported.write_onnx(path, Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
+        exported.write_onnx(path, net, chosen, SCALE, size=size, pitch_um=30.0)
         made[resolution, size] = chosen, copy.deepcopy(net), path
     return made
 
@@ -109,9 +108,7 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
 
     chosen, net, path = graphs[CASES[0]]
     bare = dataclasses.replace(SCALE, axis=False, points=False)
-    exported.write_onnx(
-        tmp_path / "bare", Subnet(net, chosen), bare, size=61, pitch_um=30.0
-    )
+    exported.write_onnx(tmp_path / "bare", net, chosen, bare, size=61, pitch_um=30.0)
     whole, cut = (onnx.load(name) for name in (path, tmp_path / "bare"))
     onnx.checker.check_model(whole, full_check=True)
     assert [v.name for v in cut.graph.output] == [
@@ -126,6 +123,8 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
     } == dict.fromkeys(["pupil_mm", "slip_mm", "slip_sd_mm"], "mm") | {
         "points_mm": "mm"
     }
+    held = sum(np.prod(v.dims) for v in whole.graph.initializer)
+    assert held < 0.6 * sum(p.numel() for p in net.parameters())  # no other network's
     assert whole.graph.output[5].doc_string.endswith("deg")
     about = {p.key: ast.literal_eval(p.value) for p in whole.metadata_props}
     assert about == {

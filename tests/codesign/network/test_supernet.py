@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codesign.network import architecture as arch
-from codesign.network.subnet import Subnet
 from codesign.network.supernet import Supernet, recalibrate_batch_norm, soft_argmax
 from metalens.core.errors import ConfigError, TrainingError
 
@@ -37,34 +36,6 @@ def test_every_sampled_architecture_runs_and_gives_all_outputs(net):
         assert found.centre.shape == (2, 2)
         for value in (found.mask_logits, found.centre, found.slip):
             assert torch.isfinite(value).all()
-
-
-def test_a_subnet_equals_its_slice_of_the_supernet(net):
-    chosen = arch.sample_architecture(SPACE, np.random.default_rng(3))
-    recalibrate_batch_norm(net, chosen, [_frames(), _frames(4)])
-    with torch.no_grad():
-        whole = net(_frames(), chosen)
-        cut = Subnet(net, chosen)(_frames())
-    for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
-        torch.testing.assert_close(
-            a, b, rtol=1e-4, atol=1e-5
-        )  # single precision, laid out otherwise in memory
-    assert sum(p.numel() for p in Subnet(net, chosen).parameters()) < sum(
-        p.numel() for p in net.parameters()
-    )
-
-
-@pytest.mark.filterwarnings(
-    "ignore:.*torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning"
-)
-def test_torchscript_export_gives_equal_outputs(net):
-    chosen = arch.smallest_architecture(SPACE)
-    recalibrate_batch_norm(net, chosen, [_frames(size=96)])
-    cut = Subnet(net, chosen)
-    with torch.no_grad():
-        traced = torch.jit.trace(cut, _frames(size=96))
-        for a, b in zip(cut(_frames(3, 96)), traced(_frames(3, 96)), strict=True):
-            assert torch.allclose(a, b, atol=1e-6)
 
 
 def test_recalibration_gives_the_mean_of_the_batches_whatever_came_before(net):
