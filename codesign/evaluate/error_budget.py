@@ -475,7 +475,8 @@ class ErrorBudget:
         designed = self.lens.diameters
         rounded = np.rint(designed.diameter_um / step_um) * step_um
         on_mask = replace(designed, diameter_um=rounded.astype(np.float32))
-        drawn = self.made.redrawn(replace(self.lens, diameters=on_mask))
+        lens = replace(self.lens, diameters=on_mask)
+        drawn = MadeLens(lens, self.settings, response=self.made.response)
         method = f"every diameter rounded to {step_um * 1e3:g} nm"
         yield self._changed("mask grid", method, made=drawn)
 
