@@ -28,7 +28,10 @@ def check_ranges(record: Any, **limits: tuple[float, float]) -> None:
         if value is not None and not all(
             least <= v <= largest for v in np.ravel(value)
         ):
-            raise ConfigError(f"{name} = {value}: need {least:g} to {largest:g}")
+            need = "above 0" if least == LEAST else f"{least:g} or more"
+            if largest < LARGEST:
+                need = f"{least:g} to {largest:g}"
+            raise ConfigError(f"{name} = {value}: need {need}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +105,8 @@ class ExperimentConfig:
             or not 3 <= round(self.share * points) < points
         ):
             raise ConfigError(
-                f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
-                "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
+                f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a "
+                "subject, 2 x 2 stimuli, 3 of them to calibrate on, and some to judge"
             )
         rest = ("hidden", "seed", "fixation_deg", "pupil_sd")
         check_ranges(self, **dict.fromkeys(rest, (0, LARGEST)))

@@ -22,7 +22,7 @@ from codesign.eye import (
     render_dressed,
 )
 from codesign.eye import population as eye
-from metalens.core.errors import ConfigError
+from codesign.settings import LARGEST, check_ranges
 
 # Streams of the random generator. Training, the search's selection, the calibration of
 # intervals and the test each have frames that no other one uses.
@@ -84,33 +84,19 @@ class SceneConfig:
     blinks: float = field(default=0.0, metadata={"most": 1.0})
 
     def __post_init__(self) -> None:
-        if (
-            self.pixels < 32
-            or not 0 <= self.margin < self.pixels
-            or not 0 <= self.scale < 0.5
-        ):
-            raise ConfigError(
-                f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
-                "margin below them, and a scale below 0.5"
-            )
-        if max(abs(self.elevation_deg), abs(self.azimuth_deg)) > 80:
-            raise ConfigError(
-                f"elevation_deg = {self.elevation_deg}, azimuth_deg = {self.azimuth_deg}: need angles of -80 to 80"
-            )
-        if (
-            min(self.slip_mm) < 0
-            or self.slip_mm[2] >= self.eye_distance_mm
-            or not all(0 <= turn < 60 for turn in self.gaze_deg)
-        ):
-            raise ConfigError(
-                f"slip_mm = {self.slip_mm}, gaze_deg = {self.gaze_deg}: need largest slippages of 0 or more, along z "
-                f"below the {self.eye_distance_mm:g} mm of scenes.eye_distance_mm, and angles of 0 to 60, as eyes turn"
-            )
-        if self.pool < 0 or not self.depth_sd_mm >= 0 or not 0 <= self.variety <= 4:
-            raise ConfigError(
-                f"pool = {self.pool}, depth_sd_mm = {self.depth_sd_mm}, variety = {self.variety}: need the first two 0 "
-                "or more, and a variety of 0 to 4"
-            )
+        check_ranges(
+            self,
+            pixels=(32, LARGEST),
+            margin=(0, self.pixels - 1),
+            scale=(0, 0.49),
+            elevation_deg=(-80, 80),
+            azimuth_deg=(-80, 80),
+            slip_mm=(0, self.eye_distance_mm),
+            gaze_deg=(0, 59.9),  # as eyes turn
+            pool=(0, LARGEST),
+            depth_sd_mm=(0, LARGEST),
+            variety=(0, 4),
+        )
 
     @property
     def pupil_depths_um(self) -> tuple[float, float]:

@@ -106,10 +106,12 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
     if not births:
         return []
     costs, errors = ([e[name] for e in births] for name in ("mmacs", "error"))
-    # of equal costs the lower error comes first
-    order = sorted(range(len(births)), key=lambda i: (costs[i], errors[i]))
-    best = np.minimum.accumulate([math.inf, *(errors[i] for i in order)])
-    front = [i for i, before in zip(order, best, strict=False) if errors[i] < before]
+    pairs = list(zip(costs, errors, strict=True))
+    front = [
+        number
+        for number, (cost, error) in enumerate(pairs)
+        if not any(c <= cost and e <= error for c, e in set(pairs) - {(cost, error)})
+    ]
     return [
         PointPanel(
             "Networks of the searches",
@@ -119,32 +121,9 @@ def _search_panels(entries: list[dict[str, Any]]) -> list[Panel]:
             "gaze error / deg",
             [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
             front,
-            notes=[_layers(e["architecture"]) for e in births],
-            caption="Errors are of the validation frames. Pick a network to read its layers.",
+            caption="Errors are of the validation frames; log.jsonl holds the layers.",
         )
     ]
-
-
-def _layers(architecture: dict[str, Any]) -> dict[str, str]:
-    """{property: value} of a network: input scale, channels, blocks of each stage.
-
-    A block is written kernel × kernel × expansion.
-    """
-    depths = architecture["depths"]
-    slots = len(architecture["kernels"]) // len(depths)
-    blocks = [
-        f"{kernel}×{kernel} × {expansion:g}"
-        for kernel, expansion in zip(
-            architecture["kernels"], architecture["expansions"], strict=True
-        )
-    ]
-    return {
-        "input scale": f"{architecture['resolution']:.3g}",
-        "channels, of the full ones": f"{architecture['width']:.3g}",
-    } | {
-        f"stage {stage + 1}": ", ".join(blocks[stage * slots : stage * slots + depth])
-        for stage, depth in enumerate(depths)
-    }
 
 
 def prediction_panels(path: Path) -> list[Panel]:
@@ -215,7 +194,7 @@ def _pixels(
 
 
 def scene_panels(path: Path) -> list[Panel]:
-    """Rendered eyes, depth in mm, pupil mask, and a table of the labels of every frame.
+    """Rendered eyes, depth in mm and pupil mask of every frame; labels.csv holds labels.
 
     The depth of a pixel is that of the sheet that covers most of it.
 
@@ -223,32 +202,19 @@ def scene_panels(path: Path) -> list[Panel]:
         path: of the file.
     """
     arrays = store.load(path, "scene").arrays
-    count = len(arrays["radiance"])
-    frames = [SliderAxis("frame", list(range(count)))]
+    frames = [SliderAxis("frame", list(range(len(arrays["radiance"]))))]
     full = float(np.iinfo(arrays["radiance"].dtype).max)
     # the far sheet's depth counts where it covers most of the pixel
     is_far = arrays["coverage"] > full / 2
     depth_mm = 1e-3 * np.where(
         is_far, arrays["depth_um"][:, 1], arrays["depth_um"][:, 0]
     )
-    columns: list[str] = []
-    labels: list[Array] = []
-    for name in ("slip_um", "pupil_um", "visible"):
-        labels.append(arrays[f"labels/{name}"].reshape(count, -1))
-        axes = [f", {axis}" for axis in "xyz"] if labels[-1].shape[1] > 1 else [""]
-        columns += [report.in_words(name) + axis for axis in axes]
     radiance = arrays["radiance"].sum(1, dtype=float) / full
     pupil = arrays["pupil"] / full
     return [
         _pixels("Rendered eyes", radiance, frames, "of full light"),
         _pixels("Depth", depth_mm, frames, "mm from the lens", from_least=True),
         _pixels("Pupil", pupil, frames, "share of the pixel"),
-        TablePanel(
-            "Labels",
-            ("frame", *columns),
-            [(k, *row) for k, row in enumerate(np.concatenate(labels, 1).tolist())],
-            "Positions in the camera's axes; labels.csv holds all of them.",
-        ),
     ]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign.settings import LEAST, check_ranges
 from metalens.aberrations import OverField, frequencies_per_mm, over_field
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
@@ -40,19 +41,17 @@ class FieldSetting:
     depth_mm: float | None = None
 
     def __post_init__(self) -> None:
-        angles, frequencies = self.angles_deg, self.frequencies_per_mm
-        if angles is not None and not (angles and max(map(abs, angles)) < 85):
-            raise ConfigError(
-                f"angles_deg = {angles}: need one field angle or more, between -85 and 85"
-            )
-        if frequencies is not None and not (frequencies and min(frequencies) > 0):
-            raise ConfigError(
-                f"frequencies_per_mm = {frequencies}: need one or more, all above 0"
-            )
-        if self.depth_mm is not None and not self.depth_mm > 0:
-            raise ConfigError(
-                f"depth_mm = {self.depth_mm}: need a depth above 0, or inf"
-            )
+        empty = [
+            name
+            for name in ("angles_deg", "frequencies_per_mm")
+            if getattr(self, name) == ()
+        ]
+        if empty:
+            raise ConfigError(f"{empty[0]} = (): need one or more")
+        above_0 = (LEAST, math.inf)
+        check_ranges(
+            self, angles_deg=(-84.9, 84.9), frequencies_per_mm=above_0, depth_mm=above_0
+        )
 
     def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
         """Aberrations of a lens over the field.

@@ -75,12 +75,8 @@ class ReaderConfig:
             pitch_um=(LEAST, LARGEST),
             electrons=(LEAST, LARGEST),
             fwhm_nm=(0, LARGEST),
+            depths_mm=(LEAST, LARGEST),
         )
-        nearest, farthest = self.depths_mm
-        if not 0 < nearest < farthest < math.inf:
-            raise ConfigError(
-                f"reader: depths_mm = {self.depths_mm}: need 0 < least < largest"
-            )
 
     @property
     def margin(self) -> int:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from codesign.settings import LARGEST, LEAST, check_ranges
 from metalens.core.errors import ConfigError
 
 Activation = Literal["relu", "hardswish"]
@@ -76,20 +77,14 @@ class SearchSpace:
     resolution: tuple[float, float] = (0.3, 1.0)
 
     def __post_init__(self) -> None:
-        for name in ("stages", "kernels", "expansions", "depths", "widths"):
-            if not getattr(self, name):
-                raise ConfigError(f"space.{name} is empty: need one choice or more")
+        check_ranges(
+            self, widths=(LEAST, LARGEST), depths=(1, LARGEST), expansions=(1, LARGEST)
+        )
         low, high = self.resolution
-        if not 0 < low <= high <= 1 or min(self.widths) <= 0 or min(self.depths) < 1:
+        if not 0 < low <= high <= 1 or any(k < 1 or k % 2 == 0 for k in self.kernels):
             raise ConfigError(
-                f"space: resolution = {self.resolution}, widths = {self.widths}, "
-                f"depths = {self.depths}: need 0 < least <= largest <= 1, widths "
-                "above 0 and depths of 1 or more"
-            )
-        if any(k < 1 or k % 2 == 0 for k in self.kernels) or min(self.expansions) < 1:
-            raise ConfigError(
-                f"space: kernels = {self.kernels}, expansions = {self.expansions}: "
-                "need odd kernels and expansions of 1 or more"
+                f"space: resolution = {self.resolution}, kernels = {self.kernels}: "
+                "need 0 < least <= largest <= 1 and odd kernels"
             )
 
     @property

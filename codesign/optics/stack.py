@@ -25,6 +25,7 @@ from codesign.optics.lens_errors import (
     variance_rad2,
     wave_front_rad,
 )
+from codesign.settings import LARGEST, LEAST, check_ranges
 from metalens import library
 from metalens.cell import Cell
 from metalens.core.arrays import Array
@@ -122,34 +123,13 @@ class OpticsConfig:
                 f"depths_mm = {self.depths_mm}, depth_count = {self.depth_count}: need 0 < least < largest and a count "
                 "of 2 or more"
             )
-        if (
-            min(
-                self.aperture_mm,
-                self.sensor_distance_mm,
-                self.wavelength_nm,
-                self.focus_mm,
-                self.sample_um,
-            )
-            <= 0
-        ):
-            raise ConfigError(
-                "aperture, sensor distance, wavelength, focus and sample must all be above 0"
-            )
-        if not abs(self.angle_deg) <= 40:
-            raise ConfigError(
-                f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees"
-            )
-        if self.zones < 0 or self.polynomials < 0:
-            raise ConfigError(
-                f"zones = {self.zones}, polynomials = {self.polynomials}: need 0 or more"
-            )
-        if not (
-            self.fwhm_nm >= 0 and self.filter_nm >= 0 and 0 < self.image_tolerance < 1
-        ):
-            raise ConfigError(
-                f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, image_tolerance = {self.image_tolerance}: "
-                "need widths of 0 or more and a tolerance between 0 and 1"
-            )
+        lengths = (
+            "aperture_mm", "sensor_distance_mm", "wavelength_nm", "focus_mm", "sample_um",
+        )  # fmt: skip
+        check_ranges(self, **dict.fromkeys(lengths, (LEAST, LARGEST)))
+        counts = ("zones", "polynomials", "fwhm_nm", "filter_nm")
+        check_ranges(self, **dict.fromkeys(counts, (0, LARGEST)))
+        check_ranges(self, angle_deg=(-40, 40), image_tolerance=(LEAST, 1))
         if self.image == "uniform" and (
             self.fwhm_nm or self.filter_nm or self.layers is not None
         ):

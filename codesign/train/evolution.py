@@ -21,6 +21,7 @@ from codesign.network import (
     sample_architecture,
     smallest_architecture,
 )
+from codesign.settings import LARGEST, check_ranges
 from metalens.core.errors import TrainingError
 
 
@@ -57,22 +58,13 @@ class EvolutionSettings:
     inner_steps: int = 0
 
     def __post_init__(self) -> None:
-        if self.inner_steps < 0:
-            raise TrainingError(
-                f"inner_steps = {self.inner_steps}: need 0 or more steps"
-            )
-        if self.together < 1:
-            raise TrainingError(
-                f"together = {self.together}: need 1 or more candidates at once"
-            )
-        if not (
-            self.population >= 1
-            and 1 <= self.tournament <= self.population <= self.rounds
-        ):
-            raise TrainingError(
-                f"population {self.population}, tournament {self.tournament}, rounds {self.rounds}: need "
-                "1 <= population, 1 <= tournament <= population <= rounds"
-            )
+        check_ranges(
+            self,
+            inner_steps=(0, LARGEST),
+            together=(1, LARGEST),
+            population=(1, self.rounds),
+            tournament=(1, self.population),
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from codesign.batches import (
 )
 from codesign.network import Architecture, SearchSpace, cost, smallest_architecture
 from codesign.optics import OpticsConfig
-from codesign.settings import Part
+from codesign.settings import LARGEST, LEAST, Part, check_ranges
 from codesign.train import checkpoint, evolution
 from codesign.train.evolution import EvolutionSettings, EvolutionState
 from codesign.train.trainer import (
@@ -63,22 +63,16 @@ class RunBudgets:
     finetune_steps: int = 0
 
     def __post_init__(self) -> None:
-        if (
-            not self.pitch_um > 0
-            or not self.budgets_mmacs
-            or min(self.budgets_mmacs) <= 0
-        ):
-            raise ConfigError(
-                f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0"
-            )
+        above_0 = (LEAST, LARGEST)
+        check_ranges(
+            self, pitch_um=above_0, budgets_mmacs=above_0, finetune_steps=(0, LARGEST)
+        )
         if len({f"{budget:g}" for budget in self.budgets_mmacs}) < len(
             self.budgets_mmacs
         ):
             raise ConfigError(
                 f"budgets_mmacs = {self.budgets_mmacs}: two are alike, and so would be their files' names"
             )
-        if self.finetune_steps < 0:
-            raise ConfigError(f"finetune_steps = {self.finetune_steps}: need 0 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +103,8 @@ class RunConfig:
     run: RunBudgets = field(default_factory=RunBudgets)
 
     def __post_init__(self) -> None:
-        if min(self.checkpoint_every, self.validation_batches, self.test_batches) < 1:
-            raise ConfigError(
-                "checkpoint_every, validation_batches and test_batches must be 1 or more"
-            )
+        counts = ("checkpoint_every", "validation_batches", "test_batches")
+        check_ranges(self, **dict.fromkeys(counts, (1, LARGEST)))
         if 0 < self.scenes.pool < self.inner.batch:
             raise ConfigError(
                 f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}: need a pool of a batch or more, "

@@ -13,7 +13,7 @@ from torch import Tensor
 from codesign.batches import EyeScenes
 from codesign.eye import moved_states, render
 from codesign.optics import OpticsConfig, PixelPsfStack
-from metalens.core.errors import ConfigError
+from codesign.settings import LARGEST, LEAST, check_ranges
 from metalens.image import (
     Frames,
     OpticsLoss,
@@ -49,18 +49,16 @@ class SeparabilityConfig:
     compactness: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.every < 0 or self.triplets < 1:
-            raise ConfigError(
-                f"separability: every = {self.every}, triplets = {self.triplets}: "
-                "need 0 or more steps and 1 triplet or more"
-            )
-        if not (self.gaze_step_deg > 0 and self.slip_step_um > 0):
-            raise ConfigError(
-                f"separability: gaze_step_deg = {self.gaze_step_deg}, slip_step_um = "
-                f"{self.slip_step_um}: need steps above 0"
-            )
-        if min(self.orthogonality, self.compactness) < 0:
-            raise ConfigError("separability: need weights of 0 or more")
+        above_0, not_below_0 = (LEAST, LARGEST), (0, LARGEST)
+        check_ranges(
+            self,
+            every=not_below_0,
+            triplets=(1, LARGEST),
+            gaze_step_deg=above_0,
+            slip_step_um=above_0,
+            orthogonality=not_below_0,
+            compactness=not_below_0,
+        )
 
     @property
     def directions(self) -> tuple[tuple[str, int, float], ...]:

@@ -37,7 +37,7 @@ from codesign.network import (
 )
 from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
-from codesign.settings import Place
+from codesign.settings import LARGEST, LEAST, Place, check_ranges
 from codesign.train.evolution import Count, sample_sandwich
 from codesign.train.imaging import StepImaging, frame_wide, read_out, seeded_generator
 from codesign.train.separability import (
@@ -248,14 +248,9 @@ class InnerConfig:
     separability: SeparabilityConfig = field(default_factory=SeparabilityConfig)
 
     def __post_init__(self) -> None:
-        if (
-            min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1
-            or min(self.slip_scale_mm) <= 0
-        ):
-            raise ConfigError(
-                f"steps {self.steps}, batch {self.batch}, patience {self.patience}, refresh {self.refresh}, draws "
-                f"{self.draws}: need 1 or more; slip_scale_mm {self.slip_scale_mm}: need all above 0"
-            )
+        counts = ("steps", "batch", "patience", "refresh", "draws")
+        check_ranges(self, **dict.fromkeys(counts, (1, LARGEST)))
+        check_ranges(self, slip_scale_mm=(LEAST, LARGEST))
 
 
 def _reading_layers(net: nn.Module) -> list[nn.Parameter]:

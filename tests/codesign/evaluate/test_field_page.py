@@ -29,7 +29,7 @@ def test_what_is_left_out_is_of_the_first_lens_and_the_other_angles():
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"angles_deg": ()}, "angles_deg"), ({"angles_deg": (85.0,)}, "between -85 and 85"),
+    [({"angles_deg": ()}, "angles_deg"), ({"angles_deg": (85.0,)}, "need -84.9 to 84.9"),
      ({"frequencies_per_mm": (0.0,)}, "frequencies_per_mm"), ({"frequencies_per_mm": ()}, "one or more"),
      ({"depth_mm": 0.0}, "depth_mm"), ({"depth_mm": math.nan}, "depth_mm")],
 )  # fmt: skip

@@ -169,8 +169,8 @@ def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
         ({"image": "uniform", "fwhm_nm": 30.0}, "image of one wavelength"),
         ({"image": "uniform", "layers": Layers(stop=Stop(100.0, 300.0))}, "no layers"),
         ({"filter_nm": 10.0}, "one wavelength: give fwhm_nm"),
-        ({"fwhm_nm": -1.0}, "widths of 0 or more"),
-        ({"image_tolerance": 0.0}, "tolerance between 0 and 1"),
+        ({"fwhm_nm": -1.0}, "fwhm_nm = -1.0: need 0 or more"),
+        ({"image_tolerance": 0.0}, "image_tolerance = 0.0"),
     ],
 )
 def test_impossible_sources_are_refused(change, message):

@@ -13,7 +13,7 @@ from codesign.network import architecture as arch
 from codesign.network import cost
 from codesign.train import evolution
 from codesign.train.evolution import EvaluatedCandidate, EvolutionSettings
-from metalens.core.errors import TrainingError
+from metalens.core.errors import ConfigError, TrainingError
 
 SPACE = arch.SearchSpace()
 TARGET = arch.sample_architecture(SPACE, np.random.default_rng(42))
@@ -85,7 +85,7 @@ def test_candidates_born_together_do_not_know_of_each_other():
     assert (
         _run(plan=EvolutionSettings(8, 3, 30, together=4), start=middle)[-1] == four[-1]
     )
-    with pytest.raises(TrainingError, match="together = 0"):
+    with pytest.raises(ConfigError, match="together = 0"):
         EvolutionSettings(together=0)
 
 
