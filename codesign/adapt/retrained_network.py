@@ -6,7 +6,6 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
@@ -103,26 +102,26 @@ def load_retrained(path: Path) -> FinishedRun:
     recipe = config.load(folder / RECIPE, RetrainingRecipe)
     run_dir = _unchanged(folder, "run", recipe.weights)
     built = AsBuilt.load(_unchanged(folder, "asbuilt", recipe.asbuilt))
-    truth = None
-    if recipe.truth:
-        truth = config.load(_unchanged(folder, "truth", recipe.truth), HiddenLens)
     source = load_finished_run(run_dir, budget_mmacs=recipe.settings.budget_mmacs)
     design = lenses.load_plain(
         lens_file(run_dir, source.settings, source.row["budget_mmacs"])
     )
-    made = MadeLens(design, source.settings.optics, response=built.response)
-    psfs = retraining.lens_psfs(made, built, recipe.settings, truth)
-    stacks = retraining.training_stacks(psfs)
+    lens = MadeLens(design, source.settings.optics, response=built.response)
+    made = fitted = lens.stack(built.parameters())
+    stacks = {"nominal": lens.stack(), "retrained": fitted}
+    if recipe.truth:
+        truth = config.load(_unchanged(folder, "truth", recipe.truth), HiddenLens)
+        made = stacks["known"] = lens.stack(truth.vector())
     if job not in stacks or not (folder / f"{job}.safetensors").is_file():
         available = ", ".join(f"{name}.safetensors" for name in stacks)
         raise TrainingError(
             f"{path}: no network of this retraining; it holds {available}"
         )
-    trainer = retraining.make_trainer(source, recipe.settings, stacks[job])
+    # batch statistics are those behind the lens that the network was trained on for
+    trainer = retraining.make_trainer(source, recipe.settings, (stacks[job],))
     state = checkpoint.load(folder / f"{job}.safetensors", settings=recipe)
-    trainer.restore(state["trainer"])
-    stack = psfs.judges[0] if psfs.known else psfs.best
-    return replace(source, run=replace(source.run, trainer=trainer), made=stack)
+    trainer.model.restore(state["trainer"])
+    return replace(source, run=replace(source.run, trainer=trainer), made=made)
 
 
 def _folder(path: Path) -> Path:
@@ -136,18 +135,14 @@ def _input_paths(folder: Path) -> dict[str, Path | None]:
         TrainingError: it is not finished, or of a version that did not note them.
     """
     try:
-        inputs: dict[str, Any] = json.loads((folder / RESULT).read_text("utf-8"))[
-            "given"
-        ]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        inputs = json.loads((folder / RESULT).read_text("utf-8"))["given"]
+        names = ("run", "asbuilt", "truth")
+        return {name: folder / inputs[name] if inputs[name] else None for name in names}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         raise TrainingError(
             f"{folder} holds a retraining that is not finished, or of a version that did not note its run and fit: go "
             f"on with `metalens retrain RUN_DIR --asbuilt FILE -o {folder} --resume`"
         ) from None
-    return {
-        name: folder / inputs[name] if inputs.get(name) else None
-        for name in ("run", "asbuilt", "truth")
-    }
 
 
 def _unchanged(folder: Path, name: str, sha: str) -> Path:
@@ -156,9 +151,9 @@ def _unchanged(folder: Path, name: str, sha: str) -> Path:
     Raises:
         TrainingError: the input is missing or another, with its name and path.
     """
-    path = _input_paths(folder)[name]
-    file = path / "checkpoint.safetensors" if path and name == "run" else path
-    if path is None or file is None or not file.is_file():
+    path = _input_paths(folder)[name] or folder
+    file = path / "checkpoint.safetensors" if name == "run" else path
+    if not file.is_file():
         raise TrainingError(
             f"{folder}: its {name} is no longer at {path}; put it back, or retrain from where it is"
         )

@@ -19,7 +19,6 @@ from codesign.optics import MadeLens, PixelPsfStack, as_built_lens
 from codesign.settings import RetrainConfig
 from codesign.train import (
     InnerConfig,
-    LearningRateSchedule,
     LogRecord,
     SensorFrames,
     Trainer,
@@ -198,11 +197,8 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
     Args:
         inner: of the run. config: of the retraining.
     """
-    fixed = LearningRateSchedule(0.0)
-    return replace(
-        inner, steps=config.steps, seed=inner.seed + APART * (config.seed + 1),
-        weights=replace(inner.weights, rate=config.rate, start=0.0, end=1.0), optics=fixed, pitch=fixed,
-    )  # fmt: skip
+    seed = inner.seed + APART * (config.seed + 1)
+    return inner.fine_tuning(config.steps, seed, weights=config.rate)
 
 
 def training_stacks(psfs: LensPsfs) -> dict[str, tuple[PixelPsfStack, ...]]:

@@ -2,11 +2,14 @@
 (paper Eq. 9).
 """
 
+import functools
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from codesign.network import blur
@@ -76,6 +79,7 @@ def backbone_cost(
     return MacPolynomial(per_pixel, constant)
 
 
+@functools.lru_cache(maxsize=1024)
 def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomial:
     """Multiply-accumulates of backbone, blur branch, perception and calibration head.
 
@@ -175,38 +179,17 @@ def macs_of_size(
 def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
     """Monotone cubic interpolation of integer-size counts at a continuous size.
 
-    Fritsch and Carlson 1980, differentiable: exact at integers, never decreasing, and
-    of zero gradient between equal counts.
+    Fritsch and Carlson 1980, with its derivative: exact at integers, never decreasing,
+    and of zero gradient between equal counts.
 
     Args:
         at: exact counts at integer sizes. size: scalar.
     """
     size = torch.as_tensor(size, dtype=torch.float64)
-    low = int(torch.floor(size.detach()))
-    counts = at(np.arange(low - 1, low + 3)).astype(float)
-    previous, left, right, next_count = (
-        torch.tensor(c, dtype=torch.float64) for c in counts
-    )
-    left_slope = _slope(left - previous, right - left)
-    right_slope = _slope(right - left, next_count - right)
-    fraction = size - low
-    return (
-        left * (1 + 2 * fraction) * (1 - fraction) ** 2
-        + right * fraction**2 * (3 - 2 * fraction)
-        + left_slope * fraction * (1 - fraction) ** 2
-        + right_slope * fraction**2 * (fraction - 1)
-    )
-
-
-def _slope(left: Tensor, right: Tensor) -> Tensor:
-    """Slope of the monotone cubic: harmonic mean of both rises, 0 unless both are
-    above 0.
-    """
-    return torch.where(
-        (left > 0) & (right > 0),
-        2 * left * right / (left + right).clamp_min(1),
-        torch.zeros_like(left),
-    )
+    value = float(size.detach())
+    integers = math.floor(value) + np.arange(-1, 3)
+    count = PchipInterpolator(integers, at(integers))
+    return float(count(value)) + float(count(value, 1)) * (size - value)
 
 
 def macs(

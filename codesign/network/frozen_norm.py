@@ -55,22 +55,3 @@ class RunningNorm(nn.Module):
             share = 1 / min(int(self.batches), REACH)
             self.mean.lerp_(moments[0], share)
             self.square.lerp_(moments[1], share)
-
-
-def keep_running_means(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
-    """Every running mean of a network with a copy of it as it is now, for
-    :func:`put_back`.
-
-    Args:
-        net: network.
-    """
-    buffers = [
-        b for m in net.modules() if isinstance(m, RunningNorm) for b in m.buffers()
-    ]
-    return [(b, b.clone()) for b in buffers]
-
-
-def put_back(means: list[tuple[Tensor, Tensor]]) -> None:
-    """Restore running means of :func:`keep_running_means`, for a skipped step."""
-    for mean, before in means:
-        mean.copy_(before)

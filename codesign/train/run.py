@@ -275,11 +275,10 @@ def _finest_affordable_pitch_um(run: CodesignRun, *, moves: bool) -> float:
     if count(start_um) > budget:
         coarsest_um = cost.coarsest_um(run.window_um, settings.space.resolution[0])
         affordable_um = finest_within(count, budget, start_um, coarsest_um)
-        advice = (
-            ""
-            if affordable_um is None
-            else f", or begin with run.pitch_um = {math.ceil(affordable_um * 100) / 100:g} or more"
-        )
+        advice = ""
+        if count(affordable_um) <= budget:
+            finest = math.ceil(affordable_um * 100) / 100
+            advice = f", or begin with run.pitch_um = {finest:g} or more"
         raise TrainingError(
             f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(start_um) / 1e6:.2f} MMACs at "
             f"run.pitch_um = {start_um:g}: raise run.budgets_mmacs{advice}"
@@ -319,23 +318,21 @@ def finest_pitch_um(
     finest = min(run.settings.optics.sample_um, begins_um)
     if count(finest) <= budget:
         return 0.0
-    return finest_within(count, budget, finest, begins_um) or begins_um
+    return finest_within(count, budget, finest, begins_um)
 
 
 def finest_within(
     count: Callable[[float], float], budget: float, low_um: float, high_um: float
-) -> float | None:
+) -> float:
     """The finest pitch in um within the budget, by geometric bisection over a range.
 
-    The low pitch is taken to be beyond the budget. None where the high one is too, or
-    the range is empty.
+    The low pitch is taken to be beyond the budget; the high one where no other is
+    within it.
 
     Args:
         count: multiply-accumulates at a pitch in um. budget: of them.
         low_um: finest pitch. high_um: coarsest pitch.
     """
-    if high_um <= low_um or count(high_um) > budget:
-        return None
     for _ in range(40):
         middle = math.sqrt(low_um * high_um)
         low_um, high_um = (

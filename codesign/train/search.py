@@ -17,7 +17,7 @@ from codesign.network import Architecture, recalibrate_batch_norm
 from codesign.train import assess, evolution
 from codesign.train.evolution import EvaluatedCandidate, EvolutionSettings
 from codesign.train.run import CodesignRun, finest_pitch_um, save_run
-from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
+from codesign.train.trainer import Trainer
 
 PEOPLE_EACH = 20  # frames of a person, of which a fifth calibrates
 SLOWER = 4  # rates of the inner optimisation are those of training over this
@@ -40,13 +40,13 @@ def specialise_candidate(
     model = copy.deepcopy(source.model)
     key = repr((architecture, budget_mmacs)).encode()
     seed = source.inner.seed + 1000 + zlib.crc32(key) % 1_000_003
-    joint = _fine_tuning(source.inner, settings.search.inner_steps, seed)
-    joint = replace(joint, budget_mmacs=budget_mmacs)
-    weights = replace(
-        _fine_tuning(source.inner, settings.run.finetune_steps, seed + 1),
-        optics=LearningRateSchedule(0.0),
-        pitch=LearningRateSchedule(0.0),
-    )
+    steps = settings.search.inner_steps, settings.run.finetune_steps
+    rates = {
+        name: getattr(source.inner, name).rate / SLOWER
+        for name in ("weights", "optics", "pitch")
+    }
+    joint = source.inner.fine_tuning(steps[0], seed, **rates)
+    weights = source.inner.fine_tuning(steps[1], seed + 1, weights=rates["weights"])
     if settings.search.inner_steps:
         model.finest_um = finest_pitch_um(
             run,
@@ -55,9 +55,8 @@ def specialise_candidate(
             begins_um=float(model.pitch_um.detach()),
         )
     with parallel.single_process():
-        for inner, steps in (
-            (joint, settings.search.inner_steps),
-            (weights, settings.run.finetune_steps),
+        for inner, count in zip(
+            (replace(joint, budget_mmacs=budget_mmacs), weights), steps, strict=True
         ):
             trainer = Trainer(
                 inner,
@@ -70,24 +69,9 @@ def specialise_candidate(
                 triplets=source.triplets,
             )
             trainer.light.device = source.light.device
-            for _ in trainer.run() if steps else ():
+            for _ in trainer.run() if count else ():
                 pass
     return trainer
-
-
-def _fine_tuning(inner: InnerConfig, steps: int, seed: int) -> InnerConfig:
-    """Settings of a fine-tuning: all groups move in every step, at 1 / SLOWER of the
-    rates.
-    """
-    groups = {
-        name: replace(schedule, rate=schedule.rate / SLOWER, start=0.0, end=1.0)
-        for name, schedule in (
-            ("weights", inner.weights),
-            ("optics", inner.optics),
-            ("pitch", inner.pitch),
-        )
-    }
-    return replace(inner, steps=max(steps, 1), seed=seed, **groups)  # type: ignore[arg-type]
 
 
 def people_of(run: CodesignRun, stream: int, batches: int) -> bench.PeopleFrames:

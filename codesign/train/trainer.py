@@ -32,7 +32,6 @@ from codesign.network import (
     Supernet,
     blur,
     cost,
-    frozen_norm,
     losses,
 )
 from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
@@ -170,8 +169,8 @@ def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
     Args:
         parameters: with gradients.
     """
-    grads = (p.grad for p in parameters if p.grad is not None)
-    return all(bool(torch.isfinite(grad).all()) for grad in grads)
+    grads = [p.grad for p in parameters if p.grad is not None]
+    return bool(torch.isfinite(nn.utils.get_total_norm(grads)))
 
 
 def align_moments(optimiser: torch.optim.Optimizer) -> None:
@@ -252,6 +251,21 @@ class InnerConfig:
         check_ranges(self, **dict.fromkeys(counts, (1, LARGEST)))
         check_ranges(self, slip_scale_mm=(LEAST, LARGEST))
 
+    def fine_tuning(self, steps: int, seed: int, **rates: float) -> "InnerConfig":
+        """These settings for training on: groups move over all of it, others not.
+
+        Args:
+            steps: of the training, 1 at least. seed: of the training.
+            rates: largest learning rate by name of a group.
+        """
+        groups = {
+            name: replace(
+                getattr(self, name), rate=rates.get(name, 0.0), start=0, end=1
+            )
+            for name in ("weights", "optics", "pitch")
+        }
+        return replace(self, steps=max(steps, 1), seed=seed, **groups)
+
 
 def _reading_layers(net: nn.Module) -> list[nn.Parameter]:
     """Weight matrices of the linear and 1x1 layers of ``net.blur`` and
@@ -301,23 +315,6 @@ def _soap(weights: list[nn.Parameter]) -> torch.optim.Optimizer:
         weights, betas=(0.9, 0.98), weight_decay=0.01, max_precondition_dim=600
     )
     return optimiser
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class StepInputs:
-    """Inputs of one training step.
-
-    light: (batch, y, x) irradiance on the sensor. vergence: (batch, windows, windows)
-    of :func:`blur.window_vergence`. seen: (batch, 1, rows, columns) frames of the
-    sensor; None where the pitch moves, and members read different frames.
-    """
-
-    step: int
-    batch: FrameBatch
-    light: Tensor
-    optics_loss: Tensor
-    vergence: Tensor
-    seen: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,8 +457,11 @@ class Trainer:
         self.pitch_held_um = state["pitch_held_um"]
 
     def _advance(self, batch: FrameBatch) -> LogRecord:
-        """One training step on a batch, with the learning rates at this part of the
-        run.
+        """Backward pass of Eq. 10 on a batch, and one step of every optimiser.
+
+        L = L_task + w_optics L_optics + w_budget mean [C / C_budget - 1]_+. Gradients
+        are averaged over the processes. A step without finite gradients changes no
+        parameter.
         """
         progress = self.step / self.inner.steps
         rates = {
@@ -469,78 +469,34 @@ class Trainer:
         }
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        pitch_moves = rates["pitch"] > 0
         lens_moves = rates["optics"] > 0 and "optics" in self.optimisers
-        inputs = self._prepare_step(
-            self.step, batch, live=lens_moves, read_frames=not pitch_moves
-        )
-        return self._take_step(inputs, rates)
-
-    def _take_step(self, inputs: StepInputs, rates: dict[str, float]) -> LogRecord:
-        """Backward pass of Eq. 10 and one step of every optimiser, by learning rate of
-        a group.
-
-        L = L_task + w_optics L_optics + w_budget mean [C / C_budget - 1]_+. Gradients
-        are averaged over the processes. A step without finite gradients changes no
-        parameter.
-        """
-        means = frozen_norm.keep_running_means(self.model.net)
-        task, macs_of_members = self._losses(inputs, pitch_moves=rates["pitch"] > 0)
-        optics_loss = inputs.optics_loss
-        total = task + self.inner.optics_weight * optics_loss.to(self.light.device)
-        macs = macs_of_members.mean()
+        with torch.set_grad_enabled(lens_moves):
+            imager, optics_loss = self._form_images(batch.frames, lens_moves)
+            light = sensor_irradiance(batch.frames, imager)
+        task, macs = self._losses(batch, light, pitch_moves=rates["pitch"] > 0)
+        device = self.light.device
+        total = task + self.inner.optics_weight * optics_loss.to(device)
         if self._budget:
-            excess = losses.over_budget(macs_of_members, self._budget).mean()
-            total = total + self.inner.budget_weight * excess.to(self.light.device)
+            excess = losses.over_budget(macs, self._budget).mean()
+            total = total + self.inner.budget_weight * excess.to(device)
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.model.coefficients_rad)
-        parallel.average_gradients(p for _, ps in self.groups.values() for p in ps)
+        parameters = [p for _, ps in self.groups.values() for p in ps]
+        parallel.average_gradients(parameters)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
-        finite = finite and has_finite_gradients(
-            p for _, ps in self.groups.values() for p in ps
-        )
-        if not finite:
-            frozen_norm.put_back(means)
-        self._apply(rates, finite=finite)
+        self._apply(rates, finite=finite and has_finite_gradients(parameters))
         self.step += 1
-        values = (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
-        loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of(
-            [float(v.detach()) for v in values]
-        )
-        return LogRecord(
-            self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
-        )
+        values = (total, task, optics_loss, self.model.pitch_um, macs.mean() / 1e6)
+        means = parallel.mean_of([float(v.detach()) for v in values])
+        return LogRecord(self.step, *means, self.skipped)
 
-    def _prepare_step(
-        self, step: int, batch: FrameBatch, *, live: bool, read_frames: bool
-    ) -> StepInputs:
-        """Irradiance, labels and optics loss of a step.
-
-        Args:
-            live: the lens moves, and the light is differentiable in it.
-            read_frames: read the sensor's frames too, at the fixed pitch.
-        """
-        margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
-        with torch.set_grad_enabled(live):
-            optics, optics_loss = self._form_images(step, batch.frames, live)
-            light = sensor_irradiance(batch.frames, optics)
-        vergence = blur.window_vergence(
-            depth_um(batch.frames, margin=margin, device=self.light.device)
-        )
-        frames = self._read_pixels(step, light, pitch, False) if read_frames else None
-        return StepInputs(
-            step, batch.to(self.light.device), light, optics_loss, vergence, frames
-        )
-
-    def _read_pixels(
-        self, step: int, light: Tensor, pitch: Tensor, resized: bool
-    ) -> Tensor:
+    def _read_pixels(self, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
         """(batch, 1, rows, columns) standardised frames of the sensor.
 
         All readings of a step draw the same noise, so that members differ by their
         weights alone. ``resized``: as in :func:`codesign.train.imaging.read_out`.
         """
-        noise = seeded_generator(self.inner.seed, step, 1)
+        noise = seeded_generator(self.inner.seed, self.step, 1)
         return read_out(
             light,
             self.optics.sample_um,
@@ -552,7 +508,7 @@ class Trainer:
         )
 
     def _losses(
-        self, inputs: StepInputs, *, pitch_moves: bool
+        self, batch: FrameBatch, light: Tensor, *, pitch_moves: bool
     ) -> tuple[Tensor, Tensor]:
         """Mean task loss of the step's members, and (members,) multiply-accumulates of
         each.
@@ -561,11 +517,13 @@ class Trainer:
         pose.
 
         Args:
-            pitch_moves: read the frames again, differentiable in the pitch.
+            light: (batch, y, x) irradiance on the sensor.
+            pitch_moves: the frames are differentiable in the pitch.
         """
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
-        scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
-        size_um = inputs.light.shape[-1] * self.optics.sample_um
+        device = self.light.device
+        scale = torch.tensor(self.inner.slip_scale_mm, device=device)
+        size_um = light.shape[-1] * self.optics.sample_um
         space = self.model.net.space
         self._coarsest_um = cost.coarsest_um(size_um, space.resolution[0])
 
@@ -575,18 +533,17 @@ class Trainer:
 
         members = self._members(lambda a: float(macs_at(a, pitch.detach())))
         resized = {a: pitch_moves and a.resolution < 1 for a in members}
-        if inputs.seen is not None:
-            frames = {False: inputs.seen}
-        else:
-            frames = {
-                coarser: self._read_pixels(inputs.step, inputs.light, pitch, coarser)
-                for coarser in set(resized.values())
-            }
-        batch = inputs.batch
+        frames = {
+            coarser: self._read_pixels(light, pitch, coarser)
+            for coarser in set(resized.values())
+        }
+        depths = depth_um(batch.frames, margin=self.scenes.margin, device=device)
+        vergence = blur.window_vergence(depths)
+        batch = batch.to(device)
         pose = batch.pose
         member_losses = []
         frame_width = frame_wide(
-            inputs.light.shape[-1], self.optics.sample_um, float(pitch.detach())
+            light.shape[-1], self.optics.sample_um, float(pitch.detach())
         )
         mask = losses.mask_in_frame(batch.mask, frame_width)
         is_open = (batch.mask.amax((1, 2)) > 0)[:, None]
@@ -598,7 +555,7 @@ class Trainer:
             )
             loss = loss + losses.depth_reading_loss(
                 prediction,
-                inputs.vergence,
+                vergence,
                 shift_mm,
                 scale,
                 depth_weight=self.inner.depth_weight,
@@ -619,7 +576,7 @@ class Trainer:
         return torch.stack(member_losses).mean(), macs
 
     def _form_images(
-        self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
+        self, frames: Frames | SingleSurfaceFrames, live: bool
     ) -> tuple[Imager, Tensor]:
         """Imager of this step's frames, and the optics loss.
 
@@ -627,7 +584,7 @@ class Trainer:
         its weight is ``optics_weight`` on average. With n = 0 it is that of blurred
         texture at every step; 0 where the lens is fixed.
         """
-        coefficients = self.model.coefficients_rad
+        step, coefficients = self.step, self.model.coefficients_rad
         imager = self.light.at(
             step, coefficients, frame_samples(frames), self.scenes.margin, live=live
         )
@@ -698,9 +655,14 @@ class Trainer:
             self.skipped += 1
             self.bad_run += 1
             if self.bad_run >= self.inner.patience:
+                bad = [
+                    name
+                    for name, (_, parameters) in self.groups.items()
+                    if not has_finite_gradients(parameters)
+                ]
                 raise TrainingError(
-                    f"no finite gradient in {self.bad_run} steps up to step {self.step}; {self._culprits()}; "
-                    "lower the learning rates or resume from an earlier checkpoint"
+                    f"no finite gradient in {self.bad_run} steps up to step {self.step}; not finite: "
+                    f"{' and '.join(bad or ['the loss itself'])}; lower the rates, or resume from an earlier checkpoint"
                 )
             return
         self.bad_run = 0
@@ -718,15 +680,6 @@ class Trainer:
             self.pitch_held_um = self.model.hold(
                 finest, max(self._coarsest_um, self._begins_um)
             )
-
-    def _culprits(self) -> str:
-        """Groups whose gradients are not finite, in words."""
-        bad = [
-            name
-            for name, (_, parameters) in self.groups.items()
-            if not has_finite_gradients(parameters)
-        ]
-        return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
 
 
 def compute_ahead(
