@@ -3,7 +3,7 @@ before the eye, uneven light, movement.
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 
@@ -142,33 +142,31 @@ def apply_augmentations(
     light, cover, depth = (
         getattr(rendered.frames, name).clone() for name in Frames.__slots__
     )
-    canvas = _Canvas(light, cover, depth, rendered.pupil.clone(), worn)
-    _apply_liner(canvas)
-    for i, opacity, draws in canvas.having("overhang"):
-        canvas.light[i] *= 1 - opacity * draw_lashes(canvas.cover[i, 1], draws)
-    _add_glints(canvas, rendered.labels)
-    _apply_uneven_light(canvas)
-    _add_spectacles(canvas)
-    _apply_motion_blur(canvas)
+    pupil = rendered.pupil.clone()
+    for i, place in enumerate(rendered.labels.pupil_px.tolist()):
+        canvas = _Canvas(light[i], cover[i], depth[i], pupil[i], place)
+        for name, paint in PAINTERS.items():
+            if size := float(worn.size[name][i]):
+                paint(canvas, size, worn.draws[name][i])
     return RenderedFrames(
         Frames(light, cover, depth),
-        canvas.pupil,
-        _updated_labels(rendered.labels, rendered.pupil, canvas.pupil),
+        pupil,
+        _updated_labels(rendered.labels, rendered.pupil, pupil),
     )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Canvas:
-    """Frames that are painted over in place, and the augmentations of each.
+    """One frame, painted over in place.
 
-    light, cover, depth: (n, 2, y, x). pupil: (n, y, x).
+    light, cover, depth: (2, y, x). pupil: (y, x). pupil_px: x, y of the pupil's centre.
     """
 
     light: Tensor
     cover: Tensor
     depth: Tensor
     pupil: Tensor
-    worn: DrawnAugmentations
+    pupil_px: list[float]
 
     @property
     def pixels(self) -> int:
@@ -181,23 +179,22 @@ class _Canvas:
         line = (torch.arange(self.pixels) + 0.5) / self.pixels - 0.5
         return line[None], line[:, None]
 
-    def having(self, name: str) -> list[tuple[int, float, Array]]:
-        """(frame number, size, draws) of every frame that has the cause ``name``."""
-        size, draws = self.worn.size[name], self.worn.draws[name]
-        return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
 
-
-def _apply_liner(canvas: _Canvas) -> None:
-    """Darken skin within 1.5 to 4 % of the frame of the lid opening, in place.
+def _apply_liner(canvas: _Canvas, opacity: float, draws: Array) -> None:
+    """Darken skin within 1.5 to 4 % of the frame of the lid opening.
 
     On the side of the lower lid on every second frame one row alone.
     """
-    for i, opacity, draws in canvas.having("liner"):
-        reach = max(1, round((0.015 + 0.025 * draws[0]) * canvas.pixels))
-        below = reach if draws[1] < 0.5 else 1
-        padded = F.pad(canvas.cover[i, 1][None, None], (0, 0, below, reach))
-        margin = F.max_pool2d(padded, (reach + below + 1, 1), stride=1)[0, 0]
-        canvas.light[i, 0] *= 1 - opacity * margin
+    reach = max(1, round((0.015 + 0.025 * draws[0]) * canvas.pixels))
+    below = reach if draws[1] < 0.5 else 1
+    padded = F.pad(canvas.cover[1][None, None], (0, 0, below, reach))
+    margin = F.max_pool2d(padded, (reach + below + 1, 1), stride=1)[0, 0]
+    canvas.light[0] *= 1 - opacity * margin
+
+
+def _apply_lashes(canvas: _Canvas, opacity: float, draws: Array) -> None:
+    """Darken both sheets by lashes before the eye."""
+    canvas.light[:] *= 1 - opacity * draw_lashes(canvas.cover[1], draws)
 
 
 def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
@@ -243,100 +240,107 @@ def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
     return torch.from_numpy(canvas).float() / 255
 
 
-def _add_glints(canvas: _Canvas, labels: FrameLabels) -> None:
-    """Add one to four bright spots near the pupil to the far sheet, in place.
+def _add_glints(canvas: _Canvas, radiance: float, draws: Array) -> None:
+    """Add one to four bright spots near the pupil to the far sheet.
 
     Profile 1 / (1 + (r / size)⁴), size 0.5 to 4 % of the frame, times the coverage.
     """
     x, y = canvas.places
-    for i, radiance, draws in canvas.having("glints"):
-        px, py = ((labels.pupil_px[i] + 0.5) / canvas.pixels - 0.5).tolist()
-        distance = 0.02 + 0.07 * draws[4]
-        for k in range(1 + int(4 * draws[5])):
-            angle = 6.283 * draws[3] + 1.7 * k
-            size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
-            dx = x - px - distance * np.cos(angle)
-            dy = y - py - distance * np.sin(angle)
-            canvas.light[i, 1] += (
-                radiance * canvas.cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
-            )
+    px, py = ((place + 0.5) / canvas.pixels - 0.5 for place in canvas.pupil_px)
+    distance = 0.02 + 0.07 * draws[4]
+    for k in range(1 + int(4 * draws[5])):
+        angle = 6.283 * draws[3] + 1.7 * k
+        size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
+        dx = x - px - distance * np.cos(angle)
+        dy = y - py - distance * np.sin(angle)
+        spot = 1 / (1 + ((dx**2 + dy**2) / size**2) ** 2)
+        canvas.light[1] += radiance * canvas.cover[1] * spot
 
 
-def _apply_uneven_light(canvas: _Canvas) -> None:
-    """Multiply both sheets by a linear gradient, and by a shadow of sigmoid edge, in
-    place.
+def _apply_gradient(canvas: _Canvas, change: float, draws: Array) -> None:
+    """Multiply both sheets by a linear gradient."""
+    x, y = canvas.places
+    angle = 6.283 * draws[7]
+    ramp = x * np.cos(angle) + y * np.sin(angle)
+    canvas.light[:] *= (1 + change * 2 * ramp).clamp_min(0.1)
+
+
+def _apply_shade(canvas: _Canvas, loss: float, draws: Array) -> None:
+    """Multiply both sheets by a shadow of sigmoid edge."""
+    x, y = canvas.places
+    angle = 6.283 * draws[8]
+    edge = 0.02 + 0.1 * draws[9]
+    distance = x * np.cos(angle) + y * np.sin(angle) - (draws[10] - 0.5) * 0.6
+    canvas.light[:] *= 1 - loss * torch.sigmoid(distance / edge)
+
+
+def _add_reflections(canvas: _Canvas, radiance: float, draws: Array) -> None:
+    """Add one to three blurred rectangles 1 / (1 + (u / a)⁶ + (v / b)⁶), as spectacle
+    glass reflects.
     """
     x, y = canvas.places
-    for i, change, draws in canvas.having("gradient"):
-        angle = 6.283 * draws[7]
-        ramp = x * np.cos(angle) + y * np.sin(angle)
-        canvas.light[i] *= (1 + change * 2 * ramp).clamp_min(0.1)
-    for i, loss, draws in canvas.having("shade"):
-        angle = 6.283 * draws[8]
-        edge = 0.02 + 0.1 * draws[9]
-        distance = x * np.cos(angle) + y * np.sin(angle) - (draws[10] - 0.5) * 0.6
-        canvas.light[i] *= 1 - loss * torch.sigmoid(distance / edge)
+    lean = 0.6 * (draws[5] - 0.5)
+    for k in range(1 + int(3 * draws[0])):
+        centre_x = (draws[1] + 0.61 * k) % 1 - 0.5
+        centre_y = (draws[2] + 0.43 * k) % 1 - 0.5
+        half_x = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1)
+        half_y = 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
+        u = (x - centre_x) + lean * (y - centre_y)
+        v = (y - centre_y) - lean * (x - centre_x)
+        window = 1 + (u / half_x) ** 6 + (v / half_y) ** 6
+        canvas.light[:] += radiance * canvas.cover / window
 
 
-def _add_spectacles(canvas: _Canvas) -> None:
-    """Add reflections on spectacle glass, then an opaque rim before the face, in place.
-
-    Reflections: one to three blurred rectangles 1 / (1 + (u / a)⁶ + (v / b)⁶). Rim: a
-    band along a circular arc at RIM_DEPTH of the median depth, on the near sheet.
+def _add_rim(canvas: _Canvas, width: float, draws: Array) -> None:
+    """Add an opaque rim of spectacles before the face: a band along a circular arc at
+    RIM_DEPTH of the eye's median depth, on the near sheet.
     """
     x, y = canvas.places
-    for i, radiance, draws in canvas.having("reflection"):
-        for k in range(1 + int(3 * draws[0])):
-            centre_x = (draws[1] + 0.61 * k) % 1 - 0.5
-            centre_y = (draws[2] + 0.43 * k) % 1 - 0.5
-            half_x = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1)
-            half_y = 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
-            lean = 0.6 * (draws[5] - 0.5)
-            u = (x - centre_x) + lean * (y - centre_y)
-            v = (y - centre_y) - lean * (x - centre_x)
-            canvas.light[i] += (
-                radiance * canvas.cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
-            )
-    for i, width, draws in canvas.having("rim"):
-        radius = 0.45 + 0.5 * draws[6]
-        angle = 6.283 * draws[7]
-        middle = radius - 0.30 - 0.17 * draws[8]
-        squeezed_y = (y + middle * np.sin(angle)) * (0.8 + 0.4 * draws[9])
-        distance = torch.hypot(x + middle * np.cos(angle), squeezed_y) - radius
-        band = torch.sigmoid(
-            (width / 2 - (distance - width / 2).abs()) * canvas.pixels * 2
-        )
-        shine = 0.02 + 0.5 * draws[10] ** 2 * (
-            1 + 0.6 * torch.cos(distance / width * 6)
-        )
-        light, cover, depth = canvas.light[i], canvas.cover[i], canvas.depth[i]
-        # the far sheet's depth is 0 behind skin, most of many frames
-        eye_depths = depth[1][depth[1] > 0]
-        rim_depth = (eye_depths if len(eye_depths) else depth[0]).median() * RIM_DEPTH
-        for hidden in (light, cover, canvas.pupil[i]):
-            hidden *= 1 - band
-        light[0] += band * shine
-        cover[0] += band
-        depth[0] = torch.where(band > 0.5, rim_depth, depth[0])
+    radius = 0.45 + 0.5 * draws[6]
+    angle = 6.283 * draws[7]
+    middle = radius - 0.30 - 0.17 * draws[8]
+    squeezed_y = (y + middle * np.sin(angle)) * (0.8 + 0.4 * draws[9])
+    distance = torch.hypot(x + middle * np.cos(angle), squeezed_y) - radius
+    band = torch.sigmoid((width / 2 - (distance - width / 2).abs()) * canvas.pixels * 2)
+    shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(distance / width * 6))
+    light, cover, depth = canvas.light, canvas.cover, canvas.depth
+    # the far sheet's depth is 0 behind skin, most of many frames
+    eye_depths = depth[1][depth[1] > 0]
+    rim_depth = (eye_depths if len(eye_depths) else depth[0]).median() * RIM_DEPTH
+    for hidden in (light, cover, canvas.pupil):
+        hidden *= 1 - band
+    light[0] += band * shine
+    cover[0] += band
+    depth[0] = torch.where(band > 0.5, rim_depth, depth[0])
 
 
-def _apply_motion_blur(canvas: _Canvas) -> None:
-    """Average light, coverage, depth and pupil mask along a line, in place.
+def _apply_motion_blur(canvas: _Canvas, length: float, draws: Array) -> None:
+    """Average light, coverage, depth and pupil mask along a line.
 
     The mean of the depth is weighted by the coverage.
     """
-    for i, length, draws in canvas.having("movement"):
-        kernel = line_kernel(length * canvas.pixels, 3.1416 * draws[11])
-        weight = canvas.cover[i].clamp_min(1e-6)
-        sheets = (canvas.light[i], canvas.cover[i], weight * canvas.depth[i], weight)
-        planes = torch.cat([*sheets, canvas.pupil[i][None]])
-        reach = len(kernel) // 2
-        padded = F.pad(planes[:, None], (reach,) * 4, mode="replicate")
-        blurred = F.conv2d(padded, kernel[None, None])[:, 0]
-        canvas.light[i] = blurred[:2]
-        canvas.cover[i] = blurred[2:4]
-        canvas.depth[i] = blurred[4:6] / blurred[6:8]
-        canvas.pupil[i] = blurred[8]
+    kernel = line_kernel(length * canvas.pixels, 3.1416 * draws[11])
+    weight = canvas.cover.clamp_min(1e-6)
+    sheets = (canvas.light, canvas.cover, weight * canvas.depth, weight)
+    planes = torch.cat([*sheets, canvas.pupil[None]])
+    padded = F.pad(planes[:, None], (len(kernel) // 2,) * 4, mode="replicate")
+    blurred = F.conv2d(padded, kernel[None, None])[:, 0]
+    canvas.light[:], canvas.cover[:] = blurred[:2], blurred[2:4]
+    canvas.depth[:] = blurred[4:6] / blurred[6:8]
+    canvas.pupil[:] = blurred[8]
+
+
+# by cause, in the order that they are painted
+PAINTERS: Mapping[str, Callable[[_Canvas, float, Array], None]] = {
+    "liner": _apply_liner,
+    "overhang": _apply_lashes,
+    "glints": _add_glints,
+    "gradient": _apply_gradient,
+    "shade": _apply_shade,
+    "reflection": _add_reflections,
+    "rim": _add_rim,
+    "movement": _apply_motion_blur,
+}
 
 
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:

@@ -106,7 +106,10 @@ def _iris(rng: np.random.Generator) -> Array:
     )
     row = np.clip((np.hypot(y, x) - 40) / 84, 0, 1) * (rings - 1)
     column = (np.arctan2(y, x) / (2 * math.pi) % 1) * turns
-    return _bilinear(np.tanh(polar), row, column)
+    picture = ndimage.map_coordinates(
+        np.tanh(polar), [row, column], order=1, mode="grid-wrap"
+    )
+    return np.asarray(picture)
 
 
 def _crypt_depth(rng: np.random.Generator, rho: Array, turns: int) -> Array:
@@ -117,23 +120,6 @@ def _crypt_depth(rng: np.random.Generator, rho: Array, turns: int) -> Array:
         offset / rng.uniform(0.006, 0.018)
     )
     return np.asarray(rng.uniform(0.6, 1.3) / (1 + np.exp(6 * (distance - 1))))
-
-
-def _bilinear(picture: Array, row: Array, column: Array) -> Array:
-    """Samples of a picture (row, column) by bilinear interpolation, periodic in
-    columns.
-    """
-    row0, column0 = np.floor(row).astype(int), np.floor(column).astype(int)
-    below = np.minimum(row0 + 1, picture.shape[0] - 1)
-    right = (column0 + 1) % picture.shape[1]
-    x_part, y_part = column - column0, row - row0
-    column0 = column0 % picture.shape[1]
-    top = picture[row0, column0] * (1 - x_part) + picture[row0, right] * x_part
-    return np.asarray(
-        top * (1 - y_part)
-        + (picture[below, column0] * (1 - x_part) + picture[below, right] * x_part)
-        * y_part
-    )
 
 
 def _veins(rng: np.random.Generator) -> Array:
