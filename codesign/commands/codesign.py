@@ -93,7 +93,6 @@ def _train_and_search(
     place_on_device(going.trainer, device)
     parallel.wait_for_all()
     event_writer = _event_writer(folder, going.trainer.step) if options.events else None
-    pitch_reported = False
     records = runs.train_run(going, folder / CHECKPOINT)
     steps_left = settings.inner.steps - going.trainer.step
     for record in console.track(records, total=steps_left, label="training"):
@@ -102,9 +101,6 @@ def _train_and_search(
             for name, value in asdict(record).items():
                 event_writer.add_scalar(name, float(value), record.step)
             event_writer.flush()
-        if (limit := going.trainer.pitch_held_um) is not None and not pitch_reported:
-            pitch_reported = True
-            console.say(f"step {record.step}: {_pitch_limit_text(going, limit)}")
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
@@ -129,23 +125,6 @@ def _train_and_search(
     )  # fmt: skip
     _write_results(folder, going, ends, image, export=options.export)
     return [end.row for end in ends], image
-
-
-def _pitch_limit_text(codesign_run: CodesignRun, limit_um: float) -> str:
-    """Why the pitch was clamped at a limit, and what to change."""
-    settings = codesign_run.settings
-    cause = "coarser pixels would leave a network less than it can take"
-    if limit_um <= codesign_run.trainer.model.finest_um:
-        cause = (
-            "finer pixels take the smallest network beyond the budget of "
-            f"{min(settings.run.budgets_mmacs):g} MMACs"
-        )
-    elif limit_um <= settings.optics.sample_um:
-        cause = (
-            "the samples of the image; halve optics.sample_um, and double optics.window_samples, scenes.pixels and "
-            "scenes.margin, to let it go on"
-        )
-    return f"the pitch is held at {limit_um:.3f} um: {cause}"
 
 
 def _train_along(folder: Path, settings: RunConfig, device: torch.device) -> int:
@@ -248,7 +227,6 @@ def _write_results(
         "rows": rows,
         "frozen": list(settings.run.frozen),
         "image": image,
-        "pitch_held_um": trainer.pitch_held_um,
         "threads": torch.get_num_threads(),
         "bytes_depend_on_threads": True,
     }

@@ -56,18 +56,15 @@ def load_people(path: Path) -> PopulationPrior:
     arrays = store.load(path, KIND).arrays
     found = {name: np.asarray(arrays[name], dtype=float) for name in SHAPES}
     odd = [
-        n
-        for n, shape in SHAPES.items()
-        if found[n].shape != shape or not np.isfinite(found[n]).all()
-    ]
-    odd += [
-        n
-        for n in ("variance", "noise", "spread")
-        if n not in odd and not (found[n] > 0).all()
+        name
+        for name, shape in SHAPES.items()
+        if found[name].shape != shape
+        or not np.isfinite(found[name]).all()
+        or (name in ("variance", "noise", "spread") and found[name].min() <= 0)
     ]
     if odd:
         raise StoreError(
             f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again"
         )
-    model = MixedModel(found["mean"], found["variance"], found["noise"])
-    return PopulationPrior(model, found["middle"], found["spread"])
+    *model, middle, spread = found.values()
+    return PopulationPrior(MixedModel(*model), middle, spread)

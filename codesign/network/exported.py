@@ -2,6 +2,7 @@
 is calibrated from.
 """
 
+import copy
 import math
 import warnings
 from dataclasses import dataclass
@@ -59,7 +60,8 @@ class ExportedNetwork(nn.Module):
         self, net: Supernet, architecture: Architecture, scale: OutputScale
     ) -> None:
         super().__init__()
-        self.net, self.architecture, self.scale = net, architecture, scale
+        self.net = copy.deepcopy(net).cpu()
+        self.architecture, self.scale = architecture, scale
         self.eval()
 
     def forward(self, frames: Tensor) -> tuple[Tensor, ...]:

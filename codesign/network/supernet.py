@@ -412,6 +412,7 @@ def recalibrate_batch_norm(
         TrainingError: no batch.
     """
     net.eval()
+    device = next(net.parameters()).device
     norms = [m for m in net.modules() if isinstance(m, SlicedNorm)]
     for norm in norms:
         norm.batches = 0
@@ -419,7 +420,7 @@ def recalibrate_batch_norm(
     count = 0
     try:
         for frames in batches:
-            net(frames, architecture)
+            net(frames.to(device), architecture)
             count += 1
     finally:
         for norm in norms:

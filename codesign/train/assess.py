@@ -239,10 +239,13 @@ def predict_frames(
     """
     was_training = net.training
     net.eval()
-    predictions = [net(frames, architecture) for frames in batched_frames(seen)]
+    device = next(net.parameters()).device
+    predictions = [
+        net(frames.to(device), architecture) for frames in batched_frames(seen)
+    ]
     net.train(was_training)
     slip, centre, mask, log_sd, depth, axis = (
-        torch.cat([getattr(prediction, name) for prediction in predictions])
+        torch.cat([getattr(prediction, name) for prediction in predictions]).cpu()
         for name in ("slip", "centre", "mask_logits", "slip_log_sd", "depth", "axis")
     )
     scale = torch.tensor(inner.slip_scale_mm)

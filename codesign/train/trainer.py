@@ -25,15 +25,7 @@ from codesign.batches import (
     parallel,
     sensor_irradiance,
 )
-from codesign.network import (
-    Architecture,
-    Prediction,
-    SearchSpace,
-    Supernet,
-    blur,
-    cost,
-    losses,
-)
+from codesign.network import Architecture, SearchSpace, Supernet, blur, cost, losses
 from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.settings import LARGEST, LEAST, Place, check_ranges
@@ -124,20 +116,14 @@ class TrainedModel:
         self.coefficients_rad.copy_(state["coefficients_rad"])
         self.log_pitch.copy_(state["log_pitch"])
 
-    def hold(self, finest_um: float, coarsest_um: float) -> float | None:
-        """Clamp the pitch to a range in place; the limit that it was clamped to, in um.
-
-        None where the pitch was inside the range.
+    @torch.no_grad()
+    def clamp_pitch(self, finest_um: float, coarsest_um: float) -> None:
+        """Clamp the pitch to a range in place.
 
         Args:
             finest_um: least pitch. coarsest_um: largest pitch.
         """
-        pitch_um = float(self.pitch_um.detach())
-        with torch.no_grad():
-            self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
-        if pitch_um < finest_um:
-            return finest_um
-        return coarsest_um if pitch_um > coarsest_um else None
+        self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
 
 
 def make_model(
@@ -409,8 +395,6 @@ class Trainer:
         self.step = 0
         self.skipped = 0
         self.bad_run = 0  # consecutive steps without a finite gradient
-        # limit that the last step clamped the pitch to; None inside the range
-        self.pitch_held_um: float | None = None
         self._begins_um = float(model.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
@@ -438,7 +422,6 @@ class Trainer:
             **self.model.state(),
             "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
             "light": self.light.state(),
-            "pitch_held_um": self.pitch_held_um,
             "counters": [self.step, self.skipped, self.bad_run],
         }
 
@@ -454,7 +437,6 @@ class Trainer:
             align_moments(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]
         self.light.restore(state["light"])
-        self.pitch_held_um = state["pitch_held_um"]
 
     def _advance(self, batch: FrameBatch) -> LogRecord:
         """Backward pass of Eq. 10 on a batch, and one step of every optimiser.
@@ -677,9 +659,7 @@ class Trainer:
             finest = min(
                 max(self.optics.sample_um, self.model.finest_um), self._begins_um
             )
-            self.pitch_held_um = self.model.hold(
-                finest, max(self._coarsest_um, self._begins_um)
-            )
+            self.model.clamp_pitch(finest, max(self._coarsest_um, self._begins_um))
 
 
 def compute_ahead(
@@ -744,27 +724,3 @@ def place_on_device(trainer: Trainer, device: torch.device) -> None:
     net.to(device)
     for optimiser in trainer.optimisers.values():
         optimiser.load_state_dict(optimiser.state_dict())
-    follow_device(net, device)
-
-
-def follow_device(net: nn.Module, device: torch.device) -> None:
-    """Register hooks that run a network on ``device`` for inputs on the processor.
-
-    Its inputs move to the device; predictions of processor inputs move back.
-
-    Args:
-        net: network.
-    """
-    from_cpu = False
-
-    def to_device(_: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
-        nonlocal from_cpu
-        from_cpu = any(isinstance(v, Tensor) and v.device.type == "cpu" for v in inputs)
-        return tuple(v.to(device) if isinstance(v, Tensor) else v for v in inputs)
-
-    def to_cpu(_: nn.Module, __: tuple[Any, ...], output: Prediction) -> Prediction:
-        parts = (getattr(output, name) for name in Prediction.__slots__)
-        return Prediction(*(part.cpu() if from_cpu else part for part in parts))
-
-    net.register_forward_pre_hook(to_device)
-    net.register_forward_hook(to_cpu)

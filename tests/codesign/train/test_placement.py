@@ -52,19 +52,6 @@ def test_a_network_computes_where_its_parameters_are():
     assert {part.device.type for part in parts if part is not None} == {"meta"}
 
 
-def test_frames_and_gradients_pass_through_an_attended_network():
-    """On the processor nothing is moved, and every number stays; the second step is of
-    what the first one moved.
-    """
-    plain, attended = (
-        _going({"optics": {"image": "uniform"}}).trainer for _ in range(2)
-    )
-    trainer.follow_device(attended.model.net, torch.device("cpu"))
-    for one, other in zip(plain.run(until=2), attended.run(until=2), strict=True):
-        assert one == other
-    assert float(attended.model.coefficients_rad.grad.norm()) > 0
-
-
 @pytest.mark.parametrize(
     ("change", "frozen"),
     [
