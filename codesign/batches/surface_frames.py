@@ -66,11 +66,8 @@ def frame_samples(frames: Frames | SingleSurfaceFrames) -> int:
     Args:
         frames: rendered frames of two layers or of one.
     """
-    return int(
-        (
-            frames.light if isinstance(frames, SingleSurfaceFrames) else frames.radiance
-        ).shape[-1]
-    )
+    one = isinstance(frames, SingleSurfaceFrames)
+    return int((frames.light if one else frames.radiance).shape[-1])
 
 
 def depth_um(
@@ -99,16 +96,8 @@ def depth_um(
         depth = torch.where(
             moved.coverage[:, 1] > 0.5, moved.depth_um[:, 1], moved.depth_um[:, 0]
         )
-    return depth[:, *_inside(depth.shape[-2:], margin)].clamp_min(1.0)
-
-
-def _inside(shape: tuple[int, ...], margin: int) -> list[slice]:
-    """Rows and columns without the margin."""
-    return [slice(margin, n - margin) for n in shape]
-
-
-def _radiance(frames: SingleSurfaceFrames, device: torch.device | str) -> Tensor:
-    return torch.from_numpy(frames.light).to(device).float() * (1 / 255)
+    rows, columns = (slice(margin, n - margin) for n in depth.shape[-2:])
+    return depth[:, rows, columns].clamp_min(1.0)
 
 
 def sensor_irradiance(frames: Frames | SingleSurfaceFrames, optics: Imager) -> Tensor:
@@ -121,4 +110,5 @@ def sensor_irradiance(frames: Frames | SingleSurfaceFrames, optics: Imager) -> T
     device = optics.stack.device
     if isinstance(frames, Frames):
         return optics(frames.to(device))
-    return optics.surface(_radiance(frames, device), depth_um(frames, device=device))
+    radiance = torch.from_numpy(frames.light).to(device).float() * (1 / 255)
+    return optics.surface(radiance, depth_um(frames, device=device))

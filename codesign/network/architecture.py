@@ -247,58 +247,32 @@ def mutate_architecture(
 ) -> Architecture:
     """A mutation: every entry is drawn anew with probability ``rate``.
 
-    Where no active entry changed, a random neighbour that differs in one active entry.
-    The only member of a space is returned itself.
+    Where no active entry changed, again with a probability that rises to 1. The only
+    member of a space is returned itself.
 
     Args:
         space: architectures to choose from. architecture: member of the search space.
         generator: of the draws. rate: probability per entry.
     """
-    other = sample_architecture(space, generator)
-    child = replace(
-        architecture,
-        depths=_recombine(architecture.depths, other.depths, generator, rate),
-        kernels=_recombine(architecture.kernels, other.kernels, generator, rate),
-        expansions=_recombine(
-            architecture.expansions, other.expansions, generator, rate
-        ),
-        width=other.width if generator.random() < rate else architecture.width,
-        resolution=other.resolution
-        if generator.random() < rate
-        else architecture.resolution,
-    )
-    if canonical_architecture(space, child) != canonical_architecture(
-        space, architecture
-    ):
-        return child
-    neighbours = _neighbours(space, architecture)
-    if not neighbours:
-        return architecture
-    return neighbours[int(generator.integers(len(neighbours)))]
-
-
-def _neighbours(space: SearchSpace, architecture: Architecture) -> list[Architecture]:
-    """Every member of the space that differs from an architecture in one active
-    entry.
-    """
-    neighbours = []
-    choices: dict[str, tuple[Any, ...]] = {
-        "depths": space.depths,
-        "kernels": space.kernels,
-        "expansions": space.expansions,
-    }
-    for name, values in choices.items():
-        row = getattr(architecture, name)
-        for i in range(len(row)):
-            for value in values:
-                changed: Any = {name: (*row[:i], value, *row[i + 1 :])}
-                neighbours.append(replace(architecture, **changed))
-    neighbours += [replace(architecture, width=width) for width in space.widths]
-    neighbours += [
-        replace(architecture, resolution=r) for r in search_resolutions(space)
-    ]
     own = canonical_architecture(space, architecture)
-    return [a for a in neighbours if canonical_architecture(space, a) != own]
+    for least in np.linspace(0, 1, 200):
+        other = sample_architecture(space, generator)
+        chance = max(rate, float(least))
+        rows: dict[str, Any] = {
+            name: _recombine(
+                getattr(architecture, name), getattr(other, name), generator, chance
+            )
+            for name in ("depths", "kernels", "expansions")
+        }
+        scales = ("width", "resolution")
+        own_scales, others = (
+            tuple(getattr(a, name) for name in scales) for a in (architecture, other)
+        )
+        mixed = _recombine(own_scales, others, generator, chance)
+        child = Architecture(**rows | dict(zip(scales, mixed, strict=True)))
+        if canonical_architecture(space, child) != own:
+            return child
+    return architecture
 
 
 def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
@@ -350,11 +324,11 @@ def _uniform(space: SearchSpace, pick: Callable[[Any], Any]) -> Architecture:
 
 
 def _recombine(
-    mine: tuple[int, ...],
-    others: tuple[int, ...],
+    mine: tuple[Any, ...],
+    others: tuple[Any, ...],
     generator: np.random.Generator,
     rate: float,
-) -> tuple[int, ...]:
+) -> tuple[Any, ...]:
     """Entries of ``others`` with probability ``rate`` each, else of ``mine``."""
     return tuple(
         b if generator.random() < rate else a for a, b in zip(mine, others, strict=True)

@@ -86,48 +86,30 @@ def make_imager(
         return lens.stack_imager(settings, stack, frame, margin=margin).to(device)
     grid = frame, margin, torch.device(device)
     if made is not None:
-        return _imager_of_made_lens(settings, made, grid)
-    coefficients = tuple(coefficients_rad.detach().tolist())
+        if made.plane is None:
+            raise TrainingError(
+                "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
+                "use a run of optics.image = 'uniform' for it"
+            )
+        return _cached_imager(settings, made.plane, grid)
     if error is None:
-        return _cached_true_imager(settings, coefficients, grid)
-    return _with_scattered_light(
-        settings, _true_imager(settings, coefficients, grid, error), error
-    )
+        coefficients = tuple(coefficients_rad.detach().tolist())
+        return _cached_imager(settings, coefficients, grid)
+    optics = optics_of(settings, coefficients_rad.detach(), error)
+    imager = imager_through(settings, optics, frame, margin=margin, device=device)
+    return _with_scattered_light(settings, imager, error)
 
 
-@functools.lru_cache(maxsize=32)
-def _imager_of_made_lens(
-    settings: OpticsConfig, stack: PixelPsfStack, grid: FrameGrid
+@functools.lru_cache(maxsize=16)
+def _cached_imager(
+    settings: OpticsConfig, lens_plane: Optics | tuple[float, ...], grid: FrameGrid
 ) -> Imager:
-    """True image of a fabricated lens, cached for all who use the same lens."""
-    if stack.plane is None:
-        raise TrainingError(
-            "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
-            "use a run of optics.image = 'uniform' for it"
-        )
+    """True image of a fabricated lens, or of phase coefficients in rad, cached."""
     frame, margin, device = grid
-    return imager_through(settings, stack.plane, frame, margin=margin, device=device)
-
-
-@functools.lru_cache(maxsize=3)
-def _cached_true_imager(
-    settings: OpticsConfig, coefficients_rad: tuple[float, ...], grid: FrameGrid
-) -> Imager:
-    return _true_imager(settings, coefficients_rad, grid, None)
-
-
-@torch.no_grad()
-def _true_imager(
-    settings: OpticsConfig,
-    coefficients_rad: tuple[float, ...],
-    grid: FrameGrid,
-    error: DrawnLensErrors | None,
-) -> Imager:
-    """True image of the lens of these coefficients and error, without gradient."""
-    coefficients = torch.tensor(coefficients_rad, dtype=torch.float64)
-    frame, margin, device = grid
-    plane = optics_of(settings, coefficients, error)
-    return imager_through(settings, plane, frame, margin=margin, device=device)
+    if isinstance(lens_plane, tuple):
+        coefficients = torch.tensor(lens_plane, dtype=torch.float64)
+        lens_plane = optics_of(settings, coefficients)
+    return imager_through(settings, lens_plane, frame, margin=margin, device=device)
 
 
 @torch.no_grad()

@@ -451,6 +451,7 @@ class Trainer:
         }
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
+        buffers = [(buffer, buffer.clone()) for buffer in self.model.net.buffers()]
         lens_moves = rates["optics"] > 0 and "optics" in self.optimisers
         with torch.set_grad_enabled(lens_moves):
             imager, optics_loss = self._form_images(batch.frames, lens_moves)
@@ -466,7 +467,10 @@ class Trainer:
         parameters = [p for _, ps in self.groups.values() for p in ps]
         parallel.average_gradients(parameters)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
-        self._apply(rates, finite=finite and has_finite_gradients(parameters))
+        finite = finite and has_finite_gradients(parameters)
+        for buffer, before in () if finite else buffers:  # running means
+            buffer.copy_(before)
+        self._apply(rates, finite=finite)
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs.mean() / 1e6)
         means = parallel.mean_of([float(v.detach()) for v in values])
