@@ -6,7 +6,7 @@ import torch
 
 from benchmarks import Row, fastest
 from benchmarks.peers import layered
-from codesign.eye import dataset, renderer
+from codesign.eye import population, renderer
 from codesign.eye.population import CameraRig
 from codesign.eye.renderer import PinholeCamera
 from metalens.image import Grid, pupil, scene, uniform_imager
@@ -44,7 +44,7 @@ def _rendering(threads: int) -> list[Row]:
     out = []
     for pixels, pitch, goal in ((160, 9.0, 800), (400, 3.6, 100)):
         camera = PinholeCamera(pixels, pitch)
-        states = dataset.states_at(torch.arange(32), 1)
+        states = population.states_at(torch.arange(32), 1)
         seconds = fastest(
             lambda c=camera, s=states: renderer.render(s, camera=c), repeats=12
         ) / len(states)
@@ -57,7 +57,7 @@ def _rendering(threads: int) -> list[Row]:
 
 
 def _imaging(threads: int) -> list[Row]:
-    states = dataset.states_at(torch.arange(8), 2)
+    states = population.states_at(torch.arange(8), 2)
     frames = renderer.render(states, camera=PinholeCamera()).frames
     depths = 1 / torch.linspace(1 / 32e3, 1 / 12e3, 21, dtype=torch.float64).flip(0)
     optics = Pupil(nodes=224)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from benchmarks import Row
-from codesign.eye import dataset
+from codesign.eye import population
 from tests.referees import pathtraced
 
 STATES = (1, 3, 5, 8)
@@ -19,7 +19,7 @@ NONE = float("nan")
 
 def rows() -> list[Row]:
     """Rows of this topic; two to five minutes."""
-    states = dataset.states_at(torch.tensor(STATES), 1)
+    states = population.states_at(torch.tensor(STATES), 1)
     made = [
         pathtraced.compare(states[k : k + 1], samples=SAMPLES)
         for k in range(len(STATES))

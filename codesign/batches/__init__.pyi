@@ -1,7 +1,4 @@
 from . import parallel as parallel
-from .batch import EyePose as EyePose
-from .batch import FrameBatch as FrameBatch
-from .batch import SceneSource as SceneSource
 from .pool import FramePool as FramePool
 from .pool import PoolScenes as PoolScenes
 from .pool import render_pool as render_pool
@@ -16,6 +13,9 @@ from .scenes import as_batch as as_batch
 from .scenes import augmented_frames as augmented_frames
 from .scenes import draw_depth_scales as draw_depth_scales
 from .scenes import widen_motion as widen_motion
+from .surface_frames import EyePose as EyePose
+from .surface_frames import FrameBatch as FrameBatch
+from .surface_frames import SceneSource as SceneSource
 from .surface_frames import SingleSurfaceFrames as SingleSurfaceFrames
 from .surface_frames import depth_um as depth_um
 from .surface_frames import frame_samples as frame_samples

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch import distributed as dist
 
-from codesign.batches.batch import FrameBatch
+from codesign.batches.surface_frames import FrameBatch
 from metalens.core.errors import TrainingError
 
 

@@ -9,9 +9,13 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from codesign.batches.batch import EyePose, FrameBatch
 from codesign.batches.scenes import EyeScenes, draw_depth_scales, pose_of
-from codesign.batches.surface_frames import SingleSurfaceFrames, flatten_layers
+from codesign.batches.surface_frames import (
+    EyePose,
+    FrameBatch,
+    SingleSurfaceFrames,
+    flatten_layers,
+)
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
 

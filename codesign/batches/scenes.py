@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches.batch import EyePose, FrameBatch
+from codesign.batches.surface_frames import EyePose, FrameBatch
 from codesign.eye import (
     POPULATION,
     CameraRig,

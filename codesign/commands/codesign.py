@@ -11,7 +11,6 @@ import torch
 
 from codesign.adapt import lens_file, weights_file
 from codesign.batches import parallel
-from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
 from codesign.optics import image_formation
 from codesign.optics import stack as trained
@@ -215,7 +214,7 @@ def _write_results(
         if export:
             own = replace(codesign_run, trainer=end.trainer)
             path = folder / f"subnet_{budget:g}.onnx"
-            onnx_file.write_network_file(path, own, model.net, architecture)
+            results.write_network_file(path, own, model.net, architecture)
     axes.set(xlabel="MMACs", ylabel="gaze error on validation / deg")
     axes.legend()
     store.write_bytes(folder / "pareto.png", report.figure_png(figure))

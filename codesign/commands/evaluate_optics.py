@@ -19,7 +19,6 @@ from codesign.evaluate import (
     SensitivityScenes,
     field_page,
     judge_lenses,
-    plots,
     reader,
 )
 from codesign.evaluate import optics as evaluate_optics
@@ -134,11 +133,11 @@ def _measure(
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {
-        "axial": plots.plot_axial_information(axial, setting),
-        "scenes": plots.plot_scenes(scenes),
+        "axial": evaluate_optics.plot_axial_information(axial, setting),
+        "scenes": evaluate_optics.plot_scenes(scenes),
         "field": field_page.plot_over_field(over_field),
     }
-    captions = plots.CAPTIONS | {"field": field_page.CAPTION}
+    captions = evaluate_optics.CAPTIONS | {"field": field_page.CAPTION}
     for name, picture in pictures.items():
         store.write_bytes(folder / f"{name}.png", picture)
     figures = [Figure(png, captions[name], wide=True) for name, png in pictures.items()]

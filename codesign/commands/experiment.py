@@ -15,8 +15,8 @@ import numpy as np
 from codesign.adapt import FinishedRun, retrained_network
 from codesign.commands.evaluate import distinct_names
 from codesign.commands.options.experiment import Options
-from codesign.evaluate import RunResult, own_frames, plots, run_experiment
-from codesign.gaze import PopulationPrior, people_file
+from codesign.evaluate import RunResult, gaze_experiment, own_frames, run_experiment
+from codesign.gaze import PopulationPrior, shared
 from codesign.optics import image_formation
 from codesign.settings import ExperimentConfig
 from codesign.train import bootstrap_interval, bootstrap_ratio
@@ -139,8 +139,8 @@ def _simulate(
     }
     figures = []
     for name, picture in (
-        ("errors.png", plots.plot_gaze_errors(results)),
-        ("ambiguity.png", plots.plot_ambiguity(results[0])),
+        ("errors.png", gaze_experiment.plot_gaze_errors(results)),
+        ("ambiguity.png", gaze_experiment.plot_ambiguity(results[0])),
     ):
         store.write_bytes(folder / name, picture)
         figures.append(report.Figure(picture, CAPTIONS[name], wide=True))
@@ -151,7 +151,7 @@ def _simulate(
                 config=f"{settings.dumps(run_settings)}\n{settings.dumps(config)}",
                 seed=run_settings.inner.seed,
             )
-            people_file.save_people(
+            shared.save_people(
                 folder / f"people_{number}.h5", result.how, provenance=origin
             )
     tables, remarks = experiment_tables(values), _remarks(values)

@@ -20,7 +20,6 @@ from codesign.adapt.retrained_network import (
     relative_inputs,
 )
 from codesign.adapt.source import check_lens, load_finished_run
-from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.optics import MadeLens, posterior_parameters, psf_error
 from codesign.train import Trainer, assess, checkpoint, device_of, place_on_device
@@ -115,7 +114,7 @@ def _retrain_and_correct(
     _write_results(folder, options, (source, trained["retrained"]), results)
     if options.export:
         net = trained["retrained"].model.net
-        onnx_file.write_network_file(
+        results.write_network_file(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
     return results

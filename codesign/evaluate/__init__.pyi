@@ -4,7 +4,6 @@ from . import gaze_experiment as gaze_experiment
 from . import optics as optics
 from . import own_frames as own_frames
 from . import paper as paper
-from . import plots as plots
 from . import reader as reader
 from . import scene_image as scene_image
 from .field_page import FieldSetting as FieldSetting

@@ -35,6 +35,7 @@ from codesign.settings import ExperimentConfig
 from codesign.train import FramePredictions, SensorFrames, assess
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, PropagationError, SceneError
+from metalens.core.report import figure_png, make_figure
 from metalens.image import Imager, Sensor, low_snr
 
 AXIAL, LATERAL = "axial", "lateral"
@@ -662,3 +663,71 @@ def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Arr
         chosen = rng.choice(len(points), count, replace=False)
         frames.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
     return np.concatenate(frames)
+
+
+def plot_ambiguity(result: RunResult) -> bytes:
+    """Fig. 10: pupil centres of all stimuli under axial and lateral slippage, and their
+    means with ranges.
+
+    Args:
+        result: of one run.
+    """
+    trial = result.trial
+    percent = result.centre * 100
+    figure, axes = make_figure(1, 3, size=(10.5, 3.2))
+    for panel, kind, axis in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
+        chosen = trial.group(kind)
+        dots = panel.scatter(
+            *percent[chosen].T, c=trial.slip_mm[chosen, axis], s=2, cmap="viridis"
+        )
+        figure.colorbar(dots, ax=panel, label=f"d{'xyz'[axis]} / mm")
+        panel.set_title(f"{kind} slippage")
+    for state in np.unique(trial.state):
+        places = percent[trial.state == state]
+        x, _, z = trial.slip_mm[trial.state == state][0]
+        middle = places.mean(0)
+        span = np.abs(np.percentile(places, [2.5, 97.5], axis=0) - middle)
+        axes[2].errorbar(
+            *middle,
+            xerr=span[:, :1],
+            yerr=span[:, 1:],
+            fmt="o",
+            label=f"({x:g}, {z:g})",
+        )
+    axes[2].set_title("mean and 95 % range by (dx, dz)")
+    axes[2].legend(fontsize=6)
+    for panel in axes:
+        panel.set(xlabel="pupil x / % of the frame", ylabel="pupil y / %")
+        panel.invert_yaxis()
+    return figure_png(figure)
+
+
+def plot_gaze_errors(results: Sequence[RunResult]) -> bytes:
+    """Fig. 11: mean gaze error at every stimulus, as the size of its marker, under
+    axial and lateral slippage.
+
+    Args:
+        results: one a run.
+    """
+    figure, axes = make_figure(1, 2, size=(10.5, 3.8))
+    for panel, kind in zip(axes, (AXIAL, LATERAL), strict=True):
+        for number, result in enumerate(results):
+            trial, colour = result.trial, f"C{number}"
+            shift = (number - (len(results) - 1) / 2) * 1.1
+            chosen = trial.group(kind) & np.isfinite(result.gaze_deg)
+            for point in np.unique(trial.stimulus[chosen]):
+                at_point = chosen & (trial.stimulus == point)
+                x, y = trial.stimulus_deg[at_point][0]
+                area = 24 * result.gaze_deg[at_point].mean() ** 2 + 2
+                panel.scatter(x + shift, y, s=area, color=colour, alpha=0.75, lw=0)
+            label = f"{result.name}: {result.gaze(kind):.2f}°"
+            panel.scatter([], [], color=colour, label=label)
+        panel.set(
+            title=f"{kind} slippage",
+            xlabel="stimulus across / deg",
+            ylabel="stimulus down / deg",
+            aspect="equal",
+        )
+        panel.invert_yaxis()
+        panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), fontsize=7)
+    return figure_png(figure)

@@ -13,7 +13,7 @@ from codesign.eye import CameraRig, EyeStates, PinholeCamera, moved_states, rend
 from codesign.settings import LARGEST, LEAST, check_ranges
 from codesign.train import bootstrap_ratio
 from metalens.core.errors import ConfigError, SceneError
-from metalens.core.report import Table
+from metalens.core.report import Table, figure_png, make_figure
 from metalens.image import Frames, Grid, Normalisation, axial_information, imager
 from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens, passed_um2
@@ -481,3 +481,63 @@ def scene_table(scenes: Mapping[str, SceneEnergy]) -> Table:
             )
         )
     return Table(("lens", *KINDS, "span angle", "image error"), rows, caption)
+
+
+CAPTIONS = {
+    "axial": "Axial information on axis (Eq. 11) over depth for each binning, averaged over sub-pixel positions.",
+    "scenes": "First scene: the sensor image, its squared change with gaze, and the squared difference between gaze "
+    "and slip, on one scale for all lenses.",
+}
+
+
+def plot_axial_information(
+    axial: Mapping[str, AxialInformation], setting: ResolvedSettings
+) -> bytes:
+    """PNG of I(z) over depth on axis, a panel for each binning.
+
+    Args:
+        axial: axial information by name of the lens.
+        setting: how the lenses were measured.
+    """
+    depths = np.linspace(*setting.depths_mm, setting.count)
+    count = len(setting.binnings)
+    figure, panels = make_figure(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
+    for k, (panel, binning) in enumerate(zip(panels[0], setting.binnings, strict=True)):
+        for name, info in axial.items():
+            mean = float(info.information[0, k].mean())
+            shown = info.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
+            panel.semilogy(depths, shown, ".-", label=f"{name}: {mean:.3g}")
+        panel.set(
+            title=f"{binning} × {binning} of {setting.pixel_um:g} µm",
+            xlabel="source depth / mm",
+        )
+        panel.legend(fontsize=7, title="mean", title_fontsize=7)
+    panels[0, 0].set_ylabel(f"I(z) / mm⁻² ({setting.normalisation})")
+    return figure_png(figure)
+
+
+def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
+    """PNG of the first scene through every lens: image, squared change with gaze,
+    squared difference of gaze and slip.
+
+    Args:
+        energies: scene sensitivity by name of the lens.
+    """
+    titles = ("image", "(gaze − anchor)²", "(gaze − slip)²")
+    figure, panels = make_figure(
+        len(energies), 3, size=(8.4, 0.5 + 2.6 * len(energies)), squeeze=False
+    )
+    maps = torch.stack([energy.maps for energy in energies.values()])
+    full = torch.quantile(maps.transpose(0, 1).flatten(1), 0.998, dim=1).clamp_min(
+        1e-12
+    )
+    for row, name, pictures in zip(panels, energies, maps, strict=True):
+        row[0].set_ylabel(name, fontsize=8)
+        for k, panel in enumerate(row):
+            colours = "magma" if k else "gray"
+            panel.imshow(pictures[k].numpy(), cmap=colours, vmin=0, vmax=float(full[k]))
+            panel.set(xticks=[], yticks=[])
+            panel.grid(False)
+    for panel, title in zip(panels[0], titles, strict=True):
+        panel.set_title(title)
+    return figure_png(figure)

@@ -1,4 +1,3 @@
-from . import dataset as dataset
 from . import landmarks as landmarks
 from . import population as population
 from . import renderer as renderer
@@ -9,8 +8,6 @@ from .appearance import apply_augmentations as apply_augmentations
 from .appearance import draw_augmentations as draw_augmentations
 from .appearance import drawn_of_people as drawn_of_people
 from .appearance import render_dressed as render_dressed
-from .dataset import moved_states as moved_states
-from .dataset import states_at as states_at
 from .population import POPULATION as POPULATION
 from .population import CameraRig as CameraRig
 from .population import EyeStates as EyeStates
@@ -18,6 +15,8 @@ from .population import MotionRanges as MotionRanges
 from .population import SubjectTrait as SubjectTrait
 from .population import mean_eye_um as mean_eye_um
 from .population import model_parameters as model_parameters
+from .population import moved_states as moved_states
+from .population import states_at as states_at
 from .renderer import FrameLabels as FrameLabels
 from .renderer import PinholeCamera as PinholeCamera
 from .renderer import RenderedFrames as RenderedFrames

@@ -4,8 +4,8 @@ their states of gaze and slip.
 
 import math
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 
 import numpy as np
@@ -421,3 +421,41 @@ def _turn(vector: Tensor, mount_rad: Tensor) -> Tensor:
     y, z = cx * y + sx * z, cx * z - sx * y
     x, z = cy * x - sy * z, cy * z + sy * x
     return torch.stack([x, y, z], 1)
+
+
+def states_at(
+    indices: Tensor, seed: int, *, motion: MotionRanges | None = None
+) -> EyeStates:
+    """States of given numbers from the endless sequence of a seed.
+
+    State i is the same alone or together with others.
+
+    Args:
+        indices: (n,) numbers of the states. seed: of the sequence.
+        motion: ranges of the states; the defaults without it.
+    """
+    parts = [draw_states(1, (seed, int(i)), motion=motion) for i in indices]
+    return EyeStates(
+        *(
+            torch.cat([getattr(part, name) for part in parts])
+            for name in EyeStates.__slots__
+        )
+    )
+
+
+def moved_states(
+    states: EyeStates, motions: Sequence[tuple[str, int, float]]
+) -> list[EyeStates]:
+    """The states, then the same moved along every motion: the differences of their
+    frames, rendered at one exposure, are those of the Fisher matrix (paper Sec. 3.6).
+
+    Args:
+        states: subjects with gaze and slippage.
+        motions: (field of the state, axis, step in rad or um) each.
+    """
+    out = [states]
+    for name, axis, step in motions:
+        values = getattr(states, name).clone()
+        values[:, axis] += step
+        out.append(replace(states, **{name: values}))
+    return out

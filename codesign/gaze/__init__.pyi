@@ -1,5 +1,4 @@
 from . import bench as bench
-from . import people_file as people_file
 from . import personal as personal
 from . import shared as shared
 from .personal import PersonalGaze as PersonalGaze

@@ -3,12 +3,15 @@ others: a linear mixed model.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from codesign.gaze.readings import NetworkReadings
+from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.errors import TrainingError
+from metalens.core.errors import StoreError, TrainingError
+from metalens.core.store import typed_reader
 
 # of expectation maximisation: predictions have converged, variances near 0 still fall
 ROUNDS = 40
@@ -213,3 +216,62 @@ def _quadratic_terms(readings: Array, middle: Array, spread: Array) -> Array:
     x = (readings - middle) / spread
     first, second = np.triu_indices(x.shape[1])
     return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], 1)
+
+
+KIND = "people"
+SHAPES = {
+    "mean": (36, 2),
+    "variance": (36, 2),
+    "noise": (2,),
+    "middle": (7,),
+    "spread": (7,),
+}
+
+
+def save_people(
+    path: Path, people: PopulationPrior, *, provenance: store.Provenance | None = None
+) -> None:
+    """Write a file of kind ``people``: β, τ² and σ² in deg and deg², middle and spread
+    of the readings in deg and mm.
+
+    Args:
+        path: of the file. provenance: of the file.
+
+    Raises:
+        OSError: the target cannot be written (the old file stays).
+    """
+    model = people.model
+    arrays = {"mean": model.mean, "variance": model.variance, "noise": model.noise}
+    store.save(
+        path,
+        KIND,
+        arrays | {"middle": people.middle, "spread": people.spread},
+        provenance=provenance,
+    )
+
+
+@typed_reader
+def load_people(path: Path) -> PopulationPrior:
+    """Read a file of kind ``people``.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        StoreError: no such file, another kind, or entries that no people can have.
+    """
+    arrays = store.load(path, KIND).arrays
+    found = {name: np.asarray(arrays[name], dtype=float) for name in SHAPES}
+    odd = [
+        name
+        for name, shape in SHAPES.items()
+        if found[name].shape != shape
+        or not np.isfinite(found[name]).all()
+        or (name in ("variance", "noise", "spread") and found[name].min() <= 0)
+    ]
+    if odd:
+        raise StoreError(
+            f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again"
+        )
+    *model, middle, spread = found.values()
+    return PopulationPrior(MixedModel(*model), middle, spread)

@@ -1,7 +1,6 @@
 from . import blur as blur
 from . import cost as cost
 from . import exported as exported
-from . import frozen_norm as frozen_norm
 from . import losses as losses
 from . import windows as windows
 from .architecture import Architecture as Architecture

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from codesign.batches import parallel
-from codesign.optics import families
-from codesign.optics.families import Family
 from codesign.optics.lens_errors import (
     DrawnLensErrors,
     LensErrors,
@@ -53,6 +51,7 @@ from metalens.optics import Layers
 from metalens.optics.paths import source_path
 from metalens.psf import Source
 
+Family = Literal["free", "radial"]
 SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
 ROWS = 64  # of pillars whose phase is computed at once
 
@@ -479,7 +478,7 @@ def _orthonormal_mix(pupil: Pupil, count: int, family: Family) -> Tensor:
     plain ones.
     """
     x, y = (c / pupil.radius_um for c in coordinates(pupil))
-    raw = torch.stack(families.phase_terms(x, y, count, family))
+    raw = torch.stack(phase_terms(x, y, count, family))
     samples = raw[:, radius(pupil) <= pupil.radius_um]
     _, upper = torch.linalg.qr(samples.T)
     mix: Tensor = torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
@@ -603,12 +602,12 @@ def phase_at(
         error: assembly and process error of one lens; None for none.
     """
     rim_um = settings.aperture_mm * 500
-    total = families.double_helix_phase(x_um / rim_um, y_um / rim_um, settings.zones)
+    total = double_helix_phase(x_um / rim_um, y_um / rim_um, settings.zones)
     if settings.polynomials:
         mix = _orthonormal_mix(settings.pupil, settings.polynomials, settings.family)
         weights = mix.mT @ coefficients_rad.double()
         terms = torch.stack(
-            families.phase_terms(
+            phase_terms(
                 x_um / rim_um, y_um / rim_um, settings.polynomials, settings.family
             )
         )
@@ -656,3 +655,51 @@ def scatter_loss(settings: OpticsConfig, light: Tensor, variance: float) -> Tens
     strehl = math.exp(-variance)
     shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)
     return strehl * light + (1 - strehl) * shadow
+
+
+def double_helix_phase(x: Tensor, y: Tensor, zones: int) -> Tensor:
+    """Phase of a double helix over the unit disc, rad, float64; zero for no zones.
+
+    Vortices (2 k - 1) theta in k = 1 … ``zones`` rings of equal area.
+
+    Args:
+        x, y: coordinates over the radius of the lens. zones: rings.
+    """
+    x, y = x + torch.zeros_like(y), y + torch.zeros_like(x)
+    if not zones:
+        return torch.zeros_like(x, dtype=torch.float64)
+    ring = torch.ceil(zones * (x**2 + y**2)).clamp(1, zones)
+    return (2 * ring - 1) * torch.atan2(y, x)
+
+
+def phase_terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
+    """The first ``count`` polynomial phase terms over the unit disc, not orthogonal.
+
+    free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity
+    of n. radial: rho^2, rho^4, …
+
+    Args:
+        x, y: coordinates over the radius of the lens. count: of terms.
+        family: "free" or "radial".
+    """
+    square = x**2 + y**2
+    # by recurrence: products of x and y cost a tenth of powers and cosines
+    radial_powers = [square]  # rho^2, rho^4, …
+    cosine = [torch.ones_like(square), x]  # rho^m cos(m theta)
+    sine = [torch.zeros_like(square), y]  # rho^m sin(m theta)
+    if family == "radial":
+        while len(radial_powers) < count:
+            radial_powers.append(radial_powers[-1] * square)
+        return radial_powers[:count]
+    terms: list[Tensor] = []
+    order = 2
+    while len(terms) < count:
+        cosine.append(cosine[-1] * x - sine[-1] * y)
+        sine.append(sine[-1] * x + cosine[-2] * y)
+        radial_powers.append(radial_powers[-1] * square)
+        for m in range(-order, order + 1, 2):
+            wave = (cosine if m >= 0 else sine)[abs(m)]
+            index = (order - abs(m)) // 2
+            terms.append(radial_powers[index - 1] * wave if index else wave)
+        order += 1
+    return terms[:count]

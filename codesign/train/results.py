@@ -2,15 +2,23 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches import CALIBRATION, TEST
+from codesign.batches import CALIBRATION, EXPERIMENT, TEST
 from codesign.gaze.bench import PeopleFrames
-from codesign.network import blur, losses, recalibrate_batch_norm
+from codesign.network import (
+    Architecture,
+    Supernet,
+    blur,
+    exported,
+    losses,
+    recalibrate_batch_norm,
+)
 from codesign.train import assess, evolution
 from codesign.train.assess import FramePredictions, SensorFrames
 from codesign.train.evolution import EvaluatedCandidate
@@ -19,6 +27,7 @@ from codesign.train.search import people_of, specialise_candidate
 from codesign.train.trainer import Trainer
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
+from metalens.psf import pixel_count
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -255,3 +264,28 @@ def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Arr
         name: np.asarray(value.cpu().numpy(), np.float32)
         for name, value in arrays.items()
     }
+
+
+def write_network_file(
+    path: Path, run: CodesignRun, net: Supernet, architecture: Architecture
+) -> None:
+    """Write a network of a run, cut to its architecture, for frames of the run's
+    sensor.
+
+    Args:
+        path: of the file. net: elastic network.
+
+    Raises:
+        OSError: the target cannot be written.
+    """
+    inner, settings = run.settings.inner, run.settings
+    pitch_um = float(run.trainer.model.pitch_um.detach())
+    size = pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch_um)
+    scale = exported.OutputScale(
+        frame_mm=size * pitch_um * 1e-3,
+        slip_mm=inner.slip_scale_mm,
+        rig=run.scenes(EXPERIMENT).rig,
+        axis=inner.axis_weight > 0,
+        points=inner.point_weight > 0,
+    )
+    exported.write_onnx(path, net, architecture, scale, size=size, pitch_um=pitch_um)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from characterize.inference import AsBuilt
 from codesign.commands import budget as command_budget
 from codesign.evaluate.error_budget import BudgetEntry
-from codesign.gaze import people_file
+from codesign.gaze import shared
 from codesign.gaze.shared import MixedModel, PopulationPrior
 from metalens import lens, library, psf
 from metalens.cell.record import Cell, Index
@@ -104,10 +104,7 @@ KINDS = {
         lambda p: command_budget.save_budget(p, _budget_rows(), store.Provenance()),
         command_budget.load_budget,
     ),
-    "people": (
-        lambda p: people_file.save_people(p, _people()),
-        people_file.load_people,
-    ),
+    "people": (lambda p: shared.save_people(p, _people()), shared.load_people),
 }
 
 

@@ -24,7 +24,7 @@ class Options(CommonOptions):
             nominal.safetensors in it, the unwarned one.
         output: folder for experiment.json, ambiguity.png, errors.png, report.html and,
             of every run that predicts the optic axis, people_1.h5 ...: what calibrates a wearer of that
-            device (codesign.gaze.people_file).
+            device (codesign.gaze.shared).
         names: of the runs; by default their folders'.
         frames: folder of own eye frames on the run's sensor, and frames.csv with a row for each: file; as far as
             known subject, mask (an image), pupil_x_px and pupil_y_px, slip_x_mm to slip_z_mm (stage), gaze_x_deg and

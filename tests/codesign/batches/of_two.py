@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import EyePose, FrameBatch
 from codesign.batches.pool import PoolScenes, render_pool
 from codesign.batches.scenes import EyeScenes, SceneConfig
+from codesign.batches.surface_frames import EyePose, FrameBatch
 from codesign.network.architecture import Architecture, SearchSpace
 from codesign.optics.stack import OpticsConfig
 from codesign.train import evolution

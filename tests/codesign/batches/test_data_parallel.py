@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import EyePose
+from codesign.batches.surface_frames import EyePose
 from tests.codesign.batches import of_two
 
 ROOT = Path(__file__).parents[3]

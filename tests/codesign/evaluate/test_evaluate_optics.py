@@ -11,7 +11,7 @@ import torch
 
 from codesign.evaluate import optics as evaluate
 from codesign.evaluate.optics import MeasurementSettings, SensitivityScenes
-from codesign.eye import dataset
+from codesign.eye import population
 from codesign.train import bootstrap_ratio
 from metalens import design
 from metalens.cell.record import Cell, Index
@@ -94,7 +94,7 @@ def test_encircled_energy_is_that_of_the_best_circle(size):
 
 
 def test_scene_energies_tell_lenses_apart():
-    states = dataset.states_at(torch.arange(2), 2)
+    states = population.states_at(torch.arange(2), 2)
     lenses = [_lens(20e3), _lens(20e3, zones=3)]
     plain, helix = evaluate.scene_energies(
         lenses, states, SensitivityScenes(pixels=32, pitch_um=24.0, window_um=96.0)
@@ -125,7 +125,7 @@ def test_bootstrap_interval_covers_the_true_ratio():
 
 def test_nothing_to_evaluate_is_refused():
     with pytest.raises(ValueError, match="at least one"):
-        evaluate.scene_energies([], dataset.states_at(torch.arange(1), 0))
+        evaluate.scene_energies([], population.states_at(torch.arange(1), 0))
 
 
 def _summed(lens, angle_rad, depth_um, place_um, hole_um=math.inf):

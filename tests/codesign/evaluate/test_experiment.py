@@ -15,7 +15,7 @@ from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import ExperimentTrials
 from codesign.eye import population as eye
 from codesign.eye.population import CameraRig
-from codesign.gaze import people_file, personal, shared
+from codesign.gaze import personal, shared
 from codesign.gaze.readings import NetworkReadings
 from codesign.settings import ExperimentConfig
 from metalens.cli import main
@@ -167,7 +167,7 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
         "ambiguity.png",
         "errors.png",
     }
-    one, two = (people_file.load_people(out / f"people_{n}.h5") for n in (1, 2))
+    one, two = (shared.load_people(out / f"people_{n}.h5") for n in (1, 2))
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err

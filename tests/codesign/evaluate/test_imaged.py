@@ -12,7 +12,7 @@ import torch
 
 from codesign.commands import view
 from codesign.evaluate import scene_image
-from codesign.eye import CameraRig, PinholeCamera, dataset, render
+from codesign.eye import CameraRig, PinholeCamera, population, render
 from metalens import design, lens
 from metalens.cell import Film, Index
 from metalens.core.errors import SceneError
@@ -35,7 +35,7 @@ LENS = design.make(
 
 @pytest.fixture(scope="module")
 def found():
-    states = dataset.states_at(torch.arange(2), 5)
+    states = population.states_at(torch.arange(2), 5)
     return scene_image.image_first_frames(
         LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera)
     )
@@ -45,7 +45,7 @@ def test_the_scene_is_what_a_pinhole_at_the_lens_sees(found):
     """Without the margin that is blurred in: the rays of a camera of that size alone."""
     rig = replace(RIG, sensor_distance_um=LENS.sensor_distance_um)
     plain = (
-        render(dataset.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA)
+        render(population.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA)
         .pinhole()
         .numpy()
     )
@@ -69,7 +69,7 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
     angles alike.
     """
     behind = replace(LENS, layers=Layers(behind=(Film(Index(1.5), 60.0),)))
-    states, seen = dataset.states_at(torch.arange(1), 5), []
+    states, seen = population.states_at(torch.arange(1), 5), []
 
     def rendered(camera, rig):
         seen.append(rig.sensor_distance_um)
@@ -115,7 +115,7 @@ def test_light_that_the_pillars_are_not_known_for_is_told_and_no_error():
     known = replace(LENS, proxy=replace(m.PROXY, wavelengths_um=(0.8405, 0.862)))
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (9.5, 12))
-    states = dataset.states_at(torch.arange(1), 5)
+    states = population.states_at(torch.arange(1), 5)
     made = scene_image.image_first_frames(
         known,
         PinholeCamera(16, 9.0),
@@ -149,7 +149,7 @@ def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
     um, past the face's edge.
     """
     near = replace(LENS, sensor_distance_um=46.0)
-    states = dataset.states_at(torch.arange(1), 0)
+    states = population.states_at(torch.arange(1), 0)
     with pytest.raises(
         SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"
     ):

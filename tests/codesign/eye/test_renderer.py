@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.eye import dataset, renderer
+from codesign.eye import population, renderer
 from codesign.eye import population as eye
 from codesign.eye.population import POPULATION, CameraRig, EyeStates
 from codesign.eye.renderer import PinholeCamera
@@ -70,7 +70,7 @@ def test_differences_of_triplets_agree_with_exact_derivatives_in_their_linear_re
         motions = ("gaze_rad", 0, gaze_rad), ("slip_um", 2, slip_um)
         anchor, gaze, slip = (
             renderer.render(one, camera=SMALL, exposed=STATES).pinhole()
-            for one in dataset.moved_states(STATES, motions)
+            for one in population.moved_states(STATES, motions)
         )
         return [
             float((got - want).norm() / want.norm())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from codesign.gaze import people_file, shared
+from codesign.gaze import shared
 from codesign.gaze.readings import NetworkReadings
 from metalens.core.errors import StoreError, TrainingError
 
@@ -118,8 +118,8 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
 
 def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_path):
     people = shared.learn_population(*_read(np.random.default_rng(6), 5, 20, 0.1))
-    people_file.save_people(tmp_path / "p.h5", people)
-    again = people_file.load_people(tmp_path / "p.h5")
+    shared.save_people(tmp_path / "p.h5", people)
+    again = shared.load_people(tmp_path / "p.h5")
     read, gaze, _ = _read(np.random.default_rng(7), 1, 8, 0.1)
     assert np.array_equal(
         again.person(read[:5], gaze[:5])(read), people.person(read[:5], gaze[:5])(read)
@@ -128,11 +128,11 @@ def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_p
         replace(people, spread=0 * people.spread),
         replace(people, middle=people.middle[:3]),
     ):
-        people_file.save_people(tmp_path / "odd.h5", odd)
+        shared.save_people(tmp_path / "odd.h5", odd)
         with pytest.raises(
             StoreError, match=r"(spread|middle) of a shape or value that no people have"
         ):
-            people_file.load_people(tmp_path / "odd.h5")
+            shared.load_people(tmp_path / "odd.h5")
 
 
 def test_too_few_people_frames_or_points_are_refused():
