@@ -227,7 +227,6 @@ def _write_results(
         "frozen": list(settings.run.frozen),
         "image": image,
         "threads": torch.get_num_threads(),
-        "bytes_depend_on_threads": True,
     }
     store.write_text(folder / RESULT, json.dumps(record, indent=1) + "\n")
     labels = {

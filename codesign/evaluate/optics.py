@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,34 +35,37 @@ class MeasurementSettings:
     window_um, sample_um: of the PSFs; light outside the window counts as lost. Left
     out, 56.4 wavelength / NA of the
         first lens or 8 radii of its blur, and what shows its finest detail.
-    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. tolerance: of the
-    PSF engine.
+    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. step_um: of the
+    depth in the difference of Eq. 11; left out, by the lens. tolerance: of the PSF
+    engine.
     """
 
-    depths_mm: tuple[float, float] | None = None
+    depths_mm: tuple[float, ...] = ()
     count: int = 11
     angles_deg: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0)
-    pixel_um: float | None = None
+    pixel_um: float = 0.0
     binnings: tuple[int, ...] = (1, 2, 3)
     normalisation: Normalisation = "l2"
-    window_um: float | None = None
-    sample_um: float | None = None
-    radius_um: float | None = None
+    window_um: float = 0.0
+    sample_um: float = 0.0
+    radius_um: float = 0.0
+    step_um: float = 0.0
     tolerance: float = field(default=1e-3, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        low, high = self.depths_mm or (1.0, 1.0)
+        low, high = self.depths_mm or (0.0, 0.0)
         if not (low <= high and self.angles_deg and self.binnings):
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}, binnings = {self.binnings}: need the "
                 "nearest depth first, and at least one angle and binning"
             )
-        lengths = ("depths_mm", "pixel_um", "window_um", "sample_um", "radius_um")
-        check_ranges(self, **dict.fromkeys(lengths, (LEAST, LARGEST)))
+        lengths = ("pixel_um", "window_um", "sample_um", "radius_um", "step_um")
+        check_ranges(self, **dict.fromkeys(lengths, (0, LARGEST)))
+        check_ranges(self, depths_mm=(LEAST, LARGEST))
         check_ranges(self, count=(1, LARGEST), binnings=(1, LARGEST))
 
-    def about(self, lens: Lens) -> "ResolvedSettings":
-        """These settings with the defaults of a lens in place of None."""
+    def about(self, lens: Lens) -> "MeasurementSettings":
+        """These settings with the defaults of a lens for what is left out."""
         nearest_um, farthest_um = (
             (1e3 * z for z in self.depths_mm)
             if self.depths_mm
@@ -75,29 +78,15 @@ class MeasurementSettings:
         window_um = self.window_um or reach.window_um(
             lens, (nearest_um, farthest_um), airy=WINDOW
         )
-        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
-            "pixel_um": pixel_um,
-            "depths_mm": (nearest_um * 1e-3, farthest_um * 1e-3),
-            "radius_um": self.radius_um or reach.disc_um(lens),
-            "sample_um": sample_um,
-            "window_um": max(4, round(window_um / sample_um)) * sample_um,
-        }
-        return ResolvedSettings(**values, step_um=reach.depth_step_um(lens, nearest_um))
-
-
-@dataclass(frozen=True, slots=True)
-class ResolvedSettings(MeasurementSettings):
-    """:class:`MeasurementSettings` without None.
-
-    step_um: depth step of the difference in Eq. 11.
-    """
-
-    depths_mm: tuple[float, float] = field(kw_only=True)
-    pixel_um: float = field(kw_only=True)
-    window_um: float = field(kw_only=True)
-    sample_um: float = field(kw_only=True)
-    radius_um: float = field(kw_only=True)
-    step_um: float = field(kw_only=True)
+        return replace(
+            self,
+            pixel_um=pixel_um,
+            depths_mm=(nearest_um * 1e-3, farthest_um * 1e-3),
+            radius_um=self.radius_um or reach.disc_um(lens),
+            sample_um=sample_um,
+            window_um=max(4, round(window_um / sample_um)) * sample_um,
+            step_um=self.step_um or reach.depth_step_um(lens, nearest_um),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,14 +149,10 @@ def measure_axial_information(
 
     Args:
         lens: lens to measure.
-        setting: depths, angles and pixels. None in them takes the default of this lens:
+        setting: depths, angles and pixels. What is left out is the default of this lens:
             to compare lenses, pass :meth:`MeasurementSettings.about` of one.
     """
-    resolved = (
-        setting
-        if isinstance(setting, ResolvedSettings)
-        else (setting or MeasurementSettings()).about(lens)
-    )
+    resolved = (setting or MeasurementSettings()).about(lens)
     depths = np.linspace(
         1e3 * resolved.depths_mm[0], 1e3 * resolved.depths_mm[1], resolved.count
     )
@@ -371,7 +356,7 @@ def lens_ratios(
 def table_values(
     axial: Mapping[str, AxialInformation],
     scenes: Mapping[str, SceneEnergy],
-    setting: ResolvedSettings,
+    setting: MeasurementSettings,
 ) -> dict[str, Any]:
     """Every number of the tables, ready for JSON.
 
@@ -403,7 +388,7 @@ def table_values(
 def table_failures(
     axial: Mapping[str, AxialInformation],
     scenes: Mapping[str, SceneEnergy],
-    setting: ResolvedSettings,
+    setting: MeasurementSettings,
 ) -> list[str]:
     """Sentences on every PSF and image whose error exceeds its tolerance.
 
@@ -427,7 +412,7 @@ def table_failures(
 
 def axial_table(
     axial: Mapping[str, AxialInformation],
-    setting: ResolvedSettings,
+    setting: MeasurementSettings,
     remarks: Sequence[str] = (),
 ) -> Table:
     """Table 3: mean I(z) at every angle, a row for each lens and binning, and the least
@@ -491,7 +476,7 @@ CAPTIONS = {
 
 
 def plot_axial_information(
-    axial: Mapping[str, AxialInformation], setting: ResolvedSettings
+    axial: Mapping[str, AxialInformation], setting: MeasurementSettings
 ) -> bytes:
     """PNG of I(z) over depth on axis, a panel for each binning.
 
