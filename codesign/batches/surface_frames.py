@@ -67,8 +67,9 @@ def frame_samples(frames: Frames | SingleSurfaceFrames) -> int:
     Args:
         frames: rendered frames of two layers or of one.
     """
-    one = isinstance(frames, SingleSurfaceFrames)
-    return int((frames.light if one else frames.radiance).shape[-1])
+    if isinstance(frames, SingleSurfaceFrames):
+        return int(frames.light.shape[-1])
+    return int(frames.radiance.shape[-1])
 
 
 def depth_um(

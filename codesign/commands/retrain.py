@@ -22,7 +22,14 @@ from codesign.adapt.retrained_network import (
 from codesign.adapt.source import check_lens, load_finished_run
 from codesign.commands.options.retrain import Options
 from codesign.optics import MadeLens, posterior_parameters, psf_error
-from codesign.train import Trainer, assess, checkpoint, device_of, place_on_device
+from codesign.train import (
+    Trainer,
+    assess,
+    checkpoint,
+    device_of,
+    place_on_device,
+    results,
+)
 from metalens import lens
 from metalens.core import config, store
 from metalens.core.errors import TrainingError
@@ -101,7 +108,7 @@ def _retrain_and_correct(
         )
         true_parameters = list(draws)[-1]
     mask = next_mask.plan_next_mask(result, old=old, truths=[true_parameters])
-    results = retrain_report.RetrainingResults(
+    story = retrain_report.RetrainingResults(
         outcome,
         (psf_error(psfs.best, psfs.nominal), psf_error(psfs.judges[0], psfs.nominal)),
         len(psfs.drawn),
@@ -111,13 +118,13 @@ def _retrain_and_correct(
     )
     if not mask.refused:
         next_mask.write_correction(folder, mask.plan, evened=not mask.uneven)
-    _write_results(folder, options, (source, trained["retrained"]), results)
+    _write_results(folder, options, (source, trained["retrained"]), story)
     if options.export:
         net = trained["retrained"].model.net
         results.write_network_file(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
-    return results
+    return story
 
 
 def _check_recipe(

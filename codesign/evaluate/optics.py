@@ -40,7 +40,7 @@ class MeasurementSettings:
     engine.
     """
 
-    depths_mm: tuple[float, ...] = ()
+    depths_mm: tuple[float, float] = (0.0, 0.0)
     count: int = 11
     angles_deg: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0)
     pixel_um: float = 0.0
@@ -53,22 +53,28 @@ class MeasurementSettings:
     tolerance: float = field(default=1e-3, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        low, high = self.depths_mm or (0.0, 0.0)
+        low, high = self.depths_mm
         if not (low <= high and self.angles_deg and self.binnings):
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}, binnings = {self.binnings}: need the "
                 "nearest depth first, and at least one angle and binning"
             )
-        lengths = ("pixel_um", "window_um", "sample_um", "radius_um", "step_um")
+        lengths = (
+            "depths_mm",
+            "pixel_um",
+            "window_um",
+            "sample_um",
+            "radius_um",
+            "step_um",
+        )
         check_ranges(self, **dict.fromkeys(lengths, (0, LARGEST)))
-        check_ranges(self, depths_mm=(LEAST, LARGEST))
         check_ranges(self, count=(1, LARGEST), binnings=(1, LARGEST))
 
     def about(self, lens: Lens) -> "MeasurementSettings":
         """These settings with the defaults of a lens for what is left out."""
         nearest_um, farthest_um = (
             (1e3 * z for z in self.depths_mm)
-            if self.depths_mm
+            if any(self.depths_mm)
             else reach.depth_range_um(lens)
         )
         pixel_um = self.pixel_um or reach.pixel_um(lens)

@@ -18,6 +18,7 @@ f32, i32 = np.float32, np.int32
 ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)  # literals would widen to float64
 SETTINGS: dict[str, Any] = {"fastmath": True, "error_model": "numpy"}
 _inlined = numba.njit(forceinline=True, **SETTINGS)
+_to_tuple: Any = to_fixed_tuple
 
 COLUMNS, ROWS = 16, 4  # of a tile: vector registers, and independent work to fill them
 LANES = ROWS * COLUMNS
@@ -36,7 +37,7 @@ NUMBERS = (
     "t_lash", "offset_x", "offset_y", "turn_x", "turn_y", "caruncle",
 )  # fmt: skip
 # vectors are tuples of three
-Parameters = namedtuple("Parameters", VECTORS + NUMBERS)
+Parameters: Any = namedtuple("Parameters", VECTORS + NUMBERS)  # type: ignore[misc]
 COUNT = 3 * len(VECTORS) + len(NUMBERS)
 
 # first lane of every quantity in a tile; three quantities for a vector. The last seven
@@ -468,7 +469,7 @@ def render_strips(
     tile, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
     for job in range(first, end):
         frame, row = job // strips, job % strips * ROWS
-        v = to_fixed_tuple(rows[frame], COUNT)
+        v = _to_tuple(rows[frame], COUNT)
         named = Parameters(
             v[0:3], v[3:6], v[6:9], v[9:12], v[12:15], v[15:18], v[18:21], v[21:24],
             v[24:27], v[27:30], v[30:33], *v[33:],

@@ -473,8 +473,12 @@ class Trainer:
         self._apply(rates, finite=finite)
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs.mean() / 1e6)
-        means = parallel.mean_of([float(v.detach()) for v in values])
-        return LogRecord(self.step, *means, self.skipped)
+        loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of(
+            [float(v.detach()) for v in values]
+        )
+        return LogRecord(
+            self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
+        )
 
     def _read_pixels(self, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
         """(batch, 1, rows, columns) standardised frames of the sensor.
