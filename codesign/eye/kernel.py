@@ -470,7 +470,7 @@ def render_strips(
     for job in range(first, end):
         frame, row = job // strips, job % strips * ROWS
         v = _to_tuple(rows[frame], COUNT)
-        named = Parameters(
+        named = Parameters(  # type: ignore[call-arg]
             v[0:3], v[3:6], v[6:9], v[9:12], v[12:15], v[15:18], v[18:21], v[21:24],
             v[24:27], v[27:30], v[30:33], *v[33:],
         )  # fmt: skip
