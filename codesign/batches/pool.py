@@ -109,7 +109,7 @@ class PoolScenes:
     seed: int
 
     @property
-    def held(self) -> FramePool:
+    def frame_pool(self) -> FramePool:
         """The frames."""
         return self.pool if isinstance(self.pool, FramePool) else self.pool()
 
@@ -119,7 +119,7 @@ class PoolScenes:
         Raises:
             TrainingError: the pool is smaller than a batch.
         """
-        count = len(self.held)
+        count = len(self.frame_pool)
         batches_per_pass = count // size
         if batches_per_pass == 0:
             raise TrainingError(
@@ -140,7 +140,7 @@ class PoolScenes:
         Args:
             rows: numbers of the frames. generator: of the scales.
         """
-        pool = self.held
+        pool = self.frame_pool
         nominal_um = torch.from_numpy(pool.here_um)
         place_um = torch.from_numpy(pool.place_um[rows])
         low, high = pool.depths_um

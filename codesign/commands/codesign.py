@@ -83,17 +83,21 @@ def _train_and_search(
     record.
     """
     console = options.console
-    going = _resume(folder, settings) if options.resume else _start(folder, settings)
+    training_run = (
+        _resume(folder, settings) if options.resume else _start(folder, settings)
+    )
     if settings.run.pitch_um < settings.optics.sample_um:
         console.say(
             f"run.pitch_um = {settings.run.pitch_um:g} is finer than the samples of the image, optics.sample_um = "
             f"{settings.optics.sample_um:g}: such pixels cost more and show nothing new"
         )
-    place_on_device(going.trainer, device)
+    place_on_device(training_run.trainer, device)
     parallel.wait_for_all()
-    event_writer = _event_writer(folder, going.trainer.step) if options.events else None
-    records = runs.train_run(going, folder / CHECKPOINT)
-    steps_left = settings.inner.steps - going.trainer.step
+    event_writer = (
+        _event_writer(folder, training_run.trainer.step) if options.events else None
+    )
+    records = runs.train_run(training_run, folder / CHECKPOINT)
+    steps_left = settings.inner.steps - training_run.trainer.step
     for record in console.track(records, total=steps_left, label="training"):
         checkpoint.append_entry(folder / LOG, {"kind": "step", **asdict(record)})
         if event_writer:
@@ -105,7 +109,9 @@ def _train_and_search(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
-    for budget, candidate in search.search_architectures(going, folder / CHECKPOINT):
+    for budget, candidate in search.search_architectures(
+        training_run, folder / CHECKPOINT
+    ):
         mmacs = candidate.macs / 1e6
         entry = {
             "kind": "birth", "budget_mmacs": budget, "error": candidate.error, "mmacs": mmacs,
@@ -116,13 +122,13 @@ def _train_and_search(
             f"budget {budget:g} MMACs: gaze error {candidate.error:.2f} deg at {mmacs:.2f} MMACs"
         )
     parallel.leave_processes()
-    ends = finished_budgets(going)
+    ends = finished_budgets(training_run)
     margin = settings.scenes.margin
     image = image_formation.describe_image(
-        settings.optics, going.trainer.model.coefficients_rad.detach(),
+        settings.optics, training_run.trainer.model.coefficients_rad.detach(),
         settings.scenes.pixels + 2 * margin, margin=margin,
     )  # fmt: skip
-    _write_results(folder, going, ends, image, export=options.export)
+    _write_results(folder, training_run, ends, image, export=options.export)
     return [end.row for end in ends], image
 
 
@@ -132,11 +138,11 @@ def _train_along(folder: Path, settings: RunConfig, device: torch.device) -> int
     From the checkpoint that process 0 wrote.
     """
     parallel.wait_for_all()
-    going = runs.resume_run(folder / CHECKPOINT, settings)
-    place_on_device(going.trainer, device)
-    for _ in runs.train_run(going, folder / CHECKPOINT):
+    training_run = runs.resume_run(folder / CHECKPOINT, settings)
+    place_on_device(training_run.trainer, device)
+    for _ in runs.train_run(training_run, folder / CHECKPOINT):
         pass
-    for _ in search.search_architectures(going, folder / CHECKPOINT):
+    for _ in search.search_architectures(training_run, folder / CHECKPOINT):
         pass
     parallel.leave_processes()
     return 0

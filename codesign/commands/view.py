@@ -63,14 +63,14 @@ def _parse_table(text: str, path: Path) -> dict[str, Any]:
         StoreError: not JSON, or not an object; ``path`` is named.
     """
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except ValueError as error:
         raise StoreError(f"{path}: not JSON ({error})") from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise StoreError(
-            f"{path}: need a table of names and values, found {type(found).__name__}"
+            f"{path}: need a table of names and values, found {type(content).__name__}"
         )
-    return found
+    return content
 
 
 def _training_panels(entries: list[dict[str, Any]]) -> list[Panel]:
@@ -139,7 +139,7 @@ def prediction_panels(path: Path) -> list[Panel]:
     count = len(arrays["frames"])
     names = [
         str(stored.attributes[f"network_{i}"])
-        for i in range(len(arrays["told_slip_um"]))
+        for i in range(len(arrays["predicted_slip_um"]))
     ]
     frames = SliderAxis("frame", list(range(count)))
     panels: list[Panel] = [
@@ -151,7 +151,7 @@ def prediction_panels(path: Path) -> list[Panel]:
             from_least=True,
         )
     ]
-    predicted = arrays["told_pupil"]
+    predicted = arrays["predicted_pupil"]
     truth = np.broadcast_to(arrays["pupil"], predicted.shape)
     choice = SliderAxis("shown", ["truth", "answer"], blink=True)
     axes = [SliderAxis("network", names), frames, choice]
@@ -159,7 +159,7 @@ def prediction_panels(path: Path) -> list[Panel]:
     panels.append(_pixels("Pupil", pair, axes, "share of the pixel"))
     rows = []
     for i, name in enumerate(names):
-        pairs = np.stack([arrays["slip_um"], arrays["told_slip_um"][i]], axis=2)
+        pairs = np.stack([arrays["slip_um"], arrays["predicted_slip_um"][i]], axis=2)
         values = np.c_[pairs.reshape(count, 6), arrays["interval_um"][i]] * 1e-3
         rows += [(name, k, *row) for k, row in enumerate(values.tolist())]
     columns = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]

@@ -44,7 +44,7 @@ COUNT = 3 * len(VECTORS) + len(NUMBERS)
 # are the planes of a rendered frame
 (
     U, W, D, _, _, S, GX, GY, UPPER, LOWER, N, _, _, TS, M, _, _, TC, C, _, _, INSIDE,
-    DISC, PUPIL, VIRTUAL, R, NEAR, FAR, BARE, SEEN, FRONT, BACK, HOLE, PLACE,
+    DISC, PUPIL, VIRTUAL, R, NEAR, FAR, BARE, OPENNESS, FRONT, BACK, HOLE, PLACE,
 ) = (LANES * k for k in range(34))  # fmt: skip
 PLANES = 7
 TILE, WORDS = PLACE + 2 * SAMPLES * LANES, 2 * SAMPLES * LANES
@@ -300,7 +300,7 @@ def _shade_face(p, x, words):
         _store(x, D + i, d)
         _store(x, N + i, n)
         x[S + i] = distance
-        x[SEEN + i] = openness
+        x[OPENNESS + i] = openness
         x[BARE + i] = ONE - openness
         x[FRONT + i] = distance * cosine
         x[GX + i] = gx
@@ -407,7 +407,7 @@ def _shade_eye(p, t, x, words):
     for i in range(LANES):
         cornea, disc, pupil = x[INSIDE + i], x[DISC + i], x[PUPIL + i]
         d, m, c = _load(x, D + i), _load(x, M + i), _load(x, C + i)
-        ts, tc, openness = x[TS + i], x[TC + i], x[SEEN + i]
+        ts, tc, openness = x[TS + i], x[TC + i], x[OPENNESS + i]
         lower = x[LOWER + i]
         brown = _iris_albedo(p, x[R + i], _interpolate_texel(x, words, 0, i))
         limbus = cornea * _lorentzian((x[R + i] - p.limbus_r) / f32(1300))
@@ -441,9 +441,9 @@ def _shade(p, t, x, words):
     for i in range(NEAR, PLACE):
         x[i] = ZERO
     _shade_face(p, x, words)
-    least = largest = x[SEEN]
+    least = largest = x[OPENNESS]
     for i in range(1, LANES):
-        least, largest = min(least, x[SEEN + i]), max(largest, x[SEEN + i])
+        least, largest = min(least, x[OPENNESS + i]), max(largest, x[OPENNESS + i])
     if least < ONE:
         _shade_skin(p, t, x, words)
     if largest > ZERO:

@@ -11,7 +11,7 @@ NAMES = (
     "medial canthus", "lateral canthus", "upper margin", "lower margin",
     "limbus temporal", "limbus down", "limbus nasal", "limbus up", "corneal apex",
 )  # fmt: skip
-SETTLED_UM = 1e-6  # converged distance on the iris: 1e-9 of a tangent
+CONVERGED_UM = 1e-6  # converged distance on the iris: 1e-9 of a tangent
 # least depth of projected points; also for points behind the camera
 NEAREST_UM = 500.0
 
@@ -133,7 +133,7 @@ def iris_to_camera(
             p, tangents + offsets[:, None, None]
         )
         error = here - iris_um
-        if not tangents.requires_grad and float(error.abs().max()) < SETTLED_UM:
+        if not tangents.requires_grad and float(error.abs().max()) < CONVERGED_UM:
             break
         along_x = (right - left) / (2 * step)
         along_y = (down - up) / (2 * step)

@@ -49,7 +49,7 @@ class CameraRig:
     looks up.
     azimuth_rad: of the camera from the face's normal towards the temple.
     right_eye: the mirror image of a left eye.
-    aim_um: (x, y) of the nominal pupil beside the camera's axis, x towards the temple.
+    aim_um: (x, y) of the nominal pupil from the camera's axis, x towards the temple.
     sensor_distance_um: lens to sensor.
     lamps_um: positions of the flood LEDs in the camera's frame, x towards the temple.
     """
@@ -234,7 +234,7 @@ def model_parameters(
 
     Returns:
         traits and textures of the states, and what
-        :data:`codesign.eye.kernel.Parameters` needs beside them.
+        :data:`codesign.eye.kernel.Parameters` needs in addition.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     t |= dict(zip(TEXTURES, states.textures.unbind(1), strict=True))

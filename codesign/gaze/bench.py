@@ -1,4 +1,4 @@
-"""Gaze from a network's answers on simulated people, each calibrated on some of its
+"""Gaze from a network's predictions on simulated people, each calibrated on some of its
 own frames.
 """
 

@@ -31,19 +31,19 @@ class MixedModel:
     variance: Array
     noise: Array
 
-    def own(self, design: Array, answers: Array) -> Array:
+    def own(self, design: Array, gaze_deg: Array) -> Array:
         """(terms, 2) coefficients β + u of one person: posterior mean from that
         person's frames.
 
         Args:
-            design: (n, terms). answers: (n, 2).
+            design: (n, terms). gaze_deg: (n, 2).
         """
         columns = [
-            self.mean[:, k] + self._effects(design, answers, k)[0] for k in range(2)
+            self.mean[:, k] + self._effects(design, gaze_deg, k)[0] for k in range(2)
         ]
         return np.stack(columns, 1)
 
-    def _effects(self, design: Array, answers: Array, k: int) -> tuple[Array, Array]:
+    def _effects(self, design: Array, gaze_deg: Array, k: int) -> tuple[Array, Array]:
         """Posterior mean (terms,) and covariance (terms, terms) of u in component k.
 
         C = (X^T X / σ² + diag(1 / τ²))⁻¹, u = C X^T (y - X β) / σ².
@@ -51,18 +51,18 @@ class MixedModel:
         cov = np.linalg.inv(
             design.T @ design / self.noise[k] + np.diag(1 / self.variance[:, k])
         )
-        residual = answers[:, k] - design @ self.mean[:, k]
+        residual = gaze_deg[:, k] - design @ self.mean[:, k]
         return cov @ (design.T @ residual) / self.noise[k], cov
 
 
 def fit_mixed_model(
-    design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS
+    design: Array, gaze_deg: Array, person: Array, *, first: Array, rounds: int = ROUNDS
 ) -> MixedModel:
     """Linear mixed model of largest likelihood, by ``rounds`` of expectation
     maximisation.
 
     Args:
-        design: (n, terms). answers: (n, 2), deg. person: (n,) numbers of people.
+        design: (n, terms). gaze_deg: (n, 2), deg. person: (n,) numbers of people.
         first: (terms,) initial variances. rounds: of expectation maximisation.
 
     Raises:
@@ -74,19 +74,19 @@ def fit_mixed_model(
             f"{len(design)} frames of {len(people)} people tell not how people differ in {design.shape[1]} terms: give "
             "two people or more, and more frames than terms"
         )
-    mean = np.linalg.lstsq(design, answers, rcond=None)[0]
+    mean = np.linalg.lstsq(design, gaze_deg, rcond=None)[0]
     model = MixedModel(
         mean,
         np.repeat(first[:, None], 2, 1),
-        np.maximum((answers - design @ mean).var(0), LEAST),
+        np.maximum((gaze_deg - design @ mean).var(0), LEAST),
     )
     for _ in range(rounds):
-        model = _em_step(model, design, answers, people)
+        model = _em_step(model, design, gaze_deg, people)
     return model
 
 
 def _em_step(
-    model: MixedModel, design: Array, answers: Array, people: list[Array]
+    model: MixedModel, design: Array, gaze_deg: Array, people: list[Array]
 ) -> MixedModel:
     """One round of expectation maximisation.
 
@@ -100,15 +100,15 @@ def _em_step(
         np.empty_like(v) for v in (model.mean, model.variance, model.noise)
     )
     for k in range(2):
-        effects = [model._effects(design[rows], answers[rows], k) for rows in people]
+        effects = [model._effects(design[rows], gaze_deg[rows], k) for rows in people]
         personal = np.zeros(len(design))
         for rows, (u, _) in zip(people, effects, strict=True):
             personal[rows] = design[rows] @ u
-        mean[:, k] = np.linalg.lstsq(design, answers[:, k] - personal, rcond=None)[0]
+        mean[:, k] = np.linalg.lstsq(design, gaze_deg[:, k] - personal, rcond=None)[0]
         variance[:, k] = (
             np.mean([u**2 + np.diag(cov) for u, cov in effects], axis=0) + LEAST
         )
-        residual = ((answers[:, k] - design @ mean[:, k] - personal) ** 2).sum()
+        residual = ((gaze_deg[:, k] - design @ mean[:, k] - personal) ** 2).sum()
         uncertainty = sum(
             np.sum((design[rows] @ cov) * design[rows])
             for rows, (_, cov) in zip(people, effects, strict=True)
@@ -201,7 +201,7 @@ def _axis_deg(read: NetworkReadings) -> Array:
     """
     if read.axis_deg is None:
         raise TrainingError(
-            "the readings hold no optic axis, which gaze is told from here; calibrate by the sphere"
+            "the readings hold no optic axis, which gaze is read from here; calibrate by the sphere"
         )
     return read.axis_deg
 
@@ -261,17 +261,17 @@ def load_people(path: Path) -> PopulationPrior:
         StoreError: no such file, another kind, or entries that no people can have.
     """
     arrays = store.load(path, KIND).arrays
-    found = {name: np.asarray(arrays[name], dtype=float) for name in SHAPES}
+    values = {name: np.asarray(arrays[name], dtype=float) for name in SHAPES}
     odd = [
         name
         for name, shape in SHAPES.items()
-        if found[name].shape != shape
-        or not np.isfinite(found[name]).all()
-        or (name in ("variance", "noise", "spread") and found[name].min() <= 0)
+        if values[name].shape != shape
+        or not np.isfinite(values[name]).all()
+        or (name in ("variance", "noise", "spread") and values[name].min() <= 0)
     ]
     if odd:
         raise StoreError(
             f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again"
         )
-    *model, middle, spread = found.values()
+    *model, middle, spread = values.values()
     return PopulationPrior(MixedModel(*model), middle, spread)

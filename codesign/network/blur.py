@@ -33,9 +33,9 @@ REACH = 5
 BLOCKS = 2  # in sequence
 # unlabelled features of a window for the slippage, in addition to its depth: position of
 # the eye, confidence in the texture
-BESIDE = 8
-# vergence, its spread, the mean and BESIDE features of every window; two means
-SLIP_FEATURES = (3 + BESIDE) * GRID**2 + 2
+EXTRA = 8
+# vergence, its spread, the mean and EXTRA features of every window; two means
+SLIP_FEATURES = (3 + EXTRA) * GRID**2 + 2
 
 # 1 / depth of a face before the camera: mean and spread
 VERGENCE_PER_M = 45.0
@@ -53,7 +53,7 @@ def blur_branch_macs(size: int) -> int:
         (FEATURES + PLACES) * HIDDEN[0]
         + BLOCKS * block
         + HIDDEN[0] * HIDDEN[1]
-        + HIDDEN[1] * (2 + BESIDE)
+        + HIDDEN[1] * (2 + EXTRA)
     )
     return (
         spectra_macs(size) + STEP_MACS + GRID**2 * layers + BLOCKS * 3 * HIDDEN[0] ** 2
@@ -154,7 +154,7 @@ class BlurBranch(nn.Module):
     PSFs differ between windows of the field, so every window weights the spectra of the
     first layer by gains and offsets of its own. Its depth is then computed with those
     of its neighbours and the context of the frame, in BLOCKS blocks. Every window also
-    contributes BESIDE features without labels to the slippage: depths alone leave a
+    contributes EXTRA features without labels to the slippage: depths alone leave a
     fifth more error.
     """
 
@@ -172,7 +172,7 @@ class BlurBranch(nn.Module):
         )
         self.together = nn.Sequential(*(block for pair in pairs for block in pair))
         self.second = nn.Conv2d(HIDDEN[0], HIDDEN[1], 1)
-        self.depth = nn.Conv2d(HIDDEN[1], 2 + BESIDE, 1)
+        self.depth = nn.Conv2d(HIDDEN[1], 2 + EXTRA, 1)
         line = torch.linspace(-1, 1, GRID)
         x, y = line.expand(GRID, GRID), line[:, None].expand(GRID, GRID)
         self.register_buffer(
@@ -213,7 +213,7 @@ class BlurBranch(nn.Module):
         last layer.
 
         The log standard deviation is clipped to [-3, 2]. The features are depths, means
-        and BESIDE features of every window, the precision-weighted mean vergence and
+        and EXTRA features of every window, the precision-weighted mean vergence and
         the mean log standard deviation.
         """
         log_sd = out[:, 1].clamp(-3, 2)

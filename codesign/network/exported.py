@@ -31,7 +31,7 @@ OUTPUTS = {  # name: what it is
 
 @dataclass(frozen=True, slots=True)
 class OutputScale:
-    """What turns a network's answers into lengths and angles.
+    """What turns a network's outputs into lengths and angles.
 
     frame_mm: edge of all pixels. slip_mm: unit of the slippage. rig: pose of the camera.
     axis, points: whether training gave them weight; what it did not is

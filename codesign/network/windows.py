@@ -31,8 +31,8 @@ STEPS: tuple[
 REACHES = (1, 2)  # samples from neighbour to neighbour, of means over as many
 # of every kind of step: mean and spread of the logarithm of its square, and its
 # steepest
-TOLD = 3
-STEP_FEATURES = TOLD * len(STEPS) * len(REACHES)
+STATISTICS = 3
+STEP_FEATURES = STATISTICS * len(STEPS) * len(REACHES)
 STEP_MACS = SAMPLES**2 * (len(REACHES) * sum(len(taps) for taps in STEPS) + 4)
 
 

@@ -329,18 +329,18 @@ def describe_image(
         return record | {"error": None, "problem": str(problem)}
 
 
-def describe_image_text(found: dict[str, Any]) -> str:
+def describe_image_text(record: dict[str, Any]) -> str:
     """A line of :func:`describe_image`.
 
     Args:
-        found: record of :func:`describe_image`.
+        record: of :func:`describe_image`.
     """
-    if found["error"] is None:
-        return f"image: {found['kind']}; how far it is from the true image is not known: {found['problem']}"
-    if found["kind"] == "uniform":
+    if record["error"] is None:
+        return f"image: {record['kind']}; how far it is from the true image is not known: {record['problem']}"
+    if record["kind"] == "uniform":
         return (
             "image: one PSF for the whole field, one wavelength (uniform); it differs from the true image of a texture "
-            f"by {found['error']:.2f} of its contrast; optics.image = 'true' trains on it"
+            f"by {record['error']:.2f} of its contrast; optics.image = 'true' trains on it"
         )
-    light = f"{found['fwhm_nm']:g} nm" if found["fwhm_nm"] else "one wavelength"
-    return f"image: whole field, {light}, {100 * found['passed']:.0f} % of the light; error {found['error']:.3f}"
+    light = f"{record['fwhm_nm']:g} nm" if record["fwhm_nm"] else "one wavelength"
+    return f"image: whole field, {light}, {100 * record['passed']:.0f} % of the light; error {record['error']:.3f}"

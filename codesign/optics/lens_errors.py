@@ -137,14 +137,14 @@ def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
     radius = np.sqrt((node[:, None] + 1) / 2)
     angle = np.arange(2 * rings) * (math.pi / rings)
     bias = state.bias_um(radius * np.cos(angle), radius * np.sin(angle))
-    answers = state.response_amounts()
+    amounts = state.response_amounts()
     # means over the aperture of the bias and its square
     mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
     covariance = rates.covariance
     return float(
         covariance[0, 0] * square
-        + 2 * mean * (covariance[0, 1:] @ answers)
-        + answers @ covariance[1:, 1:] @ answers
+        + 2 * mean * (covariance[0, 1:] @ amounts)
+        + amounts @ covariance[1:, 1:] @ amounts
     )
 
 

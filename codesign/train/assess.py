@@ -226,7 +226,7 @@ class FramePredictions:
 
 @torch.no_grad()
 def predict_frames(
-    net: Supernet, architecture: Architecture, seen: SensorFrames, inner: InnerConfig
+    net: Supernet, architecture: Architecture, frames: SensorFrames, inner: InnerConfig
 ) -> FramePredictions:
     """Predictions of a network for frames, in evaluation mode, in mm.
 
@@ -235,13 +235,13 @@ def predict_frames(
 
     Args:
         net: elastic network. architecture: member of the search space.
-        seen: frames of the sensor with their labels. inner: settings of training.
+        frames: frames of the sensor with their labels. inner: settings of training.
     """
     was_training = net.training
     net.eval()
     device = next(net.parameters()).device
     predictions = [
-        net(frames.to(device), architecture) for frames in batched_frames(seen)
+        net(part.to(device), architecture) for part in batched_frames(frames)
     ]
     net.train(was_training)
     slip, centre, mask, log_sd, depth, axis = (
@@ -249,11 +249,11 @@ def predict_frames(
         for name in ("slip", "centre", "mask_logits", "slip_log_sd", "depth", "axis")
     )
     scale = torch.tensor(inner.slip_scale_mm)
-    pixels = int(seen.frames.shape[-1])
+    pixels = int(frames.frames.shape[-1])
     return FramePredictions(
         slip * scale,
-        centre * seen.wide,
-        losses.mask_iou(mask, seen.mask, pixels=pixels),
+        centre * frames.wide,
+        losses.mask_iou(mask, frames.mask, pixels=pixels),
         log_sd.exp() * scale,
         depth,
         mask,

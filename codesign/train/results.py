@@ -86,7 +86,7 @@ class _TestFrames:
     """Frames through one lens, for every budget that shares it.
 
     test: that judge. fine: the same on the finer image. people: for gaze.
-    measured: to measure batch statistics on. apart: to calibrate intervals with.
+    measured: to measure batch statistics on. calibration: to calibrate intervals with.
     shifted: the first of the test, with the PSFs shifted in depth.
     """
 
@@ -94,7 +94,7 @@ class _TestFrames:
     fine: SensorFrames | None
     people: SensorFrames
     measured: list[Tensor]
-    apart: SensorFrames
+    calibration: SensorFrames
     shifted: SensorFrames
 
 
@@ -145,7 +145,7 @@ def _evaluate_budget(
     def predict(images: SensorFrames) -> FramePredictions:
         return assess.predict_frames(net, architecture, images, inner)
 
-    quantile = conformal_quantiles(predict(frames.apart), frames.apart)
+    quantile = conformal_quantiles(predict(frames.calibration), frames.calibration)
     predictions = predict(frames.test)
     half_width = quantile * predictions.slip_sd_mm[:, 2]
     row |= _errors("", predictions, frames.test)
@@ -241,7 +241,7 @@ def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Arr
 
     Returns:
         frames (n, y, x) as the network sees them; pupil (n, y, x) and slip_um (n, 3),
-        true; told_pupil (networks, n, y, x) probability, told_slip_um (networks, n, 3);
+        true; predicted_pupil (networks, n, y, x) probability, predicted_slip_um (networks, n, 3);
         interval_um (networks, n) half width of the 90 % interval of the distance.
     """
     frames = ends[0].frames
@@ -253,12 +253,12 @@ def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Arr
     arrays = {
         "frames": frames.frames[:count, 0],
         "slip_um": 1e3 * frames.slip_mm[:count],
-        "told_slip_um": torch.stack(
+        "predicted_slip_um": torch.stack(
             [1e3 * end.predictions.slip_mm[:count] for end in ends]
         ),
         "interval_um": torch.stack([1e3 * end.interval_mm[:count] for end in ends]),
         "pupil": pairs[0][1],
-        "told_pupil": torch.stack([torch.sigmoid(logits) for logits, _ in pairs]),
+        "predicted_pupil": torch.stack([torch.sigmoid(logits) for logits, _ in pairs]),
     }
     return {
         name: np.asarray(value.cpu().numpy(), np.float32)

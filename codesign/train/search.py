@@ -117,12 +117,12 @@ def search_architectures(
     def gaze_error(architecture: Architecture, budget: float) -> float:
         if shared_frames is None:
             trainer = specialise_candidate(run, architecture, budget)
-            measured, seen = _measuring_and_people_frames(trainer, people)
+            measured, shown = _measuring_and_people_frames(trainer, people)
         else:
             trainer = run.trainer
-            measured, seen = shared_frames
+            measured, shown = shared_frames
         recalibrate_batch_norm(trainer.model.net, architecture, measured)
-        error_deg = assess.gaze_error_deg(trainer, architecture, people, seen)
+        error_deg = assess.gaze_error_deg(trainer, architecture, people, shown)
         trainer.model.net.train()
         return error_deg
 

@@ -50,7 +50,7 @@ def draw_psfs(axes: Axes, demo: Path) -> None:
 
 def draw_frame(axes: Axes, demo: Path) -> None:
     with h5py.File(demo / "run" / "answers.h5") as file:
-        frame, pupil = file["frames"][1], file["told_pupil"][1, 1]
+        frame, pupil = file["frames"][1], file["predicted_pupil"][1, 1]
     axes.imshow(frame, cmap="gray")
     axes.contour(pupil, [0.5], colors="#ff9900", linewidths=1)
     axes.set(xticks=[], yticks=[], title="eye and pupil as read")
@@ -59,7 +59,7 @@ def draw_frame(axes: Axes, demo: Path) -> None:
 def draw_answers(axes: Axes, demo: Path) -> None:
     with h5py.File(demo / "run" / "answers.h5") as file:
         true_mm = file["slip_um"][:, 2] / 1e3
-        read_mm = file["told_slip_um"][1, :, 2] / 1e3
+        read_mm = file["predicted_slip_um"][1, :, 2] / 1e3
         half_mm = file["interval_um"][1] / 1e3
     axes.errorbar(true_mm, read_mm, half_mm, fmt="o", color=INK, capsize=2, ms=4)
     span = [true_mm.min() - 0.5, true_mm.max() + 0.5]

@@ -1,5 +1,5 @@
 """lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each
-with how it was found.
+and how it was determined.
 """
 
 from dataclasses import dataclass, field
