@@ -44,7 +44,7 @@ tolerance = 0.5
 
 def made(path, focus_um, distance_um=600.0):
     focus = Focus(0.85, distance_um, focus_um)
-    lens.save(path, design.make(design.phase_of(None, focus, radius_um=100.0), focus, aperture_um=200.0, cell=CELL,
+    lens.save(path, design.make(design.phase_of(None, focus, radius_um=60.0), focus, aperture_um=120.0, cell=CELL,
                                 proxy=IDEAL)[0])  # fmt: skip
 
 
