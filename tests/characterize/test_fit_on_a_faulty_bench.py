@@ -102,19 +102,21 @@ def test_a_frame_with_full_wells_is_neither_brighter_nor_darker():
     assert not any("brighter or darker" in words for words in built.cautions)
 
 
+def far(**faults):
+    """The fit of a lens of 200 um on a faulty bench, and the session."""
+    lens = hidden.lens(200.0, 550.0, 3000.0)
+    depths = (2400.0, 2650.0, 2900.0, 3100.0, 3400.0, 3900.0)
+    session = hidden.session(
+        0, depths_um=depths, values=hidden.hidden(0, scale=3.0), pixels=40
+    )
+    session = bench.with_faults(session, **faults)
+    shots = bench.shoot(lens, session).capture
+    return characterize.fit(shots, lens, response=log_response_slopes(lens)), session
+
+
 @pytest.mark.slow
 def test_a_pixel_pitch_that_is_three_percent_off_is_named():
-    lens = hidden.lens(200.0, 550.0, 3000.0)
-    session = hidden.session(
-        0,
-        depths_um=(2400.0, 2650.0, 2900.0, 3100.0, 3400.0, 3900.0),
-        values=hidden.hidden(0, scale=3.0),
-        pixels=40,
-    )
-    session = bench.with_faults(session, pixel_error=0.03)
-    built = characterize.fit(
-        bench.shoot(lens, session).capture, lens, response=log_response_slopes(lens)
-    )
+    built, _ = far(pixel_error=0.03)
     assert any("a wrong pixel pitch explains" in words for words in built.cautions)
     low, high = built.interval("pixel_percent")
     assert low < 3.0 < high
@@ -122,17 +124,7 @@ def test_a_pixel_pitch_that_is_three_percent_off_is_named():
 
 @pytest.mark.slow
 def test_a_spectrum_of_thirty_nm_is_found_and_the_bias_lies_inside():
-    lens = hidden.lens(200.0, 550.0, 3000.0)
-    session = hidden.session(
-        0,
-        depths_um=(2400.0, 2650.0, 2900.0, 3100.0, 3400.0, 3900.0),
-        values=hidden.hidden(0, scale=3.0),
-        pixels=40,
-    )
-    session = bench.with_faults(session, led_nm=30.0)
-    built = characterize.fit(
-        bench.shoot(lens, session).capture, lens, response=log_response_slopes(lens)
-    )
+    built, session = far(led_nm=30.0)
     low, high = built.interval("bandwidth_nm")
     assert low < 30 / 2.3548 < high
     low, high = built.interval("bias_nm")

@@ -59,24 +59,21 @@ def exact_edges(written, dose, point, count=12):
     )
 
 
-def test_one_pillar_gets_the_dose_that_its_own_edge_needs():
-    one = np.zeros((5, 5))
-    one[2, 2] = 0.2
-    settings = exposure(alpha_um=0.02, beta_um=10.0, eta=0.5)
-    dose, _ = corrected(DiameterMap(one, PITCH), settings)
-    own = (rim_of_own_disc(0.2, 0.02) + 0.5 * rim_of_own_disc(0.2, 10.0)) / 1.5
-    assert dose[2, 2] == pytest.approx(0.5 / own, rel=1e-4)
+@pytest.mark.parametrize(
+    ("size_um", "pitch_um", "alpha_um", "beta_um"),
+    [(0.2, PITCH, 0.02, 10.0), (6.7, 6.8, 0.9, 60.0)],
+)
+def test_one_pillar_gets_the_dose_that_its_own_edge_needs(
+    size_um, pitch_um, alpha_um, beta_um
+):
+    """That of a wide area, less what the rim bends."""
+    one = np.zeros((5, 4))
+    one[2, 1] = size_um
+    settings = exposure(alpha_um=alpha_um, beta_um=beta_um, eta=0.5)
+    dose, _ = corrected(DiameterMap(one, pitch_um), settings)
+    rims = [rim_of_own_disc(size_um, width) for width in (alpha_um, beta_um)]
+    assert dose[2, 1] == pytest.approx(0.75 / (rims[0] + 0.5 * rims[1]), rel=1e-4)
     assert np.isfinite(dose).sum() == 1
-
-
-def test_a_pillar_wider_than_six_um_keeps_its_diameter():
-    """Its own edge is that of a wide area, less what the rim bends."""
-    one = np.zeros((3, 4))
-    one[1, 2] = 6.7
-    settings = exposure(alpha_um=0.9, beta_um=60.0, eta=0.5)
-    dose, _ = corrected(DiameterMap(one, 6.8), settings)
-    own = (rim_of_own_disc(6.7, 0.9) + 0.5 * rim_of_own_disc(6.7, 60.0)) / 1.5
-    assert dose[1, 2] == pytest.approx(0.5 / own, rel=1e-4)
 
 
 def test_deep_inside_equal_pillars_the_background_is_their_density():

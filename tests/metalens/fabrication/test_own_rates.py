@@ -172,20 +172,6 @@ def in_layers(x=0.0):
     return dataclasses.replace(ROUND, height_um=0.58 + x, layers=layers)
 
 
-def test_the_height_of_a_layered_pillar_is_that_of_its_own_material(few_orders):
-    """Differences of cells whose sections are written out by hand, over 0.1 nm: their
-    order leaves 1e-6.
-    """
-    found = own_rates(lens(in_layers()), np.array([SIZE]))
-    more, less = (
-        np.log(jones(in_layers(x), SIZE, WAVE, harmonics=3).t[0, 0])
-        for x in (1e-4, -1e-4)
-    )
-    assert found.rates[ROWS.index("height_nm"), 0] == pytest.approx(
-        (more - less) / 2e-4, rel=1e-4
-    )
-
-
 def on_films(pedestal_um=0.0, cap_um=0.0):
     """Two films under the pillar, 2 to 1, and one on it."""
     layers = (
@@ -199,15 +185,24 @@ def on_films(pedestal_um=0.0, cap_um=0.0):
     )
 
 
-def test_films_under_and_on_a_pillar_have_heights_of_their_own(few_orders):
-    """Differences of cells written out by hand, over 0.1 nm: their order leaves 1e-6."""
-    found = own_rates(lens(on_films()), np.array([SIZE]))
-    for film in ("pedestal", "cap"):
-        ends = (on_films(**{f"{film}_um": x}) for x in (1e-4, -1e-4))
-        more, less = (np.log(jones(e, SIZE, WAVE, harmonics=3).t[0, 0]) for e in ends)
-        assert found.rates[ROWS.index(f"{film}_nm"), 0] == pytest.approx(
-            (more - less) / 2e-4, rel=1e-4
-        )
+@pytest.mark.parametrize(
+    ("made", "changed_by", "row"),
+    [
+        (in_layers, "x", "height_nm"),
+        (on_films, "pedestal_um", "pedestal_nm"),
+        (on_films, "cap_um", "cap_nm"),
+    ],
+)
+def test_a_height_is_that_of_the_films_that_it_is_of(made, changed_by, row, few_orders):
+    """Of the pillar's own material, the films under it or those on it: differences of
+    cells written out by hand, over 0.1 nm: their order leaves 1e-6.
+    """
+    found = own_rates(lens(made()), np.array([SIZE]))
+    ends = (made(**{changed_by: x}) for x in (1e-4, -1e-4))
+    more, less = (np.log(jones(e, SIZE, WAVE, harmonics=3).t[0, 0]) for e in ends)
+    assert found.rates[ROWS.index(row), 0] == pytest.approx(
+        (more - less) / 2e-4, rel=1e-4
+    )
 
 
 def test_a_pillar_has_a_pedestal_and_a_cap_where_films_of_another_material_are():
