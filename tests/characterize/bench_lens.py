@@ -15,9 +15,8 @@ from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.estimate import FitOptions, fit
 from characterize.inference.leastsquares import FitImages, GaussianPrior
 from characterize.inference.multistart import SearchTask
-from characterize.model import NAMES, ForwardModel
+from characterize.model import NAMES
 from characterize.model.parameters import KnownValue
-from characterize.model.setting import FrameSetting
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import Sensitivity
@@ -163,37 +162,6 @@ def electrons(
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
     return bright * (peak_e / bright.max()) + bench.background_plane(truth(**more))
-
-
-def near_focus(
-    depths_um: tuple[float, ...], **values: float
-) -> tuple[FitImages, ForwardModel]:
-    """Frames of a lens of these parameters with 6000 electrons at the peak and a floor
-    of 9 e², and their model.
-    """
-    known = tuple(KnownValue(name, value) for name, value in values.items())
-    hidden = HiddenLens(
-        depths_um,
-        peak_e=6000.0,
-        parameter=known,
-        camera=BenchCamera(pixel_um=1.5, pixels=16),
-    )
-    electrons = bench.bench_irradiance(lens(), hidden, RESPONSE)
-    electrons = electrons * (6000.0 / electrons.max())
-    electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
-    everywhere, n = np.ones(electrons.shape, bool), len(depths_um)
-    data = FitImages(
-        electrons,
-        everywhere,
-        ~everywhere,
-        np.full(electrons.shape, 9.0),
-        np.ones(electrons.shape),
-    )
-    return data, ForwardModel(
-        lens(),
-        FrameSetting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16),
-        RESPONSE,
-    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

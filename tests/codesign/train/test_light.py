@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.optics import image_formation, stack
+from codesign.optics import stack
 from codesign.optics.stack import OpticsConfig
 from codesign.train import run
 from codesign.train.imaging import StepImaging
@@ -55,9 +55,6 @@ polynomials = 5
 depth_count = 4
 window_samples = 11
 """
-
-
-LIVE = image_formation.make_differentiable_imager
 
 
 def _never(step):

@@ -14,9 +14,6 @@ from tests.elsewhere import AWAY, elsewhere
 FOCUS = Focus(0.94, 900.0, 7e3)
 GRID = Grid((33, 26), 4.0, (5e3, 9e3), margin=6, window=13)
 LAYERS = Layers(behind=(Film(Index(1.52), 210.0),))
-SINGLE = (
-    3e-6  # rounding of sums of a few hundred single numbers, each 6e-8 of the largest
-)
 
 
 def _added(x, y):

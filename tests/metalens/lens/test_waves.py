@@ -87,14 +87,6 @@ def test_the_error_is_told_where_films_are_too_thin_for_it():
     assert 1e-9 < error < found.error(p * p) < 1e3 * error
 
 
-# media, wavelength, reach: through a thick stack, and through three um, where few waves
-# do not settle
-RANGES = [
-    ((1.31, 1.15, 1.97), (15.1, 11.4, 18.4), 0.63, 60.0),
-    ((1.31, 2.1, 1.52), (2.0, 0.3, 1.0), 0.85, 3.0),
-]
-
-
 def test_beyond_a_critical_angle_power_is_cut_for_rays_and_continued_for_waves():
     """At p = 1.2 from 1.1 into 1.8 nothing passes; the analytic function there is that
     of complex cosines.
