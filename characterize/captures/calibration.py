@@ -460,22 +460,16 @@ def isolated_pixels(frames: Array) -> Array:
     Args:
         frames: (n, y, x) counts.
     """
-    ring = np.ones((3, 3), bool)
-    ring[1, 1] = False
-    neighbours = np.stack(
-        [ndimage.median_filter(frame, footprint=ring) for frame in frames]
-    )
-    spread = np.stack(
-        [
-            np.full(frame.shape, max(robust_sigma(frame - median), 0.5))
-            for frame, median in zip(frames, neighbours, strict=True)
-        ]
-    )
-    brightest = np.stack(
-        [ndimage.maximum_filter(frame, footprint=ring) for frame in frames]
-    )
-    spike = (frames - brightest > 6 * spread) & (frames > 1.5 * brightest)
-    return np.asarray(spike.mean(0) > (0.8 if len(frames) >= 3 else 2))
+    if len(frames) < 3:
+        return np.zeros(frames.shape[1:], bool)
+    ring = np.ones((1, 3, 3), bool)
+    ring[0, 1, 1] = False
+    above_median = frames - ndimage.median_filter(frames, footprint=ring)
+    sigma = np.array([max(robust_sigma(frame), 0.5) for frame in above_median])
+    brightest = ndimage.maximum_filter(frames, footprint=ring)
+    spike = frames - brightest > 6 * sigma[:, None, None]
+    spike &= frames > 1.5 * brightest
+    return np.asarray(spike.mean(0) > 0.8)
 
 
 def pair_variance(frames: Array) -> float:

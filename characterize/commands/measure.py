@@ -301,31 +301,26 @@ def _pillars(
     """One record a pillar for pillars.csv: site, place in pixels, diameter and standard
     error in nm, state; drawn diameter and error with a design.
     """
-    rows: list[dict[str, object]] = []
-    flags = {
-        "missing": pillars.missing,
-        "collapsed": pillars.collapsed,
-        "oval": pillars.oval,
+    state = np.full(len(pillars.row), "good", dtype=object)
+    for word in ("oval", "collapsed", "missing"):
+        state[getattr(pillars, word)] = word
+    columns: dict[str, Array] = {
+        "site_row": pillars.site[:, 0],
+        "site_column": pillars.site[:, 1],
+        "row_px": pillars.row.round(3),
+        "column_px": pillars.column.round(3),
+        "diameter_nm": pillars.diameter_nm.round(3),
+        "sigma_nm": pillars.sigma_nm.round(3),
+        "state": state,
     }
-    for k in range(len(pillars.diameter_nm)):
-        state = next((word for word, flagged in flags.items() if flagged[k]), "good")
-        row: dict[str, object] = {
-            "site_row": int(pillars.site[k, 0]),
-            "site_column": int(pillars.site[k, 1]),
-            "row_px": round(float(pillars.row[k]), 3),
-            "column_px": round(float(pillars.column[k]), 3),
-            "diameter_nm": round(float(pillars.diameter_nm[k]), 3),
-            "sigma_nm": round(float(pillars.sigma_nm[k]), 3),
-            "state": state,
+    if on_mask is not None:
+        columns |= {
+            "designed_nm": on_mask.designed_nm.round(3),
+            "error_nm": on_mask.error_nm.round(3),
+            "outlier": on_mask.outlier,
         }
-        if on_mask is not None:
-            row |= {
-                "designed_nm": round(float(on_mask.designed_nm[k]), 3),
-                "error_nm": round(float(on_mask.error_nm[k]), 3),
-                "outlier": bool(on_mask.outlier[k]),
-            }
-        rows.append(row)
-    return rows
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def _pillars_text(

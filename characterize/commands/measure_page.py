@@ -54,22 +54,14 @@ def frames_page(path: Path, quality: frames.CaptureQuality) -> None:
             "Curves", "", [report.Figure(_curves(quality), CURVES, wide=True)]
         ),
     ]
-    fields = [(x, y, depth) for (x, y), depth in quality.best_depth_um.items()]
-    if fields:
-        head = (
-            "angle along x / deg",
-            "angle along y / deg",
-            "depth of the sharpest frame / µm",
-        )
-        sections.append(
-            report.Section("Field curvature", "", [report.Table(head, fields)])
-        )
-    if quality.distortion:
-        head = ("angle along x / deg", "angle along y / deg", "distortion")
-        table = report.Table(
-            head, [(x, y, f"{d:+.3%}") for (x, y), d in quality.distortion.items()]
-        )
-        sections.append(report.Section("Distortion", "", [table]))
+    for title, column, values in (
+        ("Field curvature", "depth of the sharpest frame / µm", quality.best_depth_um),
+        ("Distortion", "distortion", quality.distortion),
+    ):
+        if values:
+            head = ("angle along x / deg", "angle along y / deg", column)
+            rows = [(x, y, value) for (x, y), value in values.items()]
+            sections.append(report.Section(title, "", [report.Table(head, rows)]))
     sections.append(
         report.Section("Put right or assumed on the way", "\n\n".join(quality.notes))
     )
