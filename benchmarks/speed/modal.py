@@ -17,9 +17,8 @@ from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal import solve
 from metalens.modal.case import case_of
-from metalens.modal.engine import homogeneous_basis, solve_on_mesh
 from metalens.modal.mesh import assemble_disc
-from metalens.modal.solver import LEVELS
+from metalens.modal.solver import LEVELS, homogeneous_basis, solve_on_mesh
 
 WAVELENGTH_UM = 0.85
 CELL = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))

@@ -20,8 +20,8 @@ import numpy as np
 from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal.case import case_of
-from metalens.modal.engine import solve_on_mesh
 from metalens.modal.mesh import MeshPlan, build_mesh
+from metalens.modal.solver import solve_on_mesh
 from metalens.modal.spaces import select_functions
 
 FILE = Path(__file__).parents[1] / "results" / "reference_pillars.json"

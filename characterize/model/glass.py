@@ -121,7 +121,7 @@ class FilmStack:
         pairs = self.pairs(distance_um)
         w = media.solve_direction_square(pairs, reach2_um2)
         passed = media.passed_at((self.filling, *(n for n, _ in self.behind)), w)
-        spread = media.area_spreading_of_square(pairs, w)
+        spread = media.area_spreading(pairs, w)
         size = np.sqrt(passed / spread) / (2 * np.pi)
         return size, np.asarray(media.whole_path(pairs, w))
 

@@ -139,15 +139,7 @@ def _about(lens: Lens, extra: Sequence[str]) -> str:
     """Hash of everything that the slopes of a lens depend on: the key of the cache."""
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     cell = lens.cell
-    films = [film.material for film in (*cell.under, *cell.over)]
-    sections = [
-        material
-        for layer in cell.layers
-        for material in (layer.material, layer.between, layer.coat)
-        if material is not None
-    ]
-    media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
-    indices = [index(medium, lens.wavelength_um) for medium in media]
+    indices = [index(medium, lens.wavelength_um) for medium in cell.materials]
     ends = float(d.min()), float(d.max())
     key = cell, indices, lens.wavelength_um, ends, lens.proxy, tuple(extra)
     return str(joblib.hash(key))

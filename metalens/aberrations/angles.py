@@ -269,7 +269,9 @@ def _brightness(
         irradiance = (1 - p * p) ** 2
     else:
         irradiance = 1 / float(
-            media.area_spreading(lens.layers.before(depth_um, lens.wavelength_um), p)
+            media.area_spreading(
+                lens.layers.before(depth_um, lens.wavelength_um).layers, p * p
+            )
         )
     return irradiance / abs(float(np.linalg.det(chief.moves)))
 

@@ -87,23 +87,8 @@ def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
     Raises:
         MaterialError: a wavelength outside the range of a material.
     """
-    films = [film.material for film in (*cell.under, *cell.over)]
-    layer_materials = [
-        material
-        for layer in cell.layers
-        for material in (layer.material, layer.between, layer.coat)
-        if material is not None
-    ]
-    all_materials = (
-        cell.pillar,
-        cell.fill,
-        cell.substrate,
-        cell.cover,
-        *films,
-        *layer_materials,
-    )
     densest = max(
-        materials.index(material, wavelength_um).real for material in all_materials
+        materials.index(material, wavelength_um).real for material in cell.materials
     )
     return cell.lattice.least_order * wavelength_um / densest
 

@@ -219,6 +219,19 @@ class Cell:
         return (Layer(self.height_um),)
 
     @property
+    def materials(self) -> tuple[Material, ...]:
+        """Of pillar, surroundings, films and layers with their coats."""
+        films = [film.material for film in (*self.under, *self.over)]
+        layered = [
+            material
+            for layer in self.layers
+            for material in (layer.material, layer.between, layer.coat)
+            if material is not None
+        ]
+        around = self.fill, self.substrate, self.cover
+        return self.pillar, *around, *films, *layered
+
+    @property
     def width_slope(self) -> float:
         """Change of width for each um of height, of tilted walls."""
         return -2 * math.tan(self.sidewall_rad)

@@ -81,7 +81,7 @@ def rays(
     x = centre[0] - reach_per_p * px
     y = centre[1] - reach_per_p * py
     r = torch.hypot(x, y).clamp_min(1e-9)
-    root_spread = torch.sqrt(media.area_spreading(after, p))
+    root_spread = torch.sqrt(media.area_spreading(after.layers, p * p))
     # share of each node within the rim; r changes over a node by root_spread * step
     inside = ((radius - r) / (root_spread * step) + 0.5).clamp(0, 1)
     passed = torch.sqrt(media.passed_at(after.order, p * p))
@@ -205,7 +205,10 @@ def _turning(after: Media, p: Tensor) -> Tensor:
     unit = p / size[..., None]
     along, across = (
         part[..., None, None]
-        for part in (reach / (size * media.area_spreading(after, size)), size / reach)
+        for part in (
+            reach / (size * media.area_spreading(after.layers, size * size)),
+            size / reach,
+        )
     )
     turning: Tensor = (
         across * torch.eye(2).to(p)

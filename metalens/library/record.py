@@ -298,15 +298,8 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
     Raises:
         CellError, MaterialError: as :func:`check_sweep`.
     """
-    films = [film.material for film in (*cell.under, *cell.over)]
-    layered = [
-        m
-        for layer in cell.layers
-        for m in (layer.material, layer.between, layer.coat)
-        if m is not None
-    ]
     for wavelength in sweep.wavelengths_um:
-        for material in (cell.pillar, cell.fill, *films, *layered):
+        for material in cell.materials:
             index(material, wavelength)
         for side in ("substrate", "cover"):
             n = index(getattr(cell, side), wavelength)

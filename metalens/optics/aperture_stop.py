@@ -173,11 +173,11 @@ def fresnel_um(
     slope2 = tangents[0] ** 2 + tangents[1] ** 2
     w = slope2 / (1 + slope2)
     across = float(media.reach_per_direction(between.layers, w))
-    along = float(media.area_spreading_of_square(between.layers, w)) / across
+    along = float(media.area_spreading(between.layers, w)) / across
     if before is None:
         return along, across
     whole = float(media.reach_per_direction(before.layers, w))
-    area = float(media.area_spreading_of_square(before.layers, w))
+    area = float(media.area_spreading(before.layers, w))
     return along * (1 - along * whole / area), across * (1 - across / whole)
 
 

@@ -34,11 +34,11 @@ def chebyshev_interpolant(function: Callable[[Any], Any], u: Any) -> Any:
             lambda unit: function(middle + reach * unit), degree
         )
         if np.abs(series[-2:]).max() <= LEFT * np.abs(series).max():
-            return horner(chebyshev.cheb2poly(series), (u - middle) / reach)
+            return sum_powers(chebyshev.cheb2poly(series), (u - middle) / reach)
     return function(u)
 
 
-def horner(powers: np.ndarray, unit: Any) -> Any:
+def sum_powers(powers: np.ndarray, unit: Any) -> Any:
     """Polynomial Σ powers[n] unitⁿ, elementwise.
 
     Args:

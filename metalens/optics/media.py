@@ -14,7 +14,7 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.optics import paths
-from metalens.optics.interpolant import horner
+from metalens.optics.interpolant import sum_powers
 
 NEWTON = 14  # steps at most; each doubles the digits
 Pairs = Sequence[
@@ -124,15 +124,6 @@ def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> An
     )[1]
 
 
-def area_spreading(media: Media, p: Any) -> Any:
-    """Area on the plane per area of p: (reach / p) (d reach / d p), um².
-
-    Args:
-        media: plane-parallel media.
-    """
-    return area_spreading_of_square(media.layers, p * p)
-
-
 def ray_direction(media: Media, reach_um: Any) -> Any:
     """p of the ray of this reach: the inverse of :func:`lateral_reach`, to rounding.
 
@@ -203,8 +194,8 @@ def reach_per_direction(layers: Pairs, w: Any) -> Any:
     return sum([t / normal for _, t, normal in _with_normals(layers, w)])
 
 
-def area_spreading_of_square(layers: Pairs, w: Any) -> Any:
-    """Area on the plane per area of p, um²: :func:`area_spreading` as of w = p².
+def area_spreading(layers: Pairs, w: Any) -> Any:
+    """Area on the plane per area of p, (reach / p) (d reach / d p), um², of w = p².
 
     (Σ t / s) (Σ t n² / s³) with s = √(n² - w).
 
@@ -332,7 +323,7 @@ class SaddleCorrection:
         w.
         """
         u = ((self.rarest * self.rarest - w) ** 0.5 - self.middle) / self.half
-        return horner(self.real, u), horner(self.imaginary, u)
+        return sum_powers(self.real, u), sum_powers(self.imaginary, u)
 
     def error(self, w: Array) -> Array:
         """Relative error of the amplitude of rays of w = p²."""
@@ -403,7 +394,7 @@ def _saddle(behind: Media, wavenumber: float, most: float) -> SaddleCorrection:
     above = np.flatnonzero(np.abs(series) > ROUNDING * path_rad.min())
     count = int(above[-1]) + 1 if len(above) else 1
     power = np.polynomial.chebyshev.cheb2poly(series[:count])
-    misfit = np.abs(horner(power, u) - samples) / path_rad
+    misfit = np.abs(sum_powers(power, u) - samples) / path_rad
     return SaddleCorrection(
         rarest,
         middle,
@@ -459,7 +450,7 @@ def plane_wave_correction(
     node, node_weight = np.polynomial.hermite_e.hermegauss(count)
     p = np.sqrt(w)
     g = np.asarray(reach_per_direction(layers, w))
-    reach_slope = np.asarray(area_spreading_of_square(layers, w)) / g
+    reach_slope = np.asarray(area_spreading(layers, w)) / g
     rotation = np.exp(-0.25j * np.pi)
     u = rotation * node[:, None] / np.sqrt(k * reach_slope)
     v = rotation * node / np.sqrt(k * g)

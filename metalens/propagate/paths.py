@@ -106,7 +106,7 @@ def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> 
     """
     layers = behind.layers
     passed = media.passed_at(behind.order, w)
-    spread = media.area_spreading_of_square(layers, w)
+    spread = media.area_spreading(layers, w)
     real, imaginary = saddle_correction(behind, wavenumber, reach_um).at(w)
     correction = (real + 1j * imaginary) / (wavenumber * media.whole_path(layers, w))
     magnitude = wavenumber / (2 * np.pi) * (passed / spread) ** 0.5

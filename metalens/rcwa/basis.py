@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.cell import Cell, check_direction
+from metalens.cell import Cell, Lattice, check_direction
 from metalens.core.arrays import Array
 
 Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
@@ -63,24 +63,6 @@ def tangential_wave(
     return TangentialWave(kx, ky, azimuth_rad if kx or ky else 0.0, wavelength_um)
 
 
-@dataclass(frozen=True, slots=True)
-class LatticeFrame:
-    """Edges of the rectangle that repeats, in pitches; whether it is centred; symmetry
-    operations of the case.
-    """
-
-    along: float
-    across: float
-    centred: bool
-    operations: tuple[Operation, ...]
-
-
-def lattice_frame(cell: Cell, operations: tuple[Operation, ...]) -> LatticeFrame:
-    """Lattice of a ``cell`` with the symmetry ``operations`` of its fields."""
-    x, y = cell.lattice.periods_um(1.0)
-    return LatticeFrame(x, y, cell.lattice.centred, operations)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class OrderSet:
     """Amplitudes of one scalar field: (k,) orders m, n, one of each orbit; sizes of the
@@ -116,32 +98,31 @@ class ReducedOrders:
 
 
 @lru_cache(maxsize=24)
-def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
+def reduced_orders(
+    harmonics: float, lattice: Lattice, operations: tuple[Operation, ...]
+) -> ReducedOrders:
     """Circular truncation: all orders within ``harmonics`` orders of a square lattice
     of the cell's area, one for each orbit of the symmetry operations.
 
     Args:
         harmonics: radius, in orders of that square lattice.
-        frame: lattice and operations.
+        lattice: of the pillars. operations: symmetries of the fields.
 
     The rectangle of a hexagonal lattice holds two sites: orders with m + n even.
     """
-    area = frame.along * frame.across / (2 if frame.centred else 1)
-    radius = harmonics / np.sqrt(area)
+    along, across = lattice.periods_um(1.0)
+    radius = harmonics / np.sqrt(lattice.area_um2(1.0))
     radius_rounded_up = radius * (1 + 1e-9)
-    reach = (
-        int(radius_rounded_up * frame.along),
-        int(radius_rounded_up * frame.across),
-    )
+    reach = int(radius_rounded_up * along), int(radius_rounded_up * across)
     spans = (np.arange(-r, r + 1) for r in reach)
     m, n = (a.ravel() for a in np.meshgrid(*spans, indexing="ij"))
-    inside = (m / frame.along) ** 2 + (n / frame.across) ** 2 <= radius**2 * (1 + 1e-9)
-    if frame.centred:
+    inside = (m / along) ** 2 + (n / across) ** 2 <= radius**2 * (1 + 1e-9)
+    if lattice.centred:
         inside &= (m + n) % 2 == 0
     m, n = m[inside], n[inside]
-    ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
+    ex, ey, ez, hz = (_reduced(m, n, operations, field) for field in range(4))
     links = tuple(
-        _link(rows, columns, frame.operations, reach)
+        _link(rows, columns, operations, reach)
         for rows, columns in ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
     )
     return ReducedOrders(ex, ey, ez, hz, reach, links)

@@ -16,7 +16,6 @@ from metalens.rcwa.basis import (
     ReducedOrders,
     count_orders,
     half_space,
-    lattice_frame,
     plane_waves,
     reduced_orders,
     toeplitz_matrix,
@@ -280,7 +279,7 @@ def _fields(
         tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
     ]
     for operations in problem.classes:
-        space = reduced_orders(reach, lattice_frame(problem.cell, operations))
+        space = reduced_orders(reach, problem.cell.lattice, operations)
         orders_at = _solve_class(stack, light, space)
         if orders_at is None:
             continue

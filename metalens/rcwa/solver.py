@@ -26,7 +26,6 @@ from metalens.rcwa.basis import (
     Operation,
     TangentialWave,
     count_orders,
-    lattice_frame,
     plane_waves,
     reduced_orders,
     symmetry_operation,
@@ -623,7 +622,7 @@ def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
     normals = problem.normals or [section.outlines for section, _ in sections]
     symmetric = cell.outline(size_um).keeps(-1, -1)
     for operations in problem.classes:
-        space = reduced_orders(reach, lattice_frame(cell, operations))
+        space = reduced_orders(reach, cell.lattice, operations)
         waves = plane_waves(space, cell, light)
         if not set(columns) & set(waves.zero):
             continue
@@ -650,7 +649,7 @@ def _film_response(problem: CellProblem) -> TruncatedSolution:
     """Exact t and r with each section replaced by a film of its surroundings."""
     cell, light = problem.cell, problem.light
     sized = dataclasses.replace(problem, size_um=problem.size_um or cell.pitch_um / 2)
-    space = reduced_orders(0, lattice_frame(cell, (symmetry_operation(1, 1),)))
+    space = reduced_orders(0, cell.lattice, (symmetry_operation(1, 1),))
     waves = plane_waves(space, cell, light)
     films = [
         film_modes(waves, complex(np.sqrt(section.outside)), height)

@@ -15,7 +15,6 @@ from metalens.cell.shapes.outline import EllipseArc
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa.basis import (
-    lattice_frame,
     normal_component,
     plane_waves,
     reduced_orders,
@@ -139,7 +138,8 @@ def solve_row(
     radius = (2 * harmonics + 1) / math.sqrt(math.pi)
     space = reduced_orders(
         radius * math.sqrt(blocks) * block.width_um / cell.pitch_um,
-        lattice_frame(supercell, operations),
+        supercell.lattice,
+        operations,
     )
     waves = plane_waves(space, supercell, light)
     operators = section_operators(space, waves, slab, supercell)
@@ -157,7 +157,7 @@ def solve_row(
     along_row = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
     along_row = along_row[np.argsort(waves.m[along_row])]
     cosine = normal_component(waves.kappa[along_row], cover.real).real / cover.real
-    factor = np.sqrt(cosine if polarization == "x" else _inverse(cosine))
+    factor = cosine**0.5 if polarization == "x" else _inverse_root(cosine)
     direction = np.where(waves.m[along_row] == 0, sign, waves.along[0, along_row])
     return RowResponse(
         waves.m[along_row],
@@ -166,9 +166,9 @@ def solve_row(
     )
 
 
-def _inverse(cosine: Array) -> Array:
-    """1 / cosine, 0 for evanescent orders."""
-    return np.where(cosine > 0, 1 / np.where(cosine > 0, cosine, 1.0), 0.0)
+def _inverse_root(cosine: Array) -> Array:
+    """1 / sqrt(cosine), 0 for evanescent orders."""
+    return np.power(cosine, -0.5, out=np.zeros_like(cosine), where=cosine > 0)
 
 
 def _check_row(cell: Cell, diameters_um: Sequence[float] | Array) -> None:

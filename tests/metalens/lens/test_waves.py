@@ -42,7 +42,7 @@ def ray(behind, wavelength, p):
     k, layers = 2 * math.pi / wavelength, behind.layers
     length = sum(n * n * t / math.sqrt(n * n - p * p) for n, t in layers)
     out = media.lateral_reach(behind, p)
-    area = media.area_spreading(behind, p)
+    area = media.area_spreading(behind.layers, p * p)
     alone = (
         -1j
         * k

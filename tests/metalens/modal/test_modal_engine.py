@@ -13,9 +13,8 @@ from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import CellError
 from metalens.modal.case import case_of
-from metalens.modal.engine import solve_on_mesh
 from metalens.modal.mesh import MeshPlan, assemble_disc
-from metalens.modal.solver import LEVELS
+from metalens.modal.solver import LEVELS, solve_on_mesh
 from metalens.modal.spaces import homogeneous_modes
 
 WAVELENGTH = 0.85
