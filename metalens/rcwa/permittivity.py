@@ -272,6 +272,11 @@ def _nearest(
         px, py: (...) points in the middle rectangle, um.
     """
     sites = _sites(cell)
+    parts = [part for outline in outlines for part in outline.parts]
+    if all(isinstance(p, EllipseArc) and p.half_x_um == p.half_y_um for p in parts):
+        radii = np.repeat([part.half_x_um for part in parts], len(sites))  # type: ignore[union-attr]
+        centres = [part.centre_um + sites for part in parts]  # type: ignore[union-attr]
+        return _nearest_circle(np.concatenate(centres), radii, px, py)
     step_um = min(cell.lattice.periods_um(cell.pitch_um)) / 200
     boundaries = [outline.boundary(step_um) for outline in outlines]
     points, normals = (
@@ -284,6 +289,35 @@ def _nearest(
     tie = distances[..., 1] - distances[..., 0] < _TIE * cell.pitch_um
     mean = np.where(tie, products.mean(axis=-1), products[..., 0])
     return mean, np.asarray(distances[..., 0])
+
+
+def _nearest_circle(
+    centres: Array, radii: Array, px: Array, py: Array
+) -> tuple[Array, Array]:
+    """As :func:`_nearest`, for circles, whose normals are radial.
+
+    Circles at equal distance count with their mean. At a centre the products are those
+    of a random direction.
+
+    Args:
+        centres: (k, 2), um. radii: (k,), um.
+        px, py: (...) points, um.
+    """
+    tie = _TIE * radii.min()
+    least = np.full(px.shape, np.inf)
+    for (x, y), radius in zip(centres, radii, strict=True):
+        least = np.minimum(least, np.abs(np.hypot(px - x, py - y) - radius))
+    total, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
+    for (x, y), radius in zip(centres, radii, strict=True):
+        dx, dy = px - x, py - y
+        length = np.hypot(dx, dy)
+        nearest = np.abs(length - radius) < least + tie
+        at_centre = length < tie
+        scale = np.where(at_centre, 1.0, length) ** 2
+        products = np.stack([dx * dx, dy * dy, dx * dy]) / scale
+        products[:2, at_centre] = 0.5
+        total, count = total + nearest * products, count + nearest
+    return total / count, least
 
 
 def _sites(cell: Cell) -> Array:
