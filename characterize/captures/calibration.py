@@ -249,7 +249,8 @@ def bad_pixels(capture: Capture) -> Array:
 
     Dark frames: beyond 8 robust sigma of the median. Flats: outside 0.3 to 3 of the
     median. Frames: single pixels well above their eight neighbours, and in three or
-    more frames pixels that stay constant and differ from those around them.
+    more frames pixels that stay constant and differ from those around them, but for
+    full wells in light: those beside them are half as bright.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -265,7 +266,10 @@ def bad_pixels(capture: Capture) -> Array:
     level = frames.mean(0)
     differs = np.abs(level - ndimage.median_filter(level, 5, mode="nearest")) > 1
     if len(frames) >= 3:
-        bad |= (np.ptp(frames, axis=0) == 0) & differs
+        dark, top = np.median(frames), frames.max()
+        around = ndimage.uniform_filter(level, 3, mode="nearest")
+        is_lit = (level >= top) & (around - dark > (top - dark) / 2)
+        bad |= (np.ptp(frames, axis=0) == 0) & differs & ~is_lit
     for axis in (0, 1):
         dead = np.all(bad | ((frames.max(0) == 0) & differs), axis=1 - axis)
         bad |= dead[:, None] if axis == 0 else dead[None, :]

@@ -195,6 +195,7 @@ def _with_likely_causes(
         wider = multistart.widen_search(extended, task.all_of(ends[0].value))
         if not wider or wider[0].merit > ends[0].merit:
             break
+        extended, wider = multistart.widen_priors(extended, wider, cause.frees)
         fall = ends[0].merit - wider[0].merit
         cautions.append(
             f"{cause.cause} explains the frames better (chi-square falls by "

@@ -286,6 +286,36 @@ def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
         return []
 
 
+def widen_priors(
+    task: SearchTask, ends: list[FitSolution], names: Sequence[str]
+) -> tuple[SearchTask, list[FitSolution]]:
+    """The task with wider priors where the best mode is beyond two of their sigma, and
+    the modes fitted again.
+
+    The prior's standard deviation is then the distance of the estimate from its mean
+    (type-II maximum likelihood), so that it hardly pulls.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        ends: the modes, best first.
+        names: of the parameters whose priors are in doubt.
+    """
+    rows = zip(
+        task.names, ends[0].value, task.prior.mean, task.prior.sigma, strict=True
+    )
+    wide = {
+        name: KnownValue(name, float(mean), abs(float(value - mean)))
+        for name, value, mean, sigma in rows
+        if name in names and abs(value - mean) > 2 * sigma
+    }
+    if not wide:
+        return task, ends
+    task = dataclasses.replace(task, known=task.known | wide)
+    return task, distinct_modes(
+        [refine_fit(task, end.value, end.slopes) for end in ends]
+    )
+
+
 def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> float:
     """-2 ln posterior of a short fit with further parameters, from where the best is;
     infinite where they lead out of the model's range.
