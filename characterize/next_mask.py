@@ -139,8 +139,8 @@ def plan_next_mask(
     def bias_table_nm(x: Array) -> Array:
         return _bias_table(design, x, response, old)[-1]
 
-    table_open = reason_left_open(result, bias_table_nm)
-    map_open = reason_left_open(result, uneven_nm, part=MAP)
+    table_open = reason_left_open(result, TABLE, bias_table_nm)
+    map_open = reason_left_open(result, MAP, uneven_nm)
     return NextMask(
         plan,
         steps,
@@ -441,18 +441,9 @@ def table_rows(plan: MaskCorrection) -> list[tuple[Any, ...]]:
     return [tuple(float(v) for v in row) for row in zip(*columns, strict=True)]
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectionPart:
-    """A part of a correction, in words, and the parameters that it follows."""
-
-    words: str
-    names: tuple[str, ...]
-
-
-TABLE = CorrectionPart(
-    "the bias table", ("bias_nm", "height_nm", "index", "sidewall_deg")
-)
-MAP = CorrectionPart(
+# parts of a correction in words, and the parameters that each follows
+TABLE = "the bias table", ("bias_nm", "height_nm", "index", "sidewall_deg")
+MAP = (
     "what varies over the lens",
     ("bias_x_nm", "bias_y_nm", "bias_r_nm", "bias_a_nm", "bias_o_nm"),
 )
@@ -460,33 +451,30 @@ MAP = CorrectionPart(
 
 def reason_left_open(
     result: AsBuilt,
-    table: Callable[[Array], Array],
-    *,
-    part: CorrectionPart = TABLE,
-    wide_nm: float = WIDE_NM,
-    seed: int = 5,
+    part: tuple[str, tuple[str, ...]],
+    correction_nm: Callable[[Array], Array],
 ) -> str:
     """Why the posterior leaves a correction too open to be used, and what to measure.
 
-    Empty where its standard deviation over DRAWS draws is at most ``wide_nm``
+    Empty where its standard deviation over DRAWS draws is at most ``WIDE_NM``
     everywhere.
 
     Args:
         result: of the fit.
-        table: (knots,) nm from all parameters of one lens: the bias table, or the
-            deviation that the map subtracts.
-        part: which of them. wide_nm: largest standard deviation of a usable correction.
-        seed: of the random generator.
+        part: ``TABLE`` or ``MAP``.
+        correction_nm: (knots,) nm from all parameters of one lens: the bias table, or
+            the deviation that the map subtracts.
     """
-    draws = result.samples(DRAWS, seed=seed)
+    draws = result.samples(DRAWS, seed=5)
     try:
-        tables = [table(result.parameters(row)) for row in draws]
+        corrections = [correction_nm(result.parameters(row)) for row in draws]
     except ConfigError as refusal:
         return f"no correction: for lenses of the posterior {refusal}"
-    sigma = float(np.std(tables, axis=0, ddof=1).max())
-    if sigma <= wide_nm:
+    sigma = float(np.std(corrections, axis=0, ddof=1).max())
+    if sigma <= WIDE_NM:
         return ""
-    names = [name for name in part.names if name in result.names]
+    words, of_part = part
+    names = [name for name in of_part if name in result.names]
     intervals = ", ".join(
         "{} {:.3g} to {:.3g}".format(name, *result.interval(name)) for name in names
     )
@@ -495,6 +483,6 @@ def reason_left_open(
         causes
     )
     return (
-        f"no correction: the posterior leaves {part.words} open by {sigma:.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {intervals}). Settle it by {state}{_FRAMES}"
+        f"no correction: the posterior leaves {words} open by {sigma:.1f} nm (1 sigma, at most "
+        f"{WIDE_NM:g} allowed; {intervals}). Settle it by {state}{_FRAMES}"
     )
