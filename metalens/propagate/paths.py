@@ -159,47 +159,6 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
     )
 
 
-def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
-    """Direction cosine q along y of the ray from lens row e to the window centre.
-
-    Args:
-        case: geometry of the propagation.
-        p: direction cosine along x.
-        e: lens row, um.
-    """
-    row_offset = e - case.centre_um[1]
-    layers = case.media.layers
-    return row_offset / media.reach_per_direction(
-        layers, media.solve_direction_square(layers, row_offset * row_offset, p * p)
-    )
-
-
-def residual_path(
-    case: PropagationCase, p: Any, e: Any, X: Any, Y: Any
-) -> tuple[Any, Any]:
-    """(amplitude, path difference + pX + qY) of the ray (p, e), without cancellation.
-
-    Args:
-        case: geometry of the propagation.
-        X: offset along x from the window centre, um.
-        Y: offset along y from the window centre, um.
-    """
-    row_offset = e - case.centre_um[1]
-    layers = case.media.layers
-    w0 = media.solve_direction_square(layers, row_offset * row_offset, p * p)
-    reach_per_p = media.reach_per_direction(layers, w0)
-    reach2 = (p * reach_per_p) ** 2 + row_offset * row_offset
-    change = X * X + Y * Y - 2 * (reach_per_p * p * X + row_offset * Y)
-    w, difference = media.path_difference(layers, w0, reach2, change)
-    level = ray_amplitude(case.media, case.wavenumber, w, case.reach_um)
-    return level, difference + p * X + row_offset / reach_per_p * Y
-
-
-def probe_positions() -> Array:
-    """Positions along an axis, in half widths, at which a smooth function is sampled."""
-    return np.array([-1.0, 0.0, 1.0])
-
-
 def rayleigh_sommerfeld_kernel(
     case: PropagationCase, x: Any, y: Any, X: Any, Y: Any, inverse: Any
 ) -> Array:
@@ -219,43 +178,6 @@ def rayleigh_sommerfeld_kernel(
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
 
 
-def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float]:
-    """(least, largest) p = n sin θ cos φ of rays from the lens rows to the window
-    centre, with a margin.
-
-    Args:
-        case: geometry of the propagation.
-        rows_um: (row,) positions of lens rows.
-    """
-    high_x = case.half_size_um[1]
-    column_offsets = np.array([-high_x, high_x]) - case.centre_um[0]
-    row_offsets = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
-    p = ray_cosines(
-        case,
-        column_offsets,
-        np.array([[np.abs(row_offsets).min()], [np.abs(row_offsets).max()]]),
-    )
-    low, high = float(p.min()), float(p.max())
-    margin = max(1e-9, 1e-6 * (high - low))
-    largest = case.media.layers[0][0]
-    return max(low - margin, -largest + 1e-15), min(high + margin, largest - 1e-15)
-
-
-def plane_wave_residual(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
-    """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w
-    + pX + qY)).
-
-    Args:
-        case: geometry of the propagation.
-        p: n sin θ of the ray.
-        e: row of the lens, um.
-        X: offset along x from the window centre, um.
-        Y: offset along y from the window centre, um.
-    """
-    level, path = residual_path(case, p, e, X, Y)
-    return np.asarray(level * np.exp(1j * case.wavenumber * path))
-
-
 def over_blocks(case: PropagationCase) -> Callable[[Any, Any], Array]:
     """The kernel at (y, x) of the lens for the corners and the middle of the window and
     the extreme depths.
@@ -267,10 +189,9 @@ def over_blocks(case: PropagationCase) -> Callable[[Any, Any], Array]:
     inverse = np.array(
         [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
     )
+    ends = np.array([-1.0, 0.0, 1.0])
     X, Y, inverse_grid = (
         grid.reshape(-1, 1, 1, 1)
-        for grid in np.meshgrid(
-            probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
-        )
+        for grid in np.meshgrid(ends * wx, ends * wy, inverse, indexing="ij")
     )
     return lambda y, x: rayleigh_sommerfeld_kernel(case, x, y, X, Y, inverse_grid)

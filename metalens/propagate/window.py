@@ -26,13 +26,10 @@ from metalens.propagate.moments import (
 )
 from metalens.propagate.paths import (
     chief_path,
-    cosine_y,
-    direction_range,
     from_source,
     over_blocks,
-    plane_wave_residual,
-    probe_positions,
     ray_cosines,
+    ray_to_offset,
     rayleigh_sommerfeld_kernel,
     reference_depth,
     to_sensor,
@@ -53,22 +50,16 @@ MOST_PARTS = 16  # tiles along an axis
 
 
 @dataclass(frozen=True, slots=True)
-class NodeCounts:
-    """Counts chosen for a case and tolerance.
+class TileCounts:
+    """Legendre nodes that a tile needs, each (y, x).
 
-    nodes: (y, x) Legendre nodes over the lens; directions: direction cosines p along x.
-    window: (y, x), lens: (row, direction) grids on which the correction is sampled.
+    nodes: over the lens, for its light. window, lens: grids on which the correction of
+    the plane waves is sampled.
     """
 
     nodes: tuple[int, int]
-    directions: int
     window: tuple[int, int]
     lens: tuple[int, int]
-
-    @property
-    def table(self) -> int:
-        """Size of the table of the correction."""
-        return self.window[0] * self.window[1] * self.lens[0] * self.lens[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +67,12 @@ class WindowLayout:
     """Nodes and tiles of a windowed propagation.
 
     nodes: (y, x) over the lens for the whole window. parts: tiles along each axis.
-    sizes: counts of every tile.
+    counts: of every tile.
     """
 
     nodes: tuple[int, int]
     parts: int
-    sizes: NodeCounts
+    counts: TileCounts
 
 
 @functools.lru_cache(maxsize=1024)
@@ -89,7 +80,7 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout:
     """Nodes over the lens and tiles of the window.
 
     With more tiles along an axis the work on the window falls, and that of passing
-    light to the tiles rises. Their sum is least for about √nodes / 4 tiles.
+    light to the tiles rises. Their sum is least for about √nodes / 2.5 tiles.
 
     Args:
         case: geometry of the propagation.
@@ -100,55 +91,29 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout:
             needed: the window is too large for this method.
     """
     nodes = lens_nodes(case, tolerance / 4)
-    parts = max(1, round(math.sqrt(max(nodes)) / 4))
+    parts = max(1, round(math.sqrt(max(nodes)) / 2.5))
     most_parts = min(MOST_PARTS, max(case.samples))
     while True:
         parts = min(parts, most_parts)
         rows = window_tiles(case, parts)[1]
-        tiles = [tile for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])]
+        tiles = {tile for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])}
         # the tile below the lens is seen under the largest angle
-        tiles.append(
-            min(itertools.chain(*rows), key=lambda t: math.hypot(*t.centre_um))
-        )
-        judged = {_mirrored(tile) for tile in tiles}
+        tiles.add(min(itertools.chain(*rows), key=lambda t: math.hypot(*t.centre_um)))
         try:
-            sizes = _largest_counts([node_counts(tile, tolerance) for tile in judged])
+            of_tiles = [tile_counts(tile, tolerance) for tile in tiles]
         except PropagationError:
             if parts == most_parts:
                 raise
         else:
-            if sizes.table <= MOST_TABLE:
-                return WindowLayout(nodes, parts, sizes)
+            pairs = [
+                np.max([getattr(counts, name) for counts in of_tiles], axis=0).tolist()
+                for name in ("nodes", "window", "lens")
+            ]
+            if math.prod(pairs[1] + pairs[2]) <= MOST_TABLE:
+                return WindowLayout(nodes, parts, TileCounts(*map(tuple, pairs)))
             if parts == most_parts:
                 raise _too_large("a table of over 100 MB")
         parts *= 2
-
-
-def _mirrored(tile: PropagationCase) -> PropagationCase:
-    """The tile with its centre mirrored to positive coordinates, along every axis
-    without a source tangent.
-
-    By symmetry the mirror image needs the same counts.
-    """
-    x, y = (
-        abs(centre) if tangent == 0 else centre
-        for centre, tangent in zip(tile.centre_um, tile.tangents, strict=True)
-    )
-    return replace(tile, centre_um=(x, y))
-
-
-def _largest_counts(counts: list[NodeCounts]) -> NodeCounts:
-    """Elementwise maximum of the counts."""
-    largest_pairs = [
-        tuple(max(getattr(c, name)[i] for c in counts) for i in (0, 1))
-        for name in ("nodes", "window", "lens")
-    ]
-    return NodeCounts(
-        largest_pairs[0],
-        max(c.directions for c in counts),
-        largest_pairs[1],
-        largest_pairs[2],
-    )
 
 
 def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
@@ -159,76 +124,78 @@ def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
         tolerance: relative error of the field.
     """
     extremes = min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)
-    lines = functools.partial(
-        _needed_nodes,
-        functools.partial(rayleigh_sommerfeld_kernel, case),
-        {
-            "x": 0.9 * _around(0.0, case.half_size_um[1]),
-            "y": 0.9 * _around(0.0, case.half_size_um[0]),
-            "X": _around(0.0, case.half_window_um[1]),
-            "Y": _around(0.0, case.half_window_um[0]),
-            "inverse": np.array(extremes),
-        },
-        tolerance=tolerance,
-    )
+    kernel = functools.partial(rayleigh_sommerfeld_kernel, case)
+    probes = _probes(case) | {"inverse": np.array(extremes)}
     high_y, high_x = case.half_size_um
-    return lines("y", (0.0, high_y)), lines("x", (0.0, high_x))
+    return (
+        _needed_nodes(kernel, probes, "y", high_y, tolerance),
+        _needed_nodes(kernel, probes, "x", high_x, tolerance),
+    )
 
 
-def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
+def tile_counts(case: PropagationCase, tolerance: float) -> TileCounts:
     """The counts that a tile needs.
 
     Args:
-        case: geometry of the propagation.
+        case: geometry of the tile.
         tolerance: relative error of the field.
 
     Raises:
         PropagationError: more than 400 nodes would be needed.
     """
     quarter = tolerance / 4
-    high_y = case.half_size_um[0]
-    nodes = lens_nodes(case, quarter)
-    row_nodes = legendre.mapped_nodes(nodes[0], -high_y, high_y)
-    low, high = direction_range(case, row_nodes)
-    spans = {
-        "X": (0.0, case.half_window_um[1]),
-        "Y": (0.0, case.half_window_um[0]),
-        "p": ((low + high) / 2, (high - low) / 2),
-        "e": (0.0, high_y),
-    }
-    probes = {name: _around(*span) for name, span in spans.items()}
-
-    def kernel(p: Any, e: Any, X: Any, Y: Any) -> Array:
-        """From a lens row to a window point, along the direction cosine p."""
-        residual = plane_wave_residual(case, p, e, X, Y)
-        q = cosine_y(case, p, e)
-        return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
-
-    rows = probes | {"e": 0.9 * probes["e"]}
-    directions = _needed_nodes(kernel, rows, "p", spans["p"], tolerance=quarter)
     # rounding leaves no smaller tails than 1e-13
     edge_tolerance = max(quarter / EDGE, min(quarter, 1e-13))
-    residual = functools.partial(plane_wave_residual, case)
-    sizes = {
-        name: _needed_nodes(residual, probes, name, span, tolerance=edge_tolerance)
-        for name, span in spans.items()
-    }
-    return NodeCounts(
-        nodes, directions, (sizes["Y"], sizes["X"]), (sizes["e"], sizes["p"])
+    residual = functools.partial(_residual_kernel, case)
+    axes = zip("YXyx", (*case.half_window_um, *case.half_size_um), strict=True)
+    counts = [
+        _needed_nodes(residual, _probes(case), name, half_um, edge_tolerance)
+        for name, half_um in axes
+    ]
+    return TileCounts(
+        lens_nodes(case, quarter), (counts[0], counts[1]), (counts[2], counts[3])
     )
 
 
-def _around(middle: float, half: float) -> Array:
-    """Positions along an axis at which a smooth function is sampled."""
-    return middle + half * probe_positions()
+def _probes(case: PropagationCase) -> dict[str, Array]:
+    """Positions on lens (x, y) and window (X, Y) at which functions are sampled, um."""
+    places = np.array([-1.0, 0.0, 1.0])
+    (lens_y, lens_x), (window_y, window_x) = case.half_size_um, case.half_window_um
+    return {
+        "x": 0.9 * lens_x * places,
+        "y": 0.9 * lens_y * places,
+        "X": window_x * places,
+        "Y": window_y * places,
+    }
+
+
+def _plane_waves(case: PropagationCase, x: Any, y: Any) -> tuple[Any, Any]:
+    """Direction cosines p(x), q(y) of plane waves from the lens to the window.
+
+    Those of rays to the window's centre, p from the root mean square of y over the
+    lens, and q from that of x.
+    """
+    (high_y, high_x), (cx, cy) = case.half_size_um, case.centre_um
+    return (
+        ray_cosines(case, x - cx, math.hypot(cy, high_y / math.sqrt(3))),
+        ray_cosines(case, y - cy, math.hypot(cx, high_x / math.sqrt(3))),
+    )
+
+
+def _residual_kernel(case: PropagationCase, x: Any, y: Any, X: Any, Y: Any) -> Array:
+    """Kernel from lens (x, y) to the window offset (X, Y) over the plane waves
+    exp(-ik(pX + qY)) of :func:`_plane_waves`.
+    """
+    level, path = ray_to_offset(case, x, y, X, Y)
+    p, q = _plane_waves(case, x, y)
+    return np.asarray(level * np.exp(1j * case.wavenumber * (path + p * X + q * Y)))
 
 
 def _needed_nodes(
     function: Callable[..., Array],
     probes: dict[str, Array],
     along: str,
-    span: tuple[float, float],
-    *,
+    half: float,
     tolerance: float,
 ) -> int:
     """Legendre nodes that interpolate a function along one variable.
@@ -240,7 +207,7 @@ def _needed_nodes(
         function: of the named variables, which broadcast.
         probes: values of every variable.
         along: name of the variable.
-        span: its middle and half range.
+        half: its range is -half to half.
         tolerance: relative error of the interpolation.
 
     Raises:
@@ -251,9 +218,8 @@ def _needed_nodes(
     at = {name: g.reshape(-1, 1) for name, g in zip(others, grid, strict=True)}
     count = 32
     while count <= 1.5 * MOST_NODES:
-        line = span[0] + span[1] * legendre.gauss_legendre_nodes(count)[0]
-        values = function(**at, **{along: line})
-        needed = legendre.needed_node_count(values, tolerance)
+        line = half * legendre.gauss_legendre_nodes(count)[0]
+        needed = legendre.needed_node_count(function(**at, **{along: line}), tolerance)
         if needed <= min(count, MOST_NODES):
             return max(needed, 2)
         count *= 2
@@ -365,125 +331,78 @@ def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
     return np.stack(np.unravel_index(significant, (len(strength), len(size))))
 
 
-def _operators(
-    case: PropagationCase, chosen: NodeCounts, tolerance: float
-) -> dict[str, Array]:
-    """Operators of a tile: lens nodes to directions, and directions to the window.
+@dataclass(frozen=True, eq=False, slots=True)
+class Tile:
+    """Operators from the lens nodes (e, x) of a tile to its samples (Y, X).
+
+    The kernel is Σ_r window_terms[r] lens_terms[r] times the plane waves along_y
+    (Y, e) and along_x (x, X). pairs: of a term and a depth field, the significant ones.
+    """
+
+    along_y: torch.Tensor
+    along_x: torch.Tensor
+    lens_terms: torch.Tensor
+    window_terms: torch.Tensor
+    pairs: torch.Tensor
+
+
+def _plan_tile(
+    case: PropagationCase,
+    counts: TileCounts,
+    depths: DepthBasis,
+    tolerance: float,
+    dtype: torch.dtype,
+) -> Tile:
+    """Operators of a tile. The kernel over its plane waves is sampled on small Legendre
+    grids of window and lens, factorised by an SVD, and interpolated.
 
     Args:
         case: geometry of the tile.
-        chosen: counts of nodes and directions.
+        counts: of nodes and grids.
+        depths: basis of the depth fields.
         tolerance: relative error of the field.
-
-    Returns:
-        ``to_directions`` (e, x, p) from lens row and column nodes to directions;
-        ``along_y`` (p, Y, e) and ``along_x`` (X, p) plane waves; ``lens_terms``
-        (p, e, r) and ``window_terms`` (X, Y, r) of the correction, and their
-        ``strength`` (r,).
+        dtype: of the real and imaginary parts.
     """
-    ny, nx = chosen.nodes
-    directions = chosen.directions
-    high_y, high_x = case.half_size_um
-    e = legendre.mapped_nodes(ny, -high_y, high_y)
-    x = legendre.mapped_nodes(nx, -high_x, high_x)
-    low, high = direction_range(case, e)
-    p = legendre.mapped_nodes(directions, low, high)
-    row_offset = (e - case.centre_um[1])[:, None]
-    cosines = ray_cosines(case, x - case.centre_um[0], row_offset)
+    grids = [
+        half_um * legendre.gauss_legendre_nodes(count)[0]
+        for half_um, count in zip(
+            case.half_window_um + case.half_size_um,
+            counts.window + counts.lens,
+            strict=True,
+        )
+    ]
+    Y, X, y, x = np.ix_(*grids)
+    table = _residual_kernel(case, x, y, X, Y) * case.area_um2
+    left, size, right = np.linalg.svd(
+        table.reshape(math.prod(counts.window), -1), full_matrices=False
+    )
+    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+    rank = int(max(1, (tail > tolerance / 2).sum()))
+    pairs = significant_pairs(size[:rank], depths.strength, tolerance / 2)
+    left = (left[:, :rank] * size[:rank]).T.reshape(rank, *counts.window)
+    right = right[:rank].reshape(rank, *counts.lens)
     y_um, x_um = case.window_um
-    k = case.wavenumber
-    q = cosine_y(case, p[:, None], e[None, :])
-    lens_terms, window_terms, strength = _low_rank(
-        case, chosen, tolerance / 2, (low, high)
+    e_um, s_um = _nodes_um(case, counts.nodes)
+    (half_Y, half_X), (half_y, half_x) = case.half_window_um, case.half_size_um
+    shared_phase = np.exp(1j * case.wavenumber * chief_path(case))
+    p, q = _plane_waves(case, s_um, e_um)
+    arrays = (
+        np.exp(-1j * case.wavenumber * y_um[:, None] * q),
+        np.exp(-1j * case.wavenumber * p[:, None] * x_um),
+        _interpolated(right, e_um / half_y, s_um / half_x),
+        _interpolated(left, y_um / half_Y, x_um / half_X) * shared_phase,
     )
-    return {
-        "to_directions": legendre.interpolation_matrix(
-            directions, (2 * cosines - low - high) / (high - low)
-        ),
-        "along_y": np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
-        "along_x": np.exp(-1j * k * x_um[:, None] * p),
-        "lens_terms": lens_terms,
-        "window_terms": window_terms * np.exp(1j * k * chief_path(case)),
-        "strength": strength,
-    }
+    tensors = [torch.tensor(array, dtype=dtype.to_complex()) for array in arrays]
+    return Tile(*tensors, torch.tensor(pairs))
 
 
-def _low_rank(
-    case: PropagationCase,
-    chosen: NodeCounts,
-    tolerance: float,
-    span: tuple[float, float],
-) -> tuple[Array, Array, Array]:
-    """Low-rank factors of the correction times the pillar area: Σ_r lens_terms[p, e, r]
-    window_terms[X, Y, r].
-
-    The correction is tabulated on small Legendre grids, factorised, and interpolated.
-
-    Args:
-        case: geometry of the propagation.
-        chosen: counts of the grids.
-        tolerance: relative error in the Frobenius norm.
-        span: lowest and highest direction cosine p.
-
-    Returns:
-        lens_terms (p, e, r), window_terms (X, Y, r) and strengths (r,).
-    """
-    wy, wx = case.half_window_um
-    hy, _ = case.half_size_um
-    my, mx = chosen.window
-    me, mp = chosen.lens
-    Y = legendre.mapped_nodes(my, -wy, wy)
-    X = legendre.mapped_nodes(mx, -wx, wx)
-    e = legendre.mapped_nodes(me, -hy, hy)
-    p = legendre.mapped_nodes(mp, *span)
-    positions = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
-    table = plane_wave_residual(case, *positions)
-    left, right = _randomized_svd(
-        table.reshape(my * mx, mp * me) * case.area_um2, tolerance
+def _interpolated(values: Array, y: Array, x: Array) -> Array:
+    """(r, y, x) functions on Legendre nodes (r, node, node), at y and x in [-1, 1]."""
+    rows, columns = (
+        legendre.interpolation_matrix(count, at)
+        for count, at in zip(values.shape[1:], (y, x), strict=True)
     )
-    y_um, x_um = case.window_um
-    Iy = legendre.interpolation_matrix(my, y_um / wy)
-    Ix = legendre.interpolation_matrix(mx, x_um / wx)
-    window_terms = np.einsum(
-        "Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True
-    )
-    e_um = legendre.gauss_legendre_nodes(chosen.nodes[0])[0]
-    p_um = legendre.gauss_legendre_nodes(chosen.directions)[0]
-    Ie = legendre.interpolation_matrix(me, e_um)
-    Ip = legendre.interpolation_matrix(mp, p_um)
-    lens_terms = np.einsum(
-        "Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True
-    )
-    return lens_terms, window_terms, np.linalg.norm(left, axis=0)
-
-
-def _randomized_svd(table: Array, tolerance: float) -> tuple[Array, Array]:
-    """Factors of table ≈ left (row, r) @ right (r, column), by a randomised SVD.
-
-    The range is sampled with random vectors, doubled in number until they capture it.
-
-    Args:
-        table: (row, column).
-        tolerance: relative error in the Frobenius norm.
-    """
-    generator = np.random.default_rng(0)
-    total = np.linalg.norm(table)
-    rank = min(16, *table.shape)
-    while True:
-        left = np.linalg.qr(table @ generator.standard_normal((table.shape[1], rank)))[
-            0
-        ]
-        right = left.conj().T @ table
-        if (
-            rank == min(table.shape)
-            or np.linalg.norm(table - left @ right) <= tolerance * total / 4
-        ):
-            break
-        rank = min(2 * rank, *table.shape)
-    u, singular, v = np.linalg.svd(right, full_matrices=False)
-    tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1]) / total
-    needed = int(max(1, (tail > tolerance).sum()))
-    return left @ u[:, :needed] * singular[:needed], v[:needed]
+    return np.asarray(rows @ values @ columns.T)
 
 
 # additional nodes over the lens, and in a block, where smooth factors (``Pupils``)
@@ -494,30 +413,21 @@ SMOOTH = (4, 2)
 MORE = 8  # additional orders of the moments, for the posterior error
 
 
-BUDGET_BYTES = 8e6  # of the operands of one product: larger blocks leave the cache
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class WindowPlan:
     """Everything that depends on the geometry alone, ready for many lenses.
 
     The moments go ``MORE`` orders beyond what the method uses, for the error estimate.
-    tensors: the operators, those of the tiles stacked (tile, …); ``turn`` (tile, e, x)
-    is the phase between the window's centre and the tile's, on the nodes of the whole
-    window.
+    tensors: from moments to nodes of the whole window, and on to those of the tiles
+    (:func:`_window_tensors`); ``basis`` and ``coefficients`` of the depths. tiles: row
+    by row.
     """
 
     case: PropagationCase
-    tolerance: float
     layout: WindowLayout
-    depths: DepthBasis
     moments: PillarMoments
     tensors: dict[str, torch.Tensor]
-
-    @property
-    def nodes_um(self) -> tuple[Array, Array]:
-        """(e,), (x,) positions of the lens nodes of the tiles."""
-        return _nodes_um(self.case, self.layout.sizes.nodes)
+    tiles: list[Tile]
 
     @property
     def whole_um(self) -> tuple[Array, Array]:
@@ -565,11 +475,15 @@ def plan_window(
             dtype=dtype,
             more=inside,
         )
-        depths = depth_basis(case, _nodes_um(case, layout.sizes.nodes), tolerance / 2)
-        tensors = _window_tensors(case, layout, depths) | _tile_tensors(
-            case, layout, depths, tolerance
-        )
-    return WindowPlan(case, tolerance, layout, depths, pillars, tensors)
+        counts = layout.counts
+        depths = depth_basis(case, _nodes_um(case, counts.nodes), tolerance / 2)
+        cases = list(itertools.chain(*window_tiles(case, layout.parts)[1]))
+        tiles = [_plan_tile(tile, counts, depths, tolerance, dtype) for tile in cases]
+        tensors = _window_tensors(case, cases, layout)
+        for name in ("basis", "coefficients"):
+            array = getattr(depths, name)
+            tensors[name] = torch.tensor(array, dtype=dtype.to_complex())
+    return WindowPlan(case, layout, pillars, tensors, tiles)
 
 
 def _legendre_basis(count: int, half_um: float, places_um: Array) -> Array:
@@ -587,66 +501,26 @@ def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Ar
 
 
 def _window_tensors(
-    case: PropagationCase, layout: WindowLayout, depths: DepthBasis
+    case: PropagationCase, tiles: list[PropagationCase], layout: WindowLayout
 ) -> dict[str, torch.Tensor]:
     """Tensors of the whole window, complex128.
 
     ``rows_to_nodes``, ``columns_to_nodes``: moments to window nodes. ``rows_to_tile``,
-    ``columns_to_tile``: window nodes to tile nodes. ``turn``: phases of the tiles.
-    ``basis``, ``coefficients``: of the depths.
+    ``columns_to_tile``: window nodes to tile nodes. ``turn`` (tile, e, x): phase from
+    the window's centre to the tile's, on the window nodes.
     """
-    arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
+    arrays = {}
     for name, window_count, tile_count in zip(
-        ("rows", "columns"), layout.nodes, layout.sizes.nodes, strict=True
+        ("rows", "columns"), layout.nodes, layout.counts.nodes, strict=True
     ):
         arrays[f"{name}_to_nodes"] = legendre.to_nodes(window_count)
         arrays[f"{name}_to_tile"] = legendre.interpolation_matrix(
             tile_count, legendre.gauss_legendre_nodes(window_count)[0]
         )
     e, x = _nodes_um(case, layout.nodes)
-    parts = [part for row in window_tiles(case, layout.parts)[1] for part in row]
-    paths = [to_sensor(one_case, x, e[:, None]) for one_case in (case, *parts)]
+    paths = [to_sensor(one_case, x, e[:, None]) for one_case in (case, *tiles)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(paths[1:]) - paths[0]))
     return {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
-
-
-def _tile_tensors(
-    case: PropagationCase, layout: WindowLayout, depths: DepthBasis, tolerance: float
-) -> dict[str, torch.Tensor]:
-    """Operators of all tiles, stacked (tile, …), for all significant pairs.
-
-    A pair is a correction term and a depth field. ``fields`` holds the depth field of
-    each pair.
-
-    Args:
-        case: geometry of the propagation.
-        layout: tiles and counts.
-        depths: basis of the depth fields.
-        tolerance: relative error of the field.
-    """
-    tiles = [tile for row in window_tiles(case, layout.parts)[1] for tile in row]
-    of_tiles = [_operators(tile, layout.sizes, tolerance) for tile in tiles]
-    terms = max(len(operators["strength"]) for operators in of_tiles)
-    for operators in of_tiles:
-        for name in ("strength", "lens_terms", "window_terms"):
-            operators[name] = _padded(operators[name], terms)
-    arrays = {n: np.stack([tile[n] for tile in of_tiles]) for n in of_tiles[0]}
-    strength = arrays.pop("strength").max(0)
-    pairs = significant_pairs(strength, depths.strength, tolerance / 2)
-    for name in ("lens_terms", "window_terms"):
-        arrays[name] = np.ascontiguousarray(arrays[name][..., pairs[0]])
-    to_directions = arrays.pop("to_directions")
-    tensors = {
-        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
-    }
-    tensors["to_directions"] = torch.tensor(to_directions).flatten(0, 1)
-    tensors["fields"] = torch.tensor(pairs[1])
-    return tensors
-
-
-def _padded(array: Array, count: int) -> Array:
-    """Array with zeros appended to ``count`` along the last axis."""
-    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
 def field_windowed(
@@ -716,9 +590,25 @@ def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
         @ (light * tensors["turn"])
         @ tensors["columns_to_tile"]
     )
-    fields = zoom_to_tiles(tile_light[:, None] * tensors["basis"], tensors)
-    at_depths = fields @ tensors["coefficients"].T  # (tile, X, Y, depth)
-    return _join_tiles(at_depths.permute(0, 3, 2, 1), plan)
+    basis = tensors["basis"]
+    fields = [
+        _zoom_to_tile(one_light, basis, tile)
+        for one_light, tile in zip(tile_light.to(basis), plan.tiles, strict=True)
+    ]
+    # (tile, depth, Y, X)
+    at_depths = torch.tensordot(
+        torch.stack(fields), tensors["coefficients"], ([1], [1])
+    )
+    return _join_tiles(at_depths.movedim(-1, 1), plan)
+
+
+def _zoom_to_tile(light: torch.Tensor, basis: torch.Tensor, tile: Tile) -> torch.Tensor:
+    """(b, Y, X) field on a tile of the light (e, x) with every depth field (b, e, x)."""
+    terms, depth = tile.pairs
+    sources = light * tile.lens_terms[terms] * basis[depth]
+    waves = tile.along_y @ (sources @ tile.along_x)
+    window = waves.new_zeros((len(basis), *waves.shape[1:]))
+    return window.index_add(0, depth, waves * tile.window_terms[terms])
 
 
 def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
@@ -738,53 +628,3 @@ def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
         for i, height in enumerate(heights)
     ]
     return torch.cat(bands, -2)
-
-
-def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Propagate fields on the lens nodes to the window of their tile: (tile, b, e, x)
-    to (tile, X, Y, b).
-
-    Columns x are interpolated to directions p. Then each pair of a correction term and
-    a depth field is summed over p and e with its plane waves.
-
-    Args:
-        light: (tile, b, e, x) complex; b counts the depth fields.
-        t: tensors of the tiles.
-    """
-    tiles, b, e, _ = light.shape
-    p = t["to_directions"].shape[2]
-    X, Y = t["window_terms"].shape[1:3]
-    parts = (
-        torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(tiles * e, 2 * b, -1)
-    )
-    cosines = (
-        torch.bmm(parts, t["to_directions"])
-        .view(tiles, e, b, 2, p)
-        .permute(0, 4, 1, 2, 3)
-        .contiguous()
-    )
-    spread = torch.view_as_complex(cosines)
-    pairs = len(t["fields"])
-    pairs_at_once = max(1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size())))
-    pair_step = min(pairs, pairs_at_once)
-    tiles_at_once = max(1, pairs_at_once // pairs)
-    windows = []
-    for first in range(0, tiles, tiles_at_once):
-        tile = slice(first, first + tiles_at_once)
-        window = light.new_zeros((len(spread[tile]), X, Y, b))
-        for start in range(0, pairs, pair_step):
-            fields = t["fields"][start : start + pair_step]
-            terms = t["lens_terms"][tile, ..., start : start + pair_step] * spread[
-                tile
-            ].index_select(3, fields)
-            columns = t["along_y"][tile].flatten(0, 1) @ terms.flatten(0, 1)
-            contribution = (t["along_x"][tile] @ columns.view(len(window), p, -1)).view(
-                len(window), X, Y, -1
-            )
-            window = window.index_add(
-                3,
-                fields,
-                contribution * t["window_terms"][tile, ..., start : start + pair_step],
-            )
-        windows.append(window)
-    return torch.cat(windows)
