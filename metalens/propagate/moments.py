@@ -51,9 +51,6 @@ SHARE = 40  # of the tolerance that interpolation inside blocks may take
 PROBES = 48
 
 
-TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
-
-
 NODES = 60  # default of the approximate number of nodes of a lens along an axis
 
 
@@ -107,6 +104,11 @@ class AxisBlocks:
         return np.ascontiguousarray(
             legendre.interpolation_matrix(self.nodes, self.along).T
         )
+
+    def own(self, block: int) -> slice:
+        """Pillars that belong to a block."""
+        start = block * self.length
+        return slice(start, min(start + self.length, self.pillars))
 
     def middles_um(self, pitch_um: float) -> Array:
         """(block,) middles of the blocks from the lens axis."""
@@ -299,36 +301,30 @@ class ReferencePhase:
         longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
         return float(2 * np.pi * ROUNDED / 10 * longest)
 
-    def table(self, start: int, stop: int, dtype: Any) -> Array:
-        """(block, chunk, order, column) coefficients of block rows start to stop, in
-        turns, without whole turns.
+    def table(self, dtype: Any) -> Array:
+        """(block, chunk, order, column) coefficients of all block rows, in turns,
+        without whole turns.
 
         The columns are cut in chunks of equal size; the last is padded with zeros.
         """
         order = ORDER[np.dtype(dtype).itemsize]
         columns = self.case.shape[1]
         chunks = -(-columns // self.chunk)
-        table = np.zeros((stop - start, chunks, order, self.chunk), dtype)
-        for begin in range(start, stop, TABLE_ROWS):
-            block_rows = slice(begin, min(begin + TABLE_ROWS, stop))
-            coefficients = self._coefficients(block_rows, order)
-            padded = np.zeros((*coefficients.shape[:2], chunks * self.chunk), dtype)
-            padded[..., :columns] = coefficients
-            parts = padded.reshape(*coefficients.shape[:2], chunks, self.chunk)
-            table[block_rows.start - start : block_rows.stop - start] = parts.swapaxes(
-                1, 2
+        table = np.zeros((self.rows.count, order, chunks * self.chunk), dtype)
+        step_um = self.case.steps_um[0]
+        half_um = (self.rows.length - 1) / 2 * step_um
+        for block, middle_um in enumerate(self.rows.middles_um(step_um)):
+            coefficients = _powers(
+                self.case,
+                self.reference,
+                (middle_um, half_um),
+                self.case.pillars_um[1],
+                order,
             )
-        return table
-
-    def _coefficients(self, block_rows: slice, order: int) -> Array:
-        """(block, order, column) float64 of block_rows block rows."""
-        middles = self.rows.middles_um(self.case.steps_um[0])[block_rows, None, None]
-        half = (self.rows.length - 1) / 2 * self.case.steps_um[0]
-        coefficients = _powers(
-            self.case, self.reference, (middles, half), self.case.pillars_um[1], order
-        )
-        coefficients[:, 0] -= np.rint(coefficients[:, 0])
-        return coefficients
+            coefficients[0] -= np.rint(coefficients[0])
+            table[block, :, :columns] = coefficients
+        parts = table.reshape(self.rows.count, order, chunks, self.chunk)
+        return np.ascontiguousarray(parts.swapaxes(1, 2))
 
 
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
@@ -337,50 +333,21 @@ class ReferencePhase:
 Pupils = Callable[[Array, Array], tuple[Array, Array]]
 
 
-Bands = list[tuple[slice, slice]]
-
-
-BAND = 128  # nodes whose shares of an even grid are taken at once
-
-
-# of carrier polynomials and of nodes held at once, and of maps' copies in a thread
-KEEP_BYTES = 32e6
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class PillarMoments:
     """Plan of the reduction of a lens to moments.
 
     blocks: of rows and columns. carrier: the phase that is removed. table: its
-    polynomials, or None where they exceed ``KEEP_BYTES``. dtype: of the maps.
-    rows, columns: (y node, m) and (x node, n) weights of the nodes in the moments, in
-    the dtype of the sums. bands: of both, nodes handled at once and their moments.
+    polynomials. dtype: of the maps. rows, columns: (y node, m) and (x node, n) weights
+    of the nodes in the moments, in the dtype of the sums.
     """
 
     blocks: tuple[AxisBlocks, AxisBlocks]
     carrier: ReferencePhase
-    table: Any
+    table: Array
     dtype: torch.dtype
     rows: torch.Tensor
     columns: torch.Tensor
-    bands: tuple[Bands, Bands]
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """(m, n) numbers of moments."""
-        return self.rows.shape[1], self.columns.shape[1]
-
-    @property
-    def panels(self) -> list[slice]:
-        """Block rows that are handled at once, so that their nodes and their carrier
-        stay below ``KEEP_BYTES``.
-        """
-        rows, columns = self.blocks
-        itemsize = self.dtype.itemsize
-        nodes = 2 * rows.nodes * columns.count * columns.nodes
-        carrier = ORDER[itemsize] * self.carrier.case.shape[1]
-        step = max(4, int(KEEP_BYTES / ((nodes + carrier) * itemsize)))
-        return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
 
 def plan_moments(
@@ -415,53 +382,12 @@ def plan_moments(
     chunk = width * max(1, min(CHUNK // width, -(-case.shape[1] // width)))
     carrier = ReferencePhase(case, reference, rows, chunk)
     nodes_um = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
-    table = None
-    if case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
-        table = carrier.table(0, rows.count, np.dtype(f"f{itemsize}"))
-    values = [weight(at_um) for weight, at_um in zip(weights, nodes_um, strict=True)]
-    tensors = [torch.tensor(np.ascontiguousarray(v), dtype=sums) for v in values]
-    return PillarMoments(
-        blocks,
-        carrier,
-        table,
-        dtype,
-        tensors[0],
-        tensors[1],
-        (_bands(values[0]), _bands(values[1])),
-    )
-
-
-def _bands(weights: Array) -> Bands:
-    """Bands of nodes, each with the range of moments that have a weight there.
-
-    Where the bands hold more than half of the matrix, one band holds all of it.
-
-    Args:
-        weights: (node, moment) share of a node's light in each moment.
-    """
-    bands = []
-    for start in range(0, len(weights), BAND):
-        nodes = slice(start, min(start + BAND, len(weights)))
-        nonzero = np.flatnonzero(weights[nodes].any(0))
-        group = slice(0, 0)
-        if len(nonzero):
-            group = slice(int(nonzero[0]), int(nonzero[-1]) + 1)
-        bands.append((nodes, group))
-    if (
-        sum(group.stop - group.start for _, group in bands)
-        > weights.shape[1] * len(bands) / 2
-    ):
-        return [(slice(0, len(weights)), slice(0, weights.shape[1]))]
-    return bands
-
-
-def _clip_bands(bands: Bands, start: int, stop: int) -> Bands:
-    """The bands, cut to the nodes from start to stop; empty bands are dropped."""
-    clipped = [
-        (slice(max(nodes.start, start), min(nodes.stop, stop)), group)
-        for nodes, group in bands
+    values = [
+        torch.tensor(np.ascontiguousarray(weight(at_um)), dtype=sums)
+        for weight, at_um in zip(weights, nodes_um, strict=True)
     ]
-    return [(nodes, group) for nodes, group in clipped if nodes.start < nodes.stop]
+    table = carrier.table(f"f{itemsize}")
+    return PillarMoments(blocks, carrier, table, dtype, *values)
 
 
 def reduce_to_moments(
@@ -470,8 +396,9 @@ def reduce_to_moments(
     """(m, n) complex moments of a lens, and the sum of squares of its transmission.
 
     Differentiable in phase and transmission. Maps of another dtype than the plan's are
-    converted, some rows at a time where no derivative is required. Values that are not
-    finite give results that are not finite; tiles of closed pillars are skipped.
+    converted, a block of rows at a time where no derivative is required. Values that
+    are not finite give results that are not finite; tiles of closed pillars are
+    skipped.
 
     Args:
         phase_rad: (y, x) phase of every pillar.
@@ -540,28 +467,26 @@ class _Reduce(torch.autograd.Function):
         return out_phase, out_level, None
 
 
-def _table(plan: PillarMoments, panel: slice, dtype: Any) -> Any:
-    """Carrier polynomials of a panel."""
-    return (
-        plan.carrier.table(panel.start, panel.stop, dtype)
-        if plan.table is None
-        else plan.table[panel]
-    )
+def _block_rows(plan: PillarMoments, dtype: Any) -> Callable[[int], tuple[Any, ...]]:
+    """Function of a block row: its rows, and what the compiled loops take of it.
 
-
-def _block_arrays(plan: PillarMoments, dtype: Any) -> tuple[Array, Any, Any]:
-    """Arrays of the blocks that both compiled loops take.
-
-    Returns:
-        Row positions in a block (length,); (rows, columns) shares of the nodes, (nodes,
-        length) each; (rows, columns) indices of the first pillars, (block,) each.
+    Its results are the rows; (chunk, order, column) carrier; (row,) positions in the
+    block; (rows, columns) shares of the nodes, (node, pillar) each; (block,) first
+    columns.
     """
     rows, columns = plan.blocks
-    return (
-        rows.along.astype(dtype),
-        tuple(b.weights.astype(dtype) for b in plan.blocks),
-        (rows.bases, columns.bases),
-    )
+    along, bases = rows.along.astype(dtype), rows.bases
+    # four rows are added at once: zeros follow the last
+    row_shares = np.pad(rows.weights, ((0, 0), (0, 4))).astype(dtype)
+    column_shares, column_bases = columns.weights.astype(dtype), columns.bases
+
+    def block_row(block: int) -> tuple[Any, ...]:
+        own = rows.own(block)
+        first = own.start - bases[block]
+        shares = np.ascontiguousarray(row_shares[:, first:]), column_shares
+        return own, plan.table[block], along[first:], shares, column_bases
+
+    return block_row
 
 
 def _gather(
@@ -569,8 +494,8 @@ def _gather(
 ) -> tuple[torch.Tensor, float]:
     """Moments (2, m, n), real and imaginary, and the sum of squares of the level.
 
-    Each panel of block rows goes through three steps: pillars to the nodes of their
-    blocks (compiled), column nodes to column moments, row nodes to row moments.
+    Three steps: pillars to the nodes of their blocks (compiled, one block row after the
+    other), column nodes to column moments, row nodes to row moments.
 
     Args:
         phase: (y, x) phase, rad.
@@ -579,63 +504,25 @@ def _gather(
     """
     maps = phase.detach().numpy(), level.detach().numpy()
     rows, columns = plan.blocks
-    m, n = plan.counts
-    moments = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
+    nodes = torch.zeros(
+        (rows.count, rows.nodes, 2, columns.count * columns.nodes), dtype=plan.dtype
+    )
+    node_array = nodes.numpy()
+    block_row = _block_rows(plan, node_array.dtype)
     compiled_loop: Any = grid_pillars
-    tile_powers: list[float] = []
-    u, shares, (row_bases, column_bases) = _block_arrays(
-        plan, torch.empty(0, dtype=plan.dtype).numpy().dtype
-    )
-    # block rows at once, where maps of another dtype are copied
-    step = max(
-        1, int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * u.itemsize))
-    )
-    for panel in plan.panels:
-        table = _table(plan, panel, u.dtype)
-        count = panel.stop - panel.start
-        nodes = torch.zeros(
-            (count * rows.nodes, 2, columns.count * columns.nodes), dtype=plan.dtype
-        )
-        node_array = nodes.numpy()
+    powers: list[float] = []
 
-        def work(
-            low: int,
-            high: int,
-            first: int = panel.start,
-            table: Any = table,
-            node_array: Any = node_array,
-        ) -> None:
-            for i in range(low, high, step):
-                end = min(i + step, high)
-                first_row = (first + i) * rows.length
-                row_maps = [
-                    np.asarray(
-                        one_map[first_row : (first + end) * rows.length], u.dtype
-                    )
-                    for one_map in maps
-                ]
-                bases = row_bases[first + i : first + end] - first_row, column_bases
-                node_rows = node_array[i * rows.nodes : end * rows.nodes]
-                tile_powers.append(
-                    compiled_loop(
-                        *row_maps, table[i:end], u, shares, bases, 0, node_rows
-                    )
-                )
+    def work(low: int, high: int) -> None:
+        for block in range(low, high):
+            own, *arrays = block_row(block)
+            row_maps = [np.asarray(values[own], node_array.dtype) for values in maps]
+            powers.append(compiled_loop(*row_maps, *arrays, node_array[block]))
 
-        run_split(count, work)
-        sums = torch.zeros((count * rows.nodes * 2, n), dtype=moments.dtype)
-        light = nodes.flatten(0, 1).to(moments.dtype)
-        for span, group in plan.bands[1]:
-            sums[:, group].addmm_(light[:, span], plan.columns[span, group])
-        sums, first_node = sums.view(-1, 2 * n), panel.start * rows.nodes
-        for span, group in _clip_bands(
-            plan.bands[0], first_node, panel.stop * rows.nodes
-        ):
-            moments[group].addmm_(
-                plan.rows[span, group].T,
-                sums[span.start - first_node : span.stop - first_node],
-            )
-    return moments.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(tile_powers)
+    run_split(rows.count, work)
+    light = nodes.flatten(0, 2).to(plan.columns.dtype)
+    sums = (light @ plan.columns).view(len(plan.rows), -1)
+    moments = (plan.rows.T @ sums).view(-1, 2, plan.columns.shape[1])
+    return moments.movedim(1, 0).contiguous(), math.fsum(powers)
 
 
 def _spread(
@@ -646,7 +533,7 @@ def _spread(
 ) -> None:
     """Write the gradients in phase and transmission, from those of the moments.
 
-    The adjoint of :func:`_gather`, one panel of block rows after the other.
+    The adjoint of :func:`_gather`, one block row after the other.
 
     Args:
         maps: (y, x) phase in rad, and transmission.
@@ -656,63 +543,21 @@ def _spread(
     """
     phase, level = (one_map.detach().numpy() for one_map in maps)
     empty = np.empty((0, 0), phase.dtype)
-    targets = tuple(
-        empty if gradient is None else gradient.numpy() for gradient in gradients
-    )
+    targets = [empty if target is None else target.numpy() for target in gradients]
     rows = plan.blocks[0]
-    m, n = plan.counts
-    moment_gradient = grad.movedim(0, 1).reshape(m, 2 * n)
+    sums = plan.rows @ grad.movedim(0, 1).flatten(1)
+    nodes = sums.view(-1, plan.columns.shape[1]) @ plan.columns.T
+    node_array = nodes.view(rows.count, rows.nodes, 2, -1).to(plan.dtype).numpy()
+    block_row = _block_rows(plan, phase.dtype)
     compiled_loop: Any = interpolate_to_pillars
-    fixed = _block_arrays(plan, phase.dtype)
-    for panel in plan.panels:
-        table = _table(plan, panel, phase.dtype)
-        nodes = _node_gradients(plan, panel, moment_gradient).to(plan.dtype).numpy()
 
-        def work(
-            low: int,
-            high: int,
-            table: Any = table,
-            nodes: Any = nodes,
-            panel: slice = panel,
-        ) -> None:
-            node_rows = nodes[low * rows.nodes : high * rows.nodes]
-            compiled_loop(
-                phase,
-                level,
-                table[low:high],
-                *fixed,
-                panel.start + low,
-                node_rows,
-                *targets,
-            )
+    def work(low: int, high: int) -> None:
+        for block in range(low, high):
+            own, *arrays = block_row(block)
+            out = [target[own] for target in targets]
+            compiled_loop(phase[own], level[own], *arrays, node_array[block], *out)
 
-        run_split(panel.stop - panel.start, work)
-
-
-def _node_gradients(
-    plan: PillarMoments, panel: slice, moment_gradient: torch.Tensor
-) -> torch.Tensor:
-    """Gradients at the nodes of a panel (row node, re/im, column node).
-
-    Args:
-        plan: blocks and weights.
-        panel: block rows.
-        moment_gradient: (m, re/im · n) gradients of the moments.
-    """
-    rows, columns = plan.blocks
-    n = plan.counts[1]
-    first_node, last_node = panel.start * rows.nodes, panel.stop * rows.nodes
-    sums = torch.cat(
-        [
-            plan.rows[span, group] @ moment_gradient[group]
-            for span, group in _clip_bands(plan.bands[0], first_node, last_node)
-        ]
-    ).view(-1, n)
-    nodes = torch.cat(
-        [sums[:, group] @ plan.columns[span, group].T for span, group in plan.bands[1]],
-        1,
-    )
-    return nodes.view(-1, 2, columns.count * columns.nodes)
+    run_split(rows.count, work)
 
 
 EXACT = {
@@ -778,37 +623,16 @@ def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
 )
-def _power(level, first, last, start, stop):  # type: ignore[no-untyped-def]
-    """(sum of squares, sum of magnitudes) of the transmission of a tile; NaN
-    propagates.
-
-    level: (y, x). first, last: rows. start, stop: columns.
-    """
-    total, size = 0.0, 0.0
-    for i in range(first, last):
+def _power(level, start, stop):  # type: ignore[no-untyped-def]
+    """Sum of squares of the transmission (y, x) of columns start to stop; NaN
+    propagates."""
+    total = 0.0
+    for i in range(level.shape[0]):
         row = level[i, start:stop]
-        squares, magnitudes = row.dtype.type(0), row.dtype.type(0)
+        squares = row.dtype.type(0)
         for j in range(row.size):
             squares += row[j] * row[j]
-            magnitudes += abs(row[j])
         total += squares
-        size += magnitudes
-    return total, size
-
-
-@numba.njit(
-    fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
-)
-def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
-    """0, or NaN where a phase of a tile is not finite.
-
-    phase: (y, x). first, last: rows. start, stop: columns.
-    """
-    total = phase.dtype.type(0)
-    for i in range(first, last):
-        row = phase[i, start:stop]
-        for j in range(row.size):
-            total += row[j] * row.dtype.type(0)
     return total
 
 
@@ -857,60 +681,38 @@ def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ignore[no-untyped-def]
-    """Interpolate the light of some block rows to their nodes, added to ``out`` (block
-    row · node, re/im, column node).
+def grid_pillars(phase, level, table, u, shares, bases, out):  # type: ignore[no-untyped-def]
+    """Interpolate the light of a block row to its nodes, added to ``out`` (row node,
+    re/im, column node).
 
-    phase, level: (y, x), rad and amplitude. table: (block row, chunk, order, column)
-    carrier, from block row ``first`` on. u: (length,) row positions in a block. shares,
-    bases: (rows, columns) weights of the nodes and first pillars.
+    phase, level: (row, x), rad and amplitude. table: (chunk, order, column) carrier.
+    u: (row,) positions in the block. shares: (rows, columns) weights of the nodes
+    (node, pillar), those of the rows with four zeros at their end. bases: (block,)
+    first columns.
 
-    Tile by tile: phasors of four rows are formed, added to the row nodes, and then to
-    the column nodes. Returns the sum of squares of the transmission, NaN where a phase
-    of a closed tile is not finite.
+    Chunk by chunk: phasors of four rows are formed, added to the row nodes, and then to
+    the column nodes. Returns the sum of squares of the transmission.
     """
-    ny, nx = phase.shape
-    nodes, length = shares[0].shape
-    chunk = table.shape[3]
+    chunk = table.shape[2]
     rows = np.zeros((4, 2, chunk), out.dtype)
-    sums = np.empty((nodes, 2, chunk), out.dtype)
-    padded = np.zeros((nodes, length + 4), out.dtype)
-    padded[:, :length] = shares[0]
+    sums = np.empty((out.shape[0], 2, chunk), out.dtype)
     power = 0.0
-    for block in range(table.shape[0]):
-        start = (first + block) * length
-        stop = min((first + block + 1) * length, ny)
-        base = bases[0][first + block]
-        for c in range(table.shape[1]):
-            x0, x1 = c * chunk, min((c + 1) * chunk, nx)
-            light, size = _power(level, start, stop, x0, x1)
-            power += light
-            if size == 0:
-                power += _taint(phase, start, stop, x0, x1)
-                continue
-            sums[:] = 0
-            for i in range(start, stop, 4):
-                for q in range(4):
-                    if i + q < stop:
-                        p, t = phase[i + q, x0:x1], level[i + q, x0:x1]
-                        _light(
-                            p,
-                            t,
-                            table[block, c],
-                            u[i + q - base],
-                            rows[q, 0],
-                            rows[q, 1],
-                        )
-                    else:
-                        rows[q] = 0
-                _add_rows(rows, padded, i - base, sums)
-            _add_columns(
-                sums,
-                (x0, x1),
-                shares[1],
-                bases[1],
-                out[block * nodes : (block + 1) * nodes],
-            )
+    for c in range(table.shape[0]):
+        x0, x1 = c * chunk, min((c + 1) * chunk, phase.shape[1])
+        light = _power(level, x0, x1)
+        power += light
+        if light == 0:
+            continue
+        sums[:] = 0
+        for i in range(0, u.size, 4):
+            for q in range(4):
+                if i + q < u.size:
+                    p, t = phase[i + q, x0:x1], level[i + q, x0:x1]
+                    _light(p, t, table[c], u[i + q], rows[q, 0], rows[q, 1])
+                else:
+                    rows[q] = 0
+            _add_rows(rows, shares[0], i, sums)
+        _add_columns(sums, (x0, x1), shares[1], bases, out)
     return power
 
 
@@ -975,43 +777,30 @@ def _level_gradient(row, re, im, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
 def interpolate_to_pillars(  # type: ignore[no-untyped-def]
-    phase, level, table, u, shares, bases, first, grad, out_phase, out_level
+    phase, level, table, u, shares, bases, grad, out_phase, out_level
 ):
     """Gradients in phase and transmission from those at the nodes: the adjoint of
     :func:`grid_pillars`, which has the other arguments.
 
-    grad: as ``out`` there. out_phase, out_level: (y, x), written in place; an empty
+    grad: as ``out`` there. out_phase, out_level: (row, x), written in place; an empty
     array: no gradient is computed.
     """
-    ny, nx = phase.shape
-    nodes, length = shares[0].shape
-    chunk = table.shape[3]
+    nodes, chunk = grad.shape[0], table.shape[2]
     row = np.empty((2, chunk), grad.dtype)
     re, im = np.empty(chunk, grad.dtype), np.empty(chunk, grad.dtype)
     sums = np.zeros(((nodes + 3) // 4 * 4, 2, chunk), grad.dtype)
-    padded = np.zeros((len(sums), length), grad.dtype)
-    padded[:nodes] = shares[0]
-    for block in range(table.shape[0]):
-        start = (first + block) * length
-        stop = min((first + block + 1) * length, ny)
-        base = bases[0][first + block]
-        for c in range(table.shape[1]):
-            x0, x1 = c * chunk, min((c + 1) * chunk, nx)
-            if out_level.size == 0 and _power(level, start, stop, x0, x1)[1] == 0:
-                for i in range(start, stop):
-                    out_phase[i, x0:x1] = 0
-                continue
-            _spread_columns(
-                grad[block * nodes : (block + 1) * nodes],
-                (x0, x1),
-                shares[1],
-                bases[1],
-                sums,
-            )
-            for i in range(start, stop):
-                _spread_row(sums, padded, i - base, row)
-                _phasors(phase[i, x0:x1], table[block, c], u[i - base], re, im)
-                if out_phase.size:
-                    _phase_gradient(row, re, im, level[i, x0:x1], out_phase[i, x0:x1])
-                if out_level.size:
-                    _level_gradient(row, re, im, out_level[i, x0:x1])
+    padded = np.zeros((len(sums), u.size), grad.dtype)
+    padded[:nodes] = shares[0][:, : u.size]
+    for c in range(table.shape[0]):
+        x0, x1 = c * chunk, min((c + 1) * chunk, phase.shape[1])
+        if out_level.size == 0 and _power(level, x0, x1) == 0:
+            out_phase[:, x0:x1] = 0
+            continue
+        _spread_columns(grad, (x0, x1), shares[1], bases, sums)
+        for i in range(u.size):
+            _spread_row(sums, padded, i, row)
+            _phasors(phase[i, x0:x1], table[c], u[i], re, im)
+            if out_phase.size:
+                _phase_gradient(row, re, im, level[i, x0:x1], out_phase[i, x0:x1])
+            if out_level.size:
+                _level_gradient(row, re, im, out_level[i, x0:x1])

@@ -27,13 +27,13 @@ from metalens.propagate.moments import (
     reduce_to_moments,
 )
 from metalens.propagate.paths import (
-    from_source,
     over_blocks,
     ray_cosines,
+    rayleigh_sommerfeld_kernel,
     reference_depth,
     to_sensor,
 )
-from metalens.propagate.window import depth_basis
+from metalens.propagate.window import depth_basis, depth_nodes
 
 RAYS = 33  # along an axis, to whose reach the quadratic is fitted
 
@@ -301,41 +301,25 @@ def _fast_size(points: float) -> int:
 def _band(case: PropagationCase, i: int, extra: float) -> float:
     """Largest |d path / d x| along an axis of the kernel without its carrier.
 
-    The sum of two parts: the change of the sensor ray over the window, and the slope of
-    the source path between its extreme and its reference depth.
+    By differences over 1 nm, at the ends and middles of lens and window.
 
     Args:
         case: geometry of the propagation.
         i: 0 for y, 1 for x.
         extra: enlargement of the window along the axis, um.
     """
-    hy, hx = case.half_size_um
-    wy, wx = case.half_window_um
-    ends = np.array([-1.0, 0.0, 1.0])
-    y, x, Y, X = np.meshgrid(ends * hy, ends * hx, ends * wy, ends * wx, indexing="ij")
-    if i == 0:
-        Y = Y + np.sign(Y) * extra
-    else:
-        X = X + np.sign(X) * extra
-    offsets = [(case.centre_um[1] - y, Y), (case.centre_um[0] - x, X)]
-    along, across = offsets[i], offsets[1 - i]
-    turn = ray_cosines(case, along[0] + along[1], across[0] + across[1]) - ray_cosines(
-        case, along[0], across[0]
+    half_um = np.array([*case.half_size_um, *case.half_window_um])
+    half_um[2 + i] += extra
+    inverse = case.inverse_depths_per_um
+    y, x, Y, X, depths = np.meshgrid(
+        *np.outer(half_um, [-1, 0, 1]), [min(inverse), max(inverse)], indexing="ij"
     )
-    half_steps = np.array([-0.5, 0.5])[:, None, None] * 1e-3
-    lens_axes = [ends[:, None] * hy, ends * hx]
-    lens_axes[i] = lens_axes[i] + half_steps
-    steepest = 0.0
-    for inverse in (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)):
-        path = from_source(case, lens_axes[1], lens_axes[0], case.tangents, inverse)
-        path = np.asarray(
-            path
-            - from_source(
-                case, lens_axes[1], lens_axes[0], case.tangents, reference_depth(case)
-            )
-        )
-        steepest = max(steepest, float(np.abs(path[1] - path[0]).max() / 1e-3))
-    return max(float(np.abs(turn).max()) + steepest, 1e-6)
+    high, low = (
+        rayleigh_sommerfeld_kernel(case, x + i * h, y + (1 - i) * h, X, Y, depths)
+        for h in (5e-4, -5e-4)
+    )
+    slope = np.abs(np.angle(high * low.conj())).max() / case.wavenumber * 1e3
+    return max(float(slope), 1e-6)
 
 
 def grid_um(axis: WideAxis) -> Array:
@@ -367,11 +351,7 @@ def spread_weights(axis: WideAxis, places_um: Array) -> Array:
     )
 
 
-BAND_BYTES = 3e6  # of the rows whose depths are mixed at once
-
-
-# step of the samples of the lens grid whose light selects the depth fields
-EVERY = 3
+MIXED_ROWS = 8  # of the window, whose depths are mixed at once
 
 
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
@@ -383,8 +363,7 @@ class WidePlan:
 
     axes: (y, x). fields: (b, y, x) depth fields on the lens grid, its phases included.
     coefficients: (depth, b). chirp, transfer: (X, Y) factors after the first and second
-    transform, in the memory order of the light. left: relative root mean square of the
-    light of all depths that a reduced basis may omit.
+    transform, in the memory order of the light.
     """
 
     case: PropagationCase
@@ -394,7 +373,6 @@ class WidePlan:
     coefficients: torch.Tensor
     chirp: torch.Tensor
     transfer: torch.Tensor
-    left: float
 
     @property
     def judged_um(self) -> tuple[Array, Array]:
@@ -441,9 +419,7 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
         table = torch.empty((coefficients.shape[1], *lens.shape), dtype=complex_dtype)
         for slot, field in zip(table, fields, strict=True):
             slot.copy_(torch.from_numpy(field * lens))
-    return WidePlan(
-        case, axes, pillars, table, tensors[0], tensors[1], tensors[2], tolerance
-    )
+    return WidePlan(case, axes, pillars, table, *tensors)
 
 
 def _depth_fields(
@@ -459,38 +435,14 @@ def _depth_fields(
         tolerance: relative root mean square error of the basis.
     """
     grids = [grid_um(axis) for axis in axes]
-    counts = [min(_coarse_nodes(case, i, g), len(g)) for i, g in enumerate(grids)]
-    e, x = (
-        legendre.mapped_nodes(n, g[0], g[-1])
-        for n, g in zip(counts, grids, strict=True)
+    nodes = depth_nodes(case, [grid[-1] for grid in grids], tolerance)
+    depths = depth_basis(case, nodes, tolerance)
+    rows, columns = (
+        legendre.interpolation_matrix(len(at_um), grid / grid[-1])
+        for at_um, grid in zip(nodes, grids, strict=True)
     )
-    depths = depth_basis(case, (e, x), tolerance)
-    matrices = [
-        legendre.interpolation_matrix(n, g / g[-1])
-        for n, g in zip(counts, grids, strict=True)
-    ]
-    fields = (matrices[0] @ field @ matrices[1].T for field in depths.basis)
+    fields = (rows @ field @ columns.T for field in depths.basis)
     return fields, depths.coefficients
-
-
-def _coarse_nodes(case: PropagationCase, i: int, grid: Array) -> int:
-    """Legendre nodes along an axis that resolve the phase of the extreme depths.
-
-    24 plus six per wavelength of path difference.
-
-    Args:
-        case: geometry of the propagation.
-        i: 0 for y, 1 for x.
-        grid: lens grid along the axis, um.
-    """
-    axes = [np.array([0.0, *case.half_size_um])[:, None], grid[[0, -1]]]
-    y, x = (axes[1], axes[0]) if i == 0 else (axes[0], axes[1])
-    turns = 0.0
-    for inverse in (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)):
-        path = from_source(case, x, y, case.tangents, inverse)
-        path = path - from_source(case, x, y, case.tangents, reference_depth(case))
-        turns = max(turns, float(np.abs(path).max()) / case.wavelength_um)
-    return 24 + math.ceil(6 * turns)
 
 
 def _lens_phase(case: PropagationCase, axes: tuple[WideAxis, WideAxis]) -> Array:
@@ -618,51 +570,13 @@ def light_wide(
     ]
     grid, total = torch.stack([g for g, _ in reduced]), None
     for sign, light in mix_components(grid, pupils, plan.judged_um):
-        mixture, coefficients = (
-            (None, plan.coefficients)
-            if light.requires_grad
-            else _fewer_fields(light, plan)
-        )
-        irradiance = _mix_depths(fields_wide(light, plan, mixture), coefficients)
-        irradiance = irradiance if sign == 1 else sign * irradiance
+        irradiance = sign * _mix_depths(fields_wide(light, plan), plan.coefficients)
         total = irradiance if total is None else total + irradiance
     powers = [power for _, power in reduced]
     return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
-def _fewer_fields(
-    light: torch.Tensor, plan: WidePlan
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Reduced depth basis for this light: mixtures (r, b), coefficients (depth, r).
-
-        F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L, U: leading eigenvectors of C G Cᴴ,
-        G_ij = Σ_x |L|² B_i B_j*
-
-    A round lens leaves the corners of its square dark, where depths differ most.
-
-    Args:
-        light: (y, x) light L on the lens grid.
-        plan: of :func:`plan_wide`.
-    """
-    samples = (
-        (plan.fields[:, ::EVERY, ::EVERY] * light[::EVERY, ::EVERY])
-        .flatten(1)
-        .to(torch.complex128)
-    )
-    coefficients = plan.coefficients.to(torch.complex128)
-    power, axes = torch.linalg.eigh(
-        coefficients @ (samples @ samples.mH) @ coefficients.mH
-    )
-    omitted = torch.cumsum(power.clamp_min(0), 0)  # ascending
-    first = min(int((omitted <= plan.left**2 * omitted[-1]).sum()), len(omitted) - 1)
-    vectors = axes[:, first:]
-    mixtures = vectors.mH @ coefficients
-    return mixtures.to(plan.coefficients), vectors.to(plan.coefficients)
-
-
-def fields_wide(
-    gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | None = None
-) -> torch.Tensor:
+def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
     """(b, y, x) field on the window of every depth field, by three Fourier transforms.
 
     A phase of each sample, common to all fields, is left out.
@@ -670,16 +584,12 @@ def fields_wide(
     Args:
         gathered: (y, x) light on the lens grid.
         plan: of :func:`plan_wide`.
-        mixture: (fewer, b) mixtures to propagate in place of the depth fields.
     """
     y, x = plan.axes
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
     parts = []
-    fields = (
-        plan.fields if mixture is None else torch.tensordot(mixture, plan.fields, 1)
-    )
-    for chunk in fields.split(step):
+    for chunk in plan.fields.split(step):
         # every transform is along the last axis
         light = torch.fft.fft(chunk * gathered, n=x.first)[..., : x.size].mT
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
@@ -700,21 +610,8 @@ def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tenso
         fields: (b, y, x) complex.
         coefficients: (depth, b).
     """
-    depths = len(coefficients)
-    count, my, mx = fields.shape
-    step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
     bands = []
-    out = None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
-    for start in range(0, my, step):
-        rows = fields[:, start : start + step]
-        field = torch.view_as_real(
-            (coefficients @ rows.reshape(count, -1)).view(depths, -1, mx)
-        )
-        if out is None:
-            bands.append(field.square().sum(-1))
-        else:
-            squares = field.square_()
-            torch.add(
-                squares[..., 0], squares[..., 1], out=out[:, start : start + step]
-            )
-    return torch.cat(bands, 1) if out is None else out
+    for rows in fields.split(MIXED_ROWS, 1):
+        field = torch.tensordot(coefficients, rows, 1)
+        bands.append(torch.view_as_real(field).square().sum(-1))
+    return torch.cat(bands, 1)

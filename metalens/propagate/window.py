@@ -5,7 +5,7 @@ the lens.
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -125,7 +125,7 @@ def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
     """
     extremes = min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)
     kernel = functools.partial(rayleigh_sommerfeld_kernel, case)
-    probes = _probes(case) | {"inverse": np.array(extremes)}
+    probes = _probes(case, 0.9) | {"inverse": np.array(extremes)}
     high_y, high_x = case.half_size_um
     return (
         _needed_nodes(kernel, probes, "y", high_y, tolerance),
@@ -146,10 +146,10 @@ def tile_counts(case: PropagationCase, tolerance: float) -> TileCounts:
     quarter = tolerance / 4
     # rounding leaves no smaller tails than 1e-13
     edge_tolerance = max(quarter / EDGE, min(quarter, 1e-13))
-    residual = functools.partial(_residual_kernel, case)
+    residual, probes = functools.partial(_residual_kernel, case), _probes(case, 1.0)
     axes = zip("YXyx", (*case.half_window_um, *case.half_size_um), strict=True)
     counts = [
-        _needed_nodes(residual, _probes(case), name, half_um, edge_tolerance)
+        _needed_nodes(residual, probes, name, half_um, edge_tolerance)
         for name, half_um in axes
     ]
     return TileCounts(
@@ -157,13 +157,14 @@ def tile_counts(case: PropagationCase, tolerance: float) -> TileCounts:
     )
 
 
-def _probes(case: PropagationCase) -> dict[str, Array]:
-    """Positions on lens (x, y) and window (X, Y) at which functions are sampled, um."""
+def _probes(case: PropagationCase, part: float) -> dict[str, Array]:
+    """Positions on lens (x, y) and window (X, Y) at which functions are sampled, um:
+    middle and ends, those of the lens at this part of its half size."""
     places = np.array([-1.0, 0.0, 1.0])
     (lens_y, lens_x), (window_y, window_x) = case.half_size_um, case.half_window_um
     return {
-        "x": 0.9 * lens_x * places,
-        "y": 0.9 * lens_y * places,
+        "x": part * lens_x * places,
+        "y": part * lens_y * places,
         "X": window_x * places,
         "Y": window_y * places,
     }
@@ -256,6 +257,30 @@ def depth_factors(
     """
     reference = from_source(case, x, e, case.tangents, reference_depth(case))
     return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
+
+
+def depth_nodes(
+    case: PropagationCase, half_um: Sequence[float], tolerance: float
+) -> tuple[Array, Array]:
+    """(e,), (x,) Legendre nodes over -half_um to half_um (y, x) that interpolate the
+    fields of the extreme depths to a relative tolerance.
+    """
+
+    def field(x: Any, y: Any, inverse: Any) -> Any:
+        return np.exp(1j * depth_factors(case, y, x, case.tangents, inverse))
+
+    extremes = min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)
+    places = zip("yx", half_um, strict=True)
+    probes = {name: np.array([-1.0, 0.0, 1.0]) * half for name, half in places}
+    probes["inverse"] = np.array(extremes)
+    e, x = (
+        half
+        * legendre.gauss_legendre_nodes(
+            _needed_nodes(field, probes, name, half, tolerance)
+        )[0]
+        for name, half in zip("yx", half_um, strict=True)
+    )
+    return e, x
 
 
 def depth_basis(
@@ -443,11 +468,11 @@ class WindowPlan:
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=32)
 def plan_window(
     case: PropagationCase, tolerance: float, dtype: torch.dtype, *, smooth: bool = False
 ) -> WindowPlan:
-    """Plan of a windowed propagation; the last 64 are cached.
+    """Plan of a windowed propagation; the last 32 are cached.
 
     Args:
         case, tolerance: geometry, and relative error of the field.
