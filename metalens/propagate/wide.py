@@ -351,7 +351,11 @@ def spread_weights(axis: WideAxis, places_um: Array) -> Array:
     )
 
 
-MIXED_ROWS = 8  # of the window, whose depths are mixed at once
+MIXED_ROWS = 32  # of the window, whose depths are mixed at once
+
+
+# step of the samples of the lens grid whose light selects the depth fields
+EVERY = 3
 
 
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
@@ -363,7 +367,8 @@ class WidePlan:
 
     axes: (y, x). fields: (b, y, x) depth fields on the lens grid, its phases included.
     coefficients: (depth, b). chirp, transfer: (X, Y) factors after the first and second
-    transform, in the memory order of the light.
+    transform, in the memory order of the light. left: relative root mean square of the
+    light of all depths that a reduced basis may omit.
     """
 
     case: PropagationCase
@@ -373,6 +378,7 @@ class WidePlan:
     coefficients: torch.Tensor
     chirp: torch.Tensor
     transfer: torch.Tensor
+    left: float
 
     @property
     def judged_um(self) -> tuple[Array, Array]:
@@ -419,7 +425,7 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
         table = torch.empty((coefficients.shape[1], *lens.shape), dtype=complex_dtype)
         for slot, field in zip(table, fields, strict=True):
             slot.copy_(torch.from_numpy(field * lens))
-    return WidePlan(case, axes, pillars, table, *tensors)
+    return WidePlan(case, axes, pillars, table, *tensors, tolerance)
 
 
 def _depth_fields(
@@ -570,26 +576,60 @@ def light_wide(
     ]
     grid, total = torch.stack([g for g, _ in reduced]), None
     for sign, light in mix_components(grid, pupils, plan.judged_um):
-        irradiance = sign * _mix_depths(fields_wide(light, plan), plan.coefficients)
+        fields, coefficients = plan.fields, plan.coefficients
+        if not light.requires_grad:
+            fields, coefficients = _fewer_fields(light, plan)
+        irradiance = _mix_depths(fields_wide(light, fields, plan), coefficients)
+        irradiance = irradiance if sign == 1 else sign * irradiance
         total = irradiance if total is None else total + irradiance
     powers = [power for _, power in reduced]
     return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
-def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
+def _fewer_fields(
+    light: torch.Tensor, plan: WidePlan
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Reduced depth basis for this light: fields (r, y, x), coefficients (depth, r).
+
+        F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L, U: leading eigenvectors of C G Cᴴ,
+        G_ij = Σ_x |L|² B_i B_j*
+
+    A round lens leaves the corners of its square dark, where depths differ most.
+
+    Args:
+        light: (y, x) light L on the lens grid.
+        plan: of :func:`plan_wide`.
+    """
+    some = (slice(None, None, EVERY),) * 2
+    coefficients = plan.coefficients.to(torch.complex128)
+    sampled = (plan.fields[:, *some] * light[some]).flatten(1).to(coefficients)
+    power, vectors = torch.linalg.eigh(
+        coefficients @ (sampled @ sampled.mH) @ coefficients.mH
+    )
+    omitted = torch.cumsum(power.clamp_min(0), 0)  # ascending
+    first = min(int((omitted <= plan.left**2 * omitted[-1]).sum()), len(omitted) - 1)
+    basis = vectors[:, first:]
+    mixtures = (basis.mH @ coefficients).to(plan.fields)
+    return torch.tensordot(mixtures, plan.fields, 1), basis.to(plan.fields)
+
+
+def fields_wide(
+    gathered: torch.Tensor, fields: torch.Tensor, plan: WidePlan
+) -> torch.Tensor:
     """(b, y, x) field on the window of every depth field, by three Fourier transforms.
 
     A phase of each sample, common to all fields, is left out.
 
     Args:
         gathered: (y, x) light on the lens grid.
+        fields: (b, y, x) depth fields on it.
         plan: of :func:`plan_wide`.
     """
     y, x = plan.axes
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
     parts = []
-    for chunk in plan.fields.split(step):
+    for chunk in fields.split(step):
         # every transform is along the last axis
         light = torch.fft.fft(chunk * gathered, n=x.first)[..., : x.size].mT
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
@@ -612,6 +652,7 @@ def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tenso
     """
     bands = []
     for rows in fields.split(MIXED_ROWS, 1):
-        field = torch.tensordot(coefficients, rows, 1)
-        bands.append(torch.view_as_real(field).square().sum(-1))
+        squares = torch.view_as_real(coefficients @ rows.flatten(1)).square()
+        irradiance = squares[..., 0] + squares[..., 1]
+        bands.append(irradiance.view(len(coefficients), *rows.shape[1:]))
     return torch.cat(bands, 1)
