@@ -4,7 +4,6 @@ from . import plots as plots
 from . import spectrum as spectrum
 from .budget import NEIGHBOURS as NEIGHBOURS
 from .budget import Budget as Budget
-from .budget import LeftOut as LeftOut
 from .budget import Polarisation as Polarisation
 from .budget import scalar_error as scalar_error
 from .budget import sine_aperture as sine_aperture

@@ -9,7 +9,7 @@ from scipy.special import jv
 
 from metalens.core.arrays import Array
 from metalens.lens import CURVED, Lens, NeighbourRows
-from metalens.optics import media
+from metalens.optics import Media, media
 from metalens.psf.spectrum import SpectralNodes
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
@@ -22,9 +22,6 @@ NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 ANGLE = 2.5
 # of an aperture over which obliquity is averaged: to rounding at NA 0.6, 25 degrees
 RINGS, SPOKES = 8, 24
-HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
-
-
 CURES = {  # of an error above the tolerance, by its largest part
     "numerical": "raise it or widen the window",
     "sampling": "give the window more samples",
@@ -33,31 +30,23 @@ CURES = {  # of an error above the tolerance, by its largest part
 }
 
 
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """Sizes of the pillar effects that the model of a lens leaves out.
+def neighbours_text(rows: NeighbourRows | None) -> str:
+    """What the terms ``neighbours`` and ``angle`` of a lens's budget are of, in words.
 
-    By default they are rough, those of another cell.
-
-    neighbours: solved rows of the lens's own pillars. Its PSFs include their coupling at
-        the rows' wavelength and at normal incidence. Or (a, b) of the coupling
-        1 + a s + b s² of light that is deflected by the sine s, which its PSFs lack.
-    angle: relative change of t over sin² of the incidence.
-    of: name of the cell that the numbers are of.
+    Args:
+        rows: solved rows of the lens's own pillars; None for the constants of this
+            module.
     """
-
-    neighbours: NeighbourRows | tuple[complex, complex] = NEIGHBOURS
-    angle: float = ANGLE
-    of: str = ""
-
-    @property
-    def words(self) -> str:
-        """For a person."""
-        if isinstance(self.neighbours, tuple):
-            return f"neighbours and angle: of {self.of or HOW}"
-        angle = "" if self.of else "; angle: of the default cell, rough"
-        at = f"at {self.neighbours.wavelength_um:g} um and normal incidence"
-        return f"unlike neighbours counted, by {len(self.neighbours.sine)} solved rows {at}{angle}"
+    if rows is None:
+        return (
+            "neighbours and angle: of the default cell, rough "
+            "(design --own-cell has a lens hold its own neighbours)"
+        )
+    return (
+        f"unlike neighbours counted, by {len(rows.sine)} solved rows at "
+        f"{rows.wavelength_um:g} um and normal incidence; angle: of the default cell, "
+        "rough"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,22 +123,14 @@ class Budget:
     @property
     def text(self) -> str:
         """One line for a person."""
-        terms = [
-            (f.name, getattr(self, f.name)) for f in fields(self) if f.name != "outside"
-        ]
-        known = [
-            f"{name} {value:.1e}" if value else f"{name} 0"
-            for name, value in terms
-            if not math.isnan(value)
-        ]
-        lost = (
-            ""
-            if math.isnan(self.outside)
-            else f"; {self.outside:.1%} of the light falls outside the window"
-        )
-        return (
-            f"error by cause: {', '.join(known)}; of the device {self.total:.1e}{lost}"
-        )
+        terms = {f.name: getattr(self, f.name) for f in fields(self)}
+        known = {name: term for name, term in terms.items() if not math.isnan(term)}
+        outside = known.pop("outside", None)
+        causes = [f"{n} {term:.1e}" if term else f"{n} 0" for n, term in known.items()]
+        words = f"error by cause: {', '.join(causes)}; of the device {self.total:.1e}"
+        if outside is None:
+            return words
+        return f"{words}; {outside:.1%} of the light falls outside the window"
 
 
 def _together(*terms: float) -> float:
@@ -158,13 +139,12 @@ def _together(*terms: float) -> float:
 
 def worst_of_budgets(budgets: list[Budget]) -> Budget:
     """The largest of every term of ``budgets``."""
-    names = [f.name for f in fields(Budget)]
-    return Budget(**{n: _largest([getattr(b, n) for b in budgets]) for n in names})
 
+    def worst(name: str) -> float:
+        known = [getattr(b, name) for b in budgets if not math.isnan(getattr(b, name))]
+        return max(known, default=math.nan)
 
-def _largest(values: list[float]) -> float:
-    finite = [v for v in values if not math.isnan(v)]
-    return max(finite) if finite else math.nan
+    return Budget(**{field.name: worst(field.name) for field in fields(Budget)})
 
 
 def with_model(
@@ -173,7 +153,6 @@ def with_model(
     angle_rad: tuple[float, float],
     nodes: SpectralNodes,
     polarisation: Polarisation,
-    left_out: LeftOut,
 ) -> Budget:
     """The budget of one direction with the errors of spectrum and lens model added.
 
@@ -188,11 +167,10 @@ def with_model(
         angle_rad: (x, y) field angle.
         nodes: wavelengths with weights, and the error of their quadrature.
         polarisation: that was computed.
-        left_out: solved rows or constants of neighbours, and the constant of angles.
     """
     aperture = sine_aperture(lens, angle_rad)
     wavelength_um = lens.wavelength_um
-    slanted = min(1.0, left_out.angle * incidence_sine(angle_rad) ** 2)
+    slanted = min(1.0, ANGLE * incidence_sine(angle_rad) ** 2)
     area = lens.diameters.pillars * lens.diameters.site_um2 / wavelength_um**2
     pairs = lens.pairs
     curve = pairs.entry_error if pairs else lens.proxy.error(wavelength_um)
@@ -205,7 +183,7 @@ def with_model(
         spectrum=nodes.error,
         polarisation=mixing,
         neighbours=_neighbours(
-            aperture, left_out.neighbours, polarisation, nodes, slanted, area
+            aperture, lens.neighbours, polarisation, nodes, slanted, area
         ),
         angle=0.0 if lens.proxy.max_angle_rad > 0 else slanted,
         glass=lens.layers.ghost(wavelength_um),
@@ -223,6 +201,13 @@ def incidence_sine(angle_rad: tuple[float, float]) -> float:
     return slope / math.hypot(1.0, slope)
 
 
+def _aperture(lens: Lens, angle_rad: tuple[float, float]) -> tuple[Media, float, float]:
+    """Media behind a lens, lateral reach of the chief ray, and radius of the aperture."""
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
+    return after, centre, lens.diameters.radius_um + lens.diameters.pitch_um / 2
+
+
 def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Numerical aperture on the sensor: half the range of sin θ of the rays to a point.
 
@@ -232,9 +217,7 @@ def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
         lens: aperture, distance and films.
         angle_rad: field angles along x and y, rad.
     """
-    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
-    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    after, centre, radius = _aperture(lens, angle_rad)
     edges = centre + np.array([-1.0, 1.0]) * radius
     p = np.sign(edges) * media.ray_direction(after, np.abs(edges))
     return float((p[1] - p[0]) / 2 / after.order[-1])
@@ -250,16 +233,13 @@ def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
         lens: aperture, distance and films.
         angle_rad: field angles along x and y, rad.
     """
-    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
+    after, centre, edge = _aperture(lens, angle_rad)
     node, share = np.polynomial.legendre.leggauss(RINGS)
-    edge = lens.diameters.radius_um + lens.diameters.pitch_um / 2
     radius = edge * np.sqrt((node + 1) / 2)[:, None]
     turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
-    p = media.ray_direction(
-        after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn))
-    )
-    weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)
+    reach = np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn))
+    sine = np.asarray(media.ray_direction(after, reach)) / after.order[-1]
+    weight = 1 / np.sqrt(1 - sine**2)
     mean = share @ weight.mean(1) / 2
     return float(np.sqrt(share @ ((weight - mean) ** 2).mean(1) / 2) / mean)
 
@@ -283,7 +263,7 @@ def scalar_error(aperture: float, uneven: float = 0.0) -> float:
 
 def _neighbours(
     aperture: float,
-    model: NeighbourRows | tuple[complex, complex],
+    model: NeighbourRows | None,
     polarisation: Polarisation,
     nodes: SpectralNodes,
     slanted: float,
@@ -291,14 +271,14 @@ def _neighbours(
 ) -> float:
     """Relative L2 error of a PSF by the coupling of unequal neighbours.
 
-    Two constants stand for a lens without solved rows: the error is then that of no
+    ``NEIGHBOURS`` stands for a lens without solved rows: the error is then that of no
     coupling. With solved rows the errors are those of their truncation, of any row left
     out, of the change of zones, of other wavelengths, and of one scalar mean for both
     polarisations. Light that neighbours scatter is added in both cases.
 
     Args:
         aperture: numerical aperture on the sensor.
-        model: solved rows, or constants (a, b) of the factor 1 + a p + b p².
+        model: solved rows; None for ``NEIGHBOURS``.
         polarisation: that was computed.
         nodes: wavelengths with weights.
         slanted: relative change of the coupling by oblique light.
@@ -306,8 +286,8 @@ def _neighbours(
     """
     p, _, _ = _nodes(aperture)
     uncoupled = _scalar(aperture)
-    if isinstance(model, tuple):
-        factor = 1 + model[0] * p + model[1] * p * p
+    if model is None:
+        factor = 1 + NEIGHBOURS[0] * p + NEIGHBOURS[1] * p * p
         psf = _scalar(aperture, factor)
         scattered = _scattered(aperture, factor, psf, area)
         return math.hypot(_difference(psf, uncoupled), scattered)

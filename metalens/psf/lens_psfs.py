@@ -19,12 +19,11 @@ from metalens.propagate import paths
 from metalens.psf import neighbour_coupling
 from metalens.psf import spectrum as spectra
 from metalens.psf.budget import (
-    NEIGHBOURS,
     RINGS,
     SPOKES,
-    LeftOut,
     Polarisation,
     incidence_sine,
+    neighbours_text,
     obliquity_variation,
     scalar_error,
     sine_aperture,
@@ -117,29 +116,20 @@ def from_lens(
         )
     if not view.angles_rad:
         raise PropagationError("angles_rad is empty, need one direction (x, y) or more")
-    how: dict[str, Any] = {
-        "tolerance": tolerance,
-        "polarisation": polarisation,
-        "own": LeftOut(lens.neighbours or NEIGHBOURS),
-        "provenance": provenance or Provenance(),
-    }
+    how = tolerance, polarisation, provenance or Provenance()
     if isinstance(spectrum, Source | MeasuredSpectrum):
-        return _over_spectrum(lens, view, spectrum, **how)
-    return _at_wavelengths(
-        lens,
-        view,
-        spectrum or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0),
-        **how,
-    )
+        return _over_spectrum(lens, view, spectrum, *how)
+    nodes = spectrum or spectra.single_wavelength(lens.wavelength_um)
+    return _at_wavelengths(lens, view, nodes, *how)
 
 
 def _over_spectrum(
     lens: Lens,
     view: View,
     source: Source | MeasuredSpectrum,
-    *,
     tolerance: float,
-    **how: Any,
+    polarisation: Polarisation,
+    provenance: Provenance,
 ) -> PsfStack:
     """PSF stack of a spectrum, by as few wavelengths as the tolerance needs.
 
@@ -152,49 +142,33 @@ def _over_spectrum(
         view: depths, angles and window.
         source: a diode or measured curves.
         tolerance: relative L2 error of the PSFs.
-        how: arguments of :func:`_at_wavelengths`.
+        polarisation: as for :func:`from_lens`.
+        provenance: settings and input files.
     """
     within = lens.proxy.wavelengths_um
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
-    middle_um = max(
-        float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans
-    )
-    nodes = spectra.spectral_nodes(source, path_um=middle_um, tolerance=tolerance / 2)
+    shares = [np.zeros(span.shape) for span in spans]
+    for share in shares:
+        share[:, share.shape[1] // 2, share.shape[2] // 2] = 1
     for _ in range(TRIES):
-        nodes = spectra.nodes_inside_library(nodes, source, within)
-        stack = _at_wavelengths(lens, view, nodes, tolerance=tolerance, **how)
+        rules = [
+            spectra.spectral_nodes(
+                source,
+                path_um=span.ravel(),
+                light=share.ravel(),
+                tolerance=tolerance / 2,
+            )
+            for span, share in zip(spans, shares, strict=True)
+        ]
+        longest = max(rules, key=lambda rule: len(rule.weights))
+        nodes = spectra.nodes_inside_library(longest, source, within)
+        stack = _at_wavelengths(lens, view, nodes, tolerance, polarisation, provenance)
         if stack.budget.spectrum <= tolerance / 2:
             break
-        nodes = _nodes_for(source, spans, stack, tolerance / 2)
+        shares = [light_shares(light, spans[0].shape[1:]) for light in stack.intensity]
     return dataclasses.replace(
         stack, reason=stack.reason + spectra.outside_library_text(source, within)
     )
-
-
-def _nodes_for(
-    source: Source | MeasuredSpectrum,
-    spans: list[Array],
-    stack: PsfStack,
-    tolerance: float,
-) -> SpectralNodes:
-    """The longest rule of wavelengths that any direction needs.
-
-    Args:
-        source: a diode or measured curves.
-        spans: (depth, y, x) path differences of each direction (:func:`paths_um`), um.
-        stack: PSFs, whose light weighs the places of the window.
-        tolerance: relative error of the sum over wavelengths.
-    """
-    rules = [
-        spectra.spectral_nodes(
-            source,
-            path_um=span.ravel(),
-            light=light_shares(light, span.shape[1:]).ravel(),
-            tolerance=tolerance,
-        )
-        for span, light in zip(spans, stack.intensity, strict=True)
-    ]
-    return max(rules, key=lambda rule: len(rule.weights))
 
 
 def paths_um(
@@ -328,10 +302,8 @@ def _at_wavelengths(
     lens: Lens,
     view: View,
     nodes: SpectralNodes,
-    *,
     tolerance: float,
     polarisation: Polarisation,
-    own: LeftOut,
     provenance: Provenance,
 ) -> PsfStack:
     """PSF stack at wavelengths with weights, direction by direction, with its error.
@@ -345,25 +317,20 @@ def _at_wavelengths(
         nodes: wavelengths in um with their weights.
         tolerance: relative L2 error of the PSFs of one direction.
         polarisation: ``"auto"``, ``"scalar"``, ``"flux"`` or ``"vector"``.
-        own: errors of the pillars' model by neighbours and angles.
         provenance: settings and input files.
     """
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
     budgets, parts = [], []
-    cached: tuple[float, bool] | None = None
+    mapped: tuple[float, bool] | None = None
     for angle in view.angles_rad:
         decided = _decided_polarisation(lens, angle, polarisation, tolerance)
-        response = library_incidence(lens, angle), decided == "scalar"
+        is_scalar = decided == "scalar"
         # without angles in the library all directions share the maps
-        if cached != response:
-            (phase, level), fields = all_maps(
-                lens, nodes, angle, dtype, scalar=decided == "scalar"
-            )
-            cached = response
+        if mapped != (mapped := (library_incidence(lens, angle), is_scalar)):
+            maps, fields = all_maps(lens, nodes, angle, dtype, scalar=is_scalar)
         part = psf_stack(
-            phase,
-            level,
+            *maps,
             **lens.diameters.grid._asdict(),
             wavelength_um=nodes.wavelengths_um.tolist(),
             weights=nodes.weights.tolist(),
@@ -378,24 +345,30 @@ def _at_wavelengths(
         parts.append(part)
         error = _quadrature_error(lens, view, angle, part, nodes)
         judged = dataclasses.replace(nodes, error=error)
-        budgets.append(with_model(part.budget, lens, angle, judged, decided, own))
+        budgets.append(with_model(part.budget, lens, angle, judged, decided))
     budget = worst_of_budgets(budgets)
-    stack = _concatenated(parts, provenance)
+    worst = max(parts, key=lambda part: part.error)
     words = [
-        stack.reason,
-        ABOVE if budget.computed > tolerance and stack.converged else "",
+        worst.reason,
+        ABOVE if budget.computed > tolerance and worst.error <= share else "",
         f"of {lens.one_light}: these pillars respond to x and y separately"
         if lens.one_light
         else "",
         AT_NORMAL if budget.angle else "",
-        own.words,
+        neighbours_text(lens.neighbours),
     ]
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("intensity", "energy_um2", "angles_rad", "centres_um")
+    }
     return dataclasses.replace(
-        stack,
+        worst,
+        **joined,
         tolerance=tolerance,
         error=budget.computed,
         budget=budget,
         reason="; ".join(filter(None, words)),
+        provenance=provenance,
     )
 
 
@@ -436,12 +409,11 @@ def _decided_polarisation(
     """
     if lens.hand or lens.pairs is not None or lens.one_light:
         if polarisation in ("flux", "vector"):
-            sized = (
-                "has pillars of two sizes"
-                if lens.pairs is not None
-                else f"knows {lens.one_light} alone"
-            )
-            own = "is for circular light" if lens.hand else sized
+            own = f"knows {lens.one_light} alone"
+            if lens.hand or lens.pairs is not None:
+                own = (
+                    "is for circular light" if lens.hand else "has pillars of two sizes"
+                )
             raise PropagationError(
                 f"polarisation = {polarisation!r} is for pillars that treat x and y alike; this lens {own}: take "
                 "'scalar'"
@@ -516,7 +488,7 @@ def passed_um2(
         angle_rad: field angles along x and y, rad.
         depths_um: source depths from the lens, um.
     """
-    nodes = SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    nodes = spectra.single_wavelength(lens.wavelength_um)
     level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0]
     passed = [
         (np.abs(level.numpy() * lens_stop_shadow(lens, angle_rad, z)) ** 2).sum()
@@ -544,15 +516,3 @@ def lens_stop_shadow(
     places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
     shade = lens.layers.shadow(tangents, depth_um, lens.wavelength_um, places, width)
     return np.asarray(shade)
-
-
-def _concatenated(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
-    """One stack of stacks of single directions (1, depth, y, x); the worst error."""
-    join: Any = {
-        n: np.concatenate([getattr(p, n) for p in parts])
-        for n in ("intensity", "energy_um2", "angles_rad", "centres_um")
-    }
-    worst = max(parts, key=lambda p: p.error)
-    return dataclasses.replace(
-        parts[0], **join, error=worst.error, reason=worst.reason, provenance=provenance
-    )

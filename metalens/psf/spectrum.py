@@ -86,6 +86,11 @@ class SpectralNodes:
             )
 
 
+def single_wavelength(wavelength_um: float) -> SpectralNodes:
+    """The rule of one wavelength, um."""
+    return SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
+
+
 @functools.lru_cache(maxsize=8)
 def spectral_weight(source: Source) -> tuple[Array, Array]:
     """Wavelengths (n,) in um and weights of sum 1 of a diode on a silicon sensor.
@@ -458,9 +463,9 @@ def outside_library_text(
 def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
     """Nodes (count,) and weights of the Gauss rule of a discrete weight.
 
-    It is exact for polynomials of degree 2·count - 1. Lanczos' recurrence, with its
-    vectors orthogonalised twice, gives the Jacobi matrix. Its eigenvalues are the nodes
-    (Golub and Welsch).
+    It is exact for polynomials of degree 2·count - 1. Polynomials that are orthogonal
+    under the weight, by a QR factorisation of Chebyshev polynomials, give the Jacobi
+    matrix. Its eigenvalues are the nodes (Golub and Welsch).
 
     Args:
         points: (n,) abscissas.
@@ -468,19 +473,10 @@ def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
         count: nodes, at most n.
     """
     count = min(count, len(points))
-    basis = np.zeros((count, len(points)))
-    diagonal = np.zeros(count)
-    off_diagonal = np.zeros(count)
-    q = np.sqrt(share / share.sum())
-    for i in range(count):
-        basis[i] = q
-        r = points * q
-        diagonal[i] = q @ r
-        r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
-        r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
-        off_diagonal[i] = np.linalg.norm(r)
-        q = r / off_diagonal[i] if off_diagonal[i] > 0 else r
-    # eigh reads the lower triangle alone
-    jacobi = np.diag(diagonal) + np.diag(off_diagonal[:-1], -1)
-    nodes, vectors = np.linalg.eigh(jacobi)
-    return nodes, vectors[0] ** 2 * share.sum()
+    middle, half = (points[0] + points[-1]) / 2, max(np.ptp(points) / 2, 1e-300)
+    u = (points - middle) / half
+    basis, _ = np.linalg.qr(
+        np.sqrt(share)[:, None] * np.polynomial.chebyshev.chebvander(u, count - 1)
+    )
+    nodes, vectors = np.linalg.eigh(basis.T @ (u[:, None] * basis))
+    return middle + half * nodes, vectors[0] ** 2 * share.sum()

@@ -13,7 +13,7 @@ from metalens.lens import Lens
 from metalens.psf.budget import sine_aperture
 from metalens.psf.lens_psfs import all_maps, lens_stop_shadow
 from metalens.psf.metrics import Point, fwhm
-from metalens.psf.spectrum import SpectralNodes
+from metalens.psf.spectrum import SpectralNodes, single_wavelength
 
 PLANES = 21
 RIM_WAVES = 1.75  # defocus at the rim of the first and last plane
@@ -75,7 +75,7 @@ def focus_scan(
     Accuracy: the tolerance, and 1e-3 of the peak by light outside the window (1 % of an
     Airy pattern), which is not propagated.
     """
-    waves = nodes or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    waves = nodes or single_wavelength(lens.wavelength_um)
     maps, _ = all_maps(lens, waves, (0.0, 0.0), torch.float64, scalar=True)
     shade = lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
     stop_phase = torch.from_numpy(np.angle(shade))
