@@ -5,11 +5,10 @@ inside their blocks is added as noise.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from metalens.core.arrays import Array
 from metalens.propagate.direct import add_point_waves, point_wave
@@ -24,7 +23,6 @@ FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed
 DEPTHS = 8  # largest number of depths that are sampled
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
-NEAR = 9  # pixels along a side of the neighbourhood of a pixel
 RAYS = 12  # points at which a polarisation mixing of their own is formed
 
 
@@ -35,7 +33,6 @@ class NodeLight:
     case: geometry of the window. weight: of the wavelength.
     light: (map, e, x) complex amplitudes. nodes_um: (e,), (x,) positions.
     noise: standard deviation of the field by rounding and interpolation at the pillars.
-    parts: tiles along each axis of the window.
     pupils: (component,) signs and (component, map, e, x) factors on the light, whose
     squares add up; None for the light of one map.
     """
@@ -45,7 +42,6 @@ class NodeLight:
     light: Array
     nodes_um: tuple[Array, Array]
     noise: float
-    parts: int = 1
     pupils: tuple[Array, Array] | None = None
 
 
@@ -64,14 +60,13 @@ def relative_error(waves: list[NodeLight], intensity: Array) -> float:
     count = min(max(POINTS, pixels // EVERY), max(FEWEST, int(WORK / nodes)))
     is_limited = count * nodes > WORK / 2
     light, energy, depths, points, chance = _sample(
-        waves[0], intensity, count, DEPTHS // 2 if is_limited else DEPTHS
+        intensity, count, DEPTHS // 2 if is_limited else DEPTHS
     )
     direct = sum(_direct_intensity(wave, wave.pupils, depths, points) for wave in waves)
     difference = direct / energy[:, None] - light[:, points]
-    noise = sum(
-        2 * abs(wave.weight) * wave.noise**2 * (1 / energy).sum() for wave in waves
-    )
-    total = sampled_square_error(light[:, points], chance, difference) + float(noise)
+    noise = 2 * sum(abs(wave.weight) * wave.noise**2 for wave in waves)
+    total = sampled_square_error(light[:, points], chance, difference)
+    total += noise * float((1 / energy).sum())
     return _relative_root(total, light, len(points))
 
 
@@ -90,17 +85,16 @@ def pupil_error(
 
     Accuracy: 1 to 2 times the true difference.
     """
-    light, energy, depths, points, chance = _sample(waves[0], intensity, RAYS, 2)
+    light, energy, depths, points, chance = _sample(intensity, RAYS, 2)
     changed = np.zeros((len(depths), len(points)))
     for wave in waves:
         y, x = wave.case.window_um
         for i, (row, column) in enumerate(zip(*np.divmod(points, len(x)), strict=True)):
             centre = wave.case.centre_um + np.array([x[column], y[row]])
             here = replace(wave.case, centre_um=tuple(centre.tolist()))
-            at_point = points[i : i + 1], pupils(here)(*wave.nodes_um)
             own, applied = (
-                _direct_intensity(wave, factors, depths, at_point[0])
-                for factors in (at_point[1], wave.pupils)
+                _direct_intensity(wave, factors, depths, points[i : i + 1])
+                for factors in (pupils(here)(*wave.nodes_um), wave.pupils)
             )
             changed[:, i] += (own - applied)[:, 0]
     total = sampled_square_error(light[:, points], chance, changed / energy[:, None])
@@ -125,22 +119,19 @@ def sampled_square_error(light: Array, chance: Array, difference: Array) -> floa
     return float(((difference - light * gain) ** 2 / chance).sum())
 
 
-def draw_pixels(
-    light: Array, count: int, others: Sequence[Array] = ()
-) -> tuple[Array, Array]:
+def draw_pixels(light: Array, count: int) -> tuple[Array, Array]:
     """Systematic sample of (n,) pixels, and the mean number of draws of each.
 
-    The chance goes in equal shares by the light and by other densities, its root by
-    default. All pixels are taken where ``count`` is not below their number.
+    The chance goes in equal shares by the light and by its root. All pixels are taken
+    where ``count`` is not below their number.
 
     Args:
         light: (pixel,) of sum 1. count: of pixels to draw.
-        others: (pixel,) densities of any sum.
     """
     if len(light) <= count:
         return np.arange(len(light)), np.ones(len(light))
-    shares = [light, *(others or (np.sqrt(light),))]
-    density = np.sum([share / share.sum() for share in shares], axis=0) / len(shares)
+    root = np.sqrt(light)
+    density = (light / light.sum() + root / root.sum()) / 2
     total = np.cumsum(density)
     picks = (np.arange(count) + 0.5) / count
     points = np.searchsorted(total / total[-1], picks)
@@ -148,15 +139,11 @@ def draw_pixels(
 
 
 def _sample(
-    wave: NodeLight, intensity: Array, count: int, most_depths: int
+    intensity: Array, count: int, most_depths: int
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Sample of depths and pixels at which the PSFs are computed directly.
 
-    Pixels are drawn by the light, by its root (more at the ends of tiles), and by the
-    smoothed light.
-
     Args:
-        wave: with the tiles of the window.
         intensity: (depth, y, x).
         count: of pixels. most_depths: largest number of depths.
 
@@ -169,21 +156,9 @@ def _sample(
     light = intensity[depths].astype(float)
     energy = light.sum((1, 2))
     light /= energy[:, None, None]
+    light = light.reshape(len(light), -1)
     mean = np.maximum(light.mean(0), 0.0)  # a flux may run back where it is dark
-    y, x = (np.abs(_tile_position(n, wave.parts)) for n in mean.shape)
-    edges = 1 + 9 * np.maximum(x, y[:, None]) ** 8
-    others = np.sqrt(mean) * edges, uniform_filter(mean, NEAR)
-    points, chance = draw_pixels(mean.ravel(), count, [o.ravel() for o in others])
-    return light.reshape(len(depths), -1), energy, depths, points, chance
-
-
-def _tile_position(count: int, parts: int) -> Array:
-    """(count,) positions of pixels within their tile, -1 to 1: truncated series err
-    most at its ends."""
-    if count == 1:
-        return np.zeros(1)
-    place = (np.arange(count) + 0.5) / count * min(parts, count)
-    return np.asarray(2 * (place % 1) - 1)
+    return light, energy, depths, *draw_pixels(mean, count)
 
 
 def _direct_intensity(
@@ -208,12 +183,9 @@ def _direct_intensity(
     wy, wx = case.window_um
     row, column = np.divmod(points, len(wx))
     places = np.stack([wx[column], wy[row]], -1) + np.array(case.centre_um)
-    fields = np.zeros((len(light) * len(depths), len(places)), complex)
-    point_waves = point_wave(case, places)
-    add_point_waves(
-        light.reshape(-1, len(e), len(x)), (e, x), places, point_waves, fields
-    )
+    fields = np.zeros((*light.shape[:2], len(places)), complex)
+    sources = light.reshape(-1, *light.shape[2:])
+    targets = fields.reshape(len(sources), -1)  # shares their memory
+    add_point_waves(sources, (e, x), places, point_wave(case, places), targets)
     power = np.abs(fields * case.area_um2) ** 2
-    return np.asarray(
-        wave.weight * np.tensordot(signs, power.reshape(len(light), len(depths), -1), 1)
-    )
+    return np.asarray(wave.weight * np.tensordot(signs, power, 1))

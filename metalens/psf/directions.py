@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft, sparse, special
@@ -129,13 +130,12 @@ def far_field(
         power, p, orders if lens.diameters.lattice.centred else []
     )
     radius, airy = _beam_sine(lens, wave)
-    exact = _Sum(light, steps, wave)
     share, rings = _squares(power, p, square, count)
     return FarField(
         share / total,
         square * (np.arange(count) - samples // 2),
         rings / total,
-        _beams(exact, power, p, radius, total),
+        _beams((light, steps, wave), power, p, radius, total),
         radius,
         1
         - special.j0(math.pi * radius / airy) ** 2
@@ -295,7 +295,11 @@ def _overlap(axis: Array, square: float, count: int) -> sparse.csr_array:
 
 
 def _beams(
-    exact: "_Sum", power: Array, p: tuple[Array, Array], radius: float, total: float
+    lens: tuple[Array, tuple[float, float], float],
+    power: Array,
+    p: tuple[Array, Array],
+    radius: float,
+    total: float,
 ) -> tuple[DiffractedBeam, ...]:
     """Brightest beams in turn, the circle of each set to 0 before the next is searched.
 
@@ -304,7 +308,7 @@ def _beams(
     ``LEAST`` of the light.
 
     Args:
-        exact: sum over pillars that refines each direction.
+        lens: (y, x) light, steps in um and wavelength, for :func:`_plain_power`.
         power: (y, x) |F|² of the transform.
         p: (x, y) direction cosines of its samples.
         radius: of a circle, direction cosine.
@@ -326,63 +330,59 @@ def _beams(
         if light < LEAST * total:
             break
         if inner >= SPOT * light:
-            peak = exact.peak(x[j], y[i], x[1] - x[0], y[1] - y[0])
-            beams.append(DiffractedBeam(*peak, light / total))
+            beams.append(DiffractedBeam(*_peak(lens, p, (i, j)), light / total))
         power[window] = np.where(distance <= radius, 0, power[window])
     return tuple(beams)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Sum:
-    """The plain sum over pillars, float64, at any directions."""
+def _plain_power(
+    lens: tuple[Array, tuple[float, float], float], sine_x: Array, sine_y: Array
+) -> Array:
+    """(y, x) |F|² of the plain sum over pillars, float64, at any direction cosines.
 
-    light: Array
-    steps: tuple[float, float]
-    wavelength_um: float
-
-    def power(self, sine_x: Array, sine_y: Array) -> Array:
-        """(y, x) |F|² up to the factor of the transform."""
-        ex, ey = (
-            np.exp(
-                -2j
-                * math.pi
-                * step
-                / self.wavelength_um
-                * np.outer(np.arange(n), sines)
-            )
-            for sines, step, n in zip(
-                (sine_x, sine_y), self.steps, self.light.shape[::-1], strict=True
-            )
+    Args:
+        lens: (y, x) light, (x, y) steps and wavelength in um.
+        sine_x, sine_y: direction cosines along each axis.
+    """
+    light, steps, wavelength_um = lens
+    ex, ey = (
+        np.exp(-2j * math.pi * step / wavelength_um * np.outer(np.arange(n), sines))
+        for sines, step, n in zip(
+            (sine_x, sine_y), steps, light.shape[::-1], strict=True
         )
-        total = np.zeros((len(sine_y), len(sine_x)), complex)
-        for start in range(0, len(self.light), _ROWS):
-            rows = slice(start, start + _ROWS)
-            total += ey[rows].T @ (self.light[rows].astype(complex) @ ex)
-        return np.asarray(np.abs(total) ** 2)
+    )
+    total = np.zeros((len(sine_y), len(sine_x)), complex)
+    for start in range(0, len(light), _ROWS):
+        rows = slice(start, start + _ROWS)
+        total += ey[rows].T @ (light[rows].astype(complex) @ ex)
+    return np.asarray(np.abs(total) ** 2)
 
-    def peak(
-        self, sine_x: float, sine_y: float, step_x: float, step_y: float
-    ) -> tuple[float, float]:
-        """(x, y) direction cosines of the maximum of |F|² near a sample.
 
-        A parabola along each axis, through the largest of sums at a quarter of the
-        sample's step.
+def _peak(
+    lens: tuple[Array, tuple[float, float], float],
+    p: tuple[Array, Array],
+    at: tuple[Any, Any],
+) -> tuple[float, float]:
+    """(x, y) direction cosines of the maximum of |F|² near a sample.
 
-        Args:
-            sine_x, sine_y: direction cosines of the sample.
-            step_x, step_y: steps of the samples.
-        """
-        offsets = np.arange(-4, 5) / 4
-        power = self.power(sine_x + offsets * step_x, sine_y + offsets * step_y)
-        i, j = (
-            int(v) for v in np.unravel_index(int(power[1:-1, 1:-1].argmax()), (7, 7))
-        )
-        column = power[i : i + 3, j + 1]
-        row = power[i + 1, j : j + 3]
-        dx, dy = (
-            0.5 * (v[0] - v[2]) / min(v[0] - 2 * v[1] + v[2], -1e-300)
-            for v in (row, column)
-        )
-        x = sine_x + (offsets[j + 1] + dx / 4) * step_x
-        y = sine_y + (offsets[i + 1] + dy / 4) * step_y
-        return x, y
+    A parabola along each axis, through the largest of sums at a quarter of the sample's
+    step.
+
+    Args:
+        lens: as :func:`_plain_power`.
+        p: (x, y) direction cosines of all samples.
+        at: (row, column) of the sample.
+    """
+    offsets = np.arange(-4, 5) / 4
+    x, y = (
+        axis[i] + offsets * (axis[1] - axis[0])
+        for axis, i in zip(p, at[::-1], strict=True)
+    )
+    power = _plain_power(lens, x, y)
+    i, j = np.unravel_index(int(power[1:-1, 1:-1].argmax()), (7, 7))
+    peaks = []
+    for axis, first, line in ((x, j, power[i + 1]), (y, i, power[:, j + 1])):
+        low, middle, high = line[first : first + 3]
+        shift = 0.5 * (low - high) / min(low - 2 * middle + high, -1e-300)
+        peaks.append(float(axis[first + 1] + shift * (axis[1] - axis[0])))
+    return peaks[0], peaks[1]

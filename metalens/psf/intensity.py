@@ -357,7 +357,8 @@ def _of_point(request: IntensityRequest) -> IntensityResult:
 def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
     """Exact sum over pillars, Σ weight · |U|² over wavelengths and components.
 
-    Its error is that of float64: half an epsilon of the largest phase for each pillar.
+    Its error is that of float64: half an epsilon of the largest phase for each pillar,
+    as noise whose power is that share of the light of all pillars.
 
     Args:
         request: maps, cases and weights of the wavelengths.
@@ -365,16 +366,13 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
     """
     total: Any = 0.0
     power = 0.0
-    noise = 0.0
+    largest = 0.0
     checked = []
     for (phase, level), case, weight, pupils in request.each():
         phase, level = phase.double(), level.double()
-        powers = (level**2).sum((-1, -2)).tolist()
-        power += weight * request.power(case, powers, level)
-        angle = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
-        angle += float((phase.abs() * (level != 0)).max())
-        rounding = np.finfo(float).eps / 2 * angle
-        noise = max(noise, rounding * _incoherent(sum(powers), case))
+        power += weight * request.power(case, (level**2).sum((-1, -2)).tolist(), level)
+        path = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
+        largest = max(largest, path + float((phase.abs() * (level != 0)).max()))
         if request.own_mixing is not None:
             checked.append(_pillar_light((phase, level), case, weight, pupils))
         for sign, light in mix_components(
@@ -382,23 +380,14 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
         ):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-    error = math.hypot(EXACT, _noise_error(total, noise))
+    case = request.cases[0]
+    energy = max(float(total.sum((1, 2)).min()) * case.step_um**2, 1e-300)
+    noise = np.finfo(float).eps * largest * math.sqrt(power * case.area_um2 / energy)
+    error = math.hypot(EXACT, noise)
     budget = Budget(error, polarisation=_mixing_error(request, checked, total))
     return IntensityResult(
         torch.as_tensor(total), budget, reason, np.full(len(total), power)
     )
-
-
-def _noise_error(light: Array, noise: float) -> float:
-    """Twice the relative L2 error of PSFs by noise n on the field U: that of 2 Re U* n.
-
-    Args:
-        light: (depth, y, x) |U|².
-        noise: standard deviation of n at each sample.
-    """
-    whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
-    share, square = light / whole[:, None, None], 2 * noise**2 / whole
-    return 2 * math.sqrt(float(square.sum() / (share**2).sum()))
 
 
 def _pillar_light(
@@ -462,10 +451,7 @@ def _windowed(
         rounding = plan.moments.carrier.rounding_rad
         noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
         noise *= _incoherent(_noisy_power(powers, mixing_at_nodes), case)
-        parts = 1 if is_wide else plan.layout.parts
-        checked.append(
-            NodeLight(case, weight, nodes, at_um, noise, parts, mixing_at_nodes)
-        )
+        checked.append(NodeLight(case, weight, nodes, at_um, noise, mixing_at_nodes))
         light = light if weight == 1 else weight * light
         total = light if total is None else total + light
         power += weight * request.power(case, powers, maps[1])

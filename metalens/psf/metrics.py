@@ -1,7 +1,7 @@
 """What a PSF stack is worth: modulation transfer, width, and the figures of a focus."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -189,12 +189,21 @@ def half_maximum(light: Array, peak: tuple[float, float, float]) -> tuple[float,
         return float(ring.mean()) / top - 0.5
 
     widest = min(row, column, light.shape[0] - 1 - row, light.shape[1] - 1 - column)
-    radii = np.arange(0.0, max(widest, 0.0), 0.25)
-    below = next((float(r) for r in radii if above(float(r)) < 0), None)
+    half, slope = _half_crossing(above, np.arange(0.0, max(widest, 0.0), 0.25))
+    return 2 * half, slope
+
+
+def _half_crossing(
+    above: Callable[[float], float], steps: Array
+) -> tuple[float, float]:
+    """First zero of a function along ascending steps, and its fall per unit there; nan
+    where there is none.
+    """
+    below = next((i for i, at in enumerate(steps) if above(float(at)) < 0), None)
     if below is None:
         return math.nan, math.nan
-    half = float(optimize.brentq(above, max(below - 0.25, 0.0), below))
-    return 2 * half, (above(0.95 * half) - above(1.05 * half)) / (0.1 * half)
+    zero = float(optimize.brentq(above, steps[max(below - 1, 0)], steps[below]))
+    return zero, (above(0.95 * zero) - above(1.05 * zero)) / (0.1 * zero)
 
 
 def _at(spline: Array, row: Array | float, column: Array | float) -> Array:
@@ -246,9 +255,5 @@ def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, flo
         return abs(complex(line @ np.exp(-2j * np.pi * frequency * x))) / total - 0.5
 
     steps = np.linspace(0, min(cutoff_per_um, 0.5 / step_um), 201)
-    below = next((i for i, f in enumerate(steps) if above(float(f)) < 0), None)
-    if below is None:
-        return math.nan, math.nan
-    frequency_50 = float(optimize.brentq(above, steps[below - 1], steps[below]))
-    fall = above(0.95 * frequency_50) - above(1.05 * frequency_50)
-    return frequency_50, 0.1 * frequency_50 / fall
+    frequency_50, fall = _half_crossing(above, steps)
+    return frequency_50, 1 / fall

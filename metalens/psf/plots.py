@@ -51,6 +51,11 @@ def _angle_name(angle: Array) -> str:
     return f"{x:.3g}°" if abs(y) < 1e-9 else f"({x:.3g}°, {y:.3g}°)"
 
 
+def _picked(count: int, most: int) -> Array:
+    """At most so many of count indices, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
 def _depth_name(depth_um: float) -> str:
     return "∞" if np.isinf(depth_um) else f"{depth_um * 1e-3:.3g} mm"
 
@@ -79,9 +84,7 @@ def plot_slices(stack: PsfStack) -> bytes:
         )
         panel.set(title=_angle_name(angle), xlabel="x from the window's middle / µm")
         panel.grid(False)
-    picks = np.unique(
-        np.linspace(0, len(depths) - 1, min(len(depths), 6)).round().astype(int)
-    )
+    picks = _picked(len(depths), 6)
     axes[0, 0].set_yticks(picks, [_depth_name(depths[order][i]) for i in picks])
     axes[0, 0].set_ylabel("source depth")
     figure.suptitle("PSF along depth (each depth at its own full scale)", fontsize=10)
@@ -96,11 +99,7 @@ def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
         stack: PSFs over angle, depth and wavelength. most: depths that are drawn.
     """
     light = _by_angle(stack)
-    picks = np.unique(
-        np.linspace(0, len(stack.depths_um) - 1, min(most, len(stack.depths_um)))
-        .round()
-        .astype(int)
-    )
+    picks = _picked(len(stack.depths_um), most)
     size = (1.3 * len(picks) + 0.7, 1.35 * len(light) + 0.6)
     figure, axes = make_figure(len(light), len(picks), size=size, squeeze=False)
     across, down = (stack.step_um * n / 2 for n in light.shape[:-3:-1])
@@ -144,21 +143,10 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
     for style, angle in zip(("-", "--"), angles, strict=False):
         for colour, i in enumerate(depths):
             name = f"{_depth_name(stack.depths_um[i])}, {_angle_name(stack.angles_rad[angle])}"
-            axes[0].plot(
-                frequency * 1e3,
-                curves[angle, i, 0],
-                style,
-                color=f"C{colour}",
-                label=name,
-            )
-            axes[0].plot(
-                frequency * 1e3,
-                curves[angle, i, 1],
-                style,
-                color=f"C{colour}",
-                lw=0.6,
-                alpha=0.7,
-            )
+            for curve, width in zip(curves[angle, i], (1.5, 0.6), strict=True):
+                axes[0].plot(
+                    frequency * 1e3, curve, style, color=f"C{colour}", lw=width
+                )
             energy = _encircled(stack, light[angle, i], radius)
             axes[1].plot(radius, energy, style, color=f"C{colour}", label=name)
     if limit is not None:

@@ -12,10 +12,11 @@ import numpy as np
 
 from metalens.core import reading
 from metalens.core.arrays import Array
-from metalens.core.errors import MaterialError, PropagationError
+from metalens.core.errors import PropagationError
 
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
+LINE_POINTS = 601  # of the line of a diode
 PATHS = 129  # from 0 to the longest, at which a rule is judged
 SUM_ERROR = 1e-6  # of the sum of weights: a relative error of all light
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
@@ -96,7 +97,7 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
     """Wavelengths (n,) in um and weights of sum 1 of a diode on a silicon sensor.
 
     weight ∝ exp(-4 ln 2 ((λ - peak) / FWHM)²) λ (1 - exp(-4π k thickness / λ)) over
-    ±2.5 FWHM, every 0.25 nm or FWHM / 40, whichever is less.
+    ±2.5 FWHM, at ``LINE_POINTS`` even steps.
 
     Args:
         source: peak, width and thickness of silicon.
@@ -106,20 +107,7 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
     """
     from metalens.cell import materials
 
-    step_nm = min(0.25, source.fwhm_nm / 40)
-    for end_nm in (
-        source.peak_nm - 2.5 * source.fwhm_nm,
-        source.peak_nm + 2.5 * source.fwhm_nm,
-    ):
-        try:  # before an absurd width takes memory
-            materials.index("Si", end_nm * 1e-3)
-        except MaterialError as error:
-            raise MaterialError(
-                f"a source at {source.peak_nm:g} nm with fwhm_nm = {source.fwhm_nm:g} reaches to {end_nm:g} nm, where "
-                f"the sensor's silicon is not known; {error}"
-            ) from None
-    count = round(2.5 * source.fwhm_nm / step_nm)
-    widths = np.arange(-count, count + 1) * step_nm / source.fwhm_nm
+    widths = np.linspace(-2.5, 2.5, LINE_POINTS)
     um = (source.peak_nm + widths * source.fwhm_nm) * 1e-3
     k = np.array([materials.index("Si", w).imag for w in um])
     response = um * (1 - np.exp(-4 * np.pi * k * source.silicon_um / um))
@@ -146,8 +134,8 @@ def read_measured_spectrum(
     """Normalised product of measured curves (LED, filter, sensor), where all exist.
 
     A file has two columns, wavelength in nm and value, separated by commas, semicolons
-    or blanks. Lines that start with # or with a word are skipped. Where semicolons,
-    tabs or blanks separate the columns, a comma is the decimal point.
+    or blanks. Names of columns and lines that start with # are skipped. Where
+    semicolons, tabs or blanks separate the columns, a comma is the decimal point.
 
     Values are interpolated linearly. The product is integrated by two-point Gauss rules
     between the rows of all curves, and over 0.25 nm at most. A constant factor of each
@@ -187,41 +175,21 @@ def read_measured_spectrum(
             f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere"
         )
     share = share / share.sum()
-    first, last = _range_within(nm, value, within_um)
-    nm = nm[first:last]
-    share = share[first:last]
-    outside = max(0.0, 1 - float(share.sum()))
-    return MeasuredSpectrum(nm * 1e-3, share / share.sum(), outside)
+    um = nm * 1e-3
+    bright = value > 1e-4 * value.max()
+    inside = bright
+    if within_um[1] > within_um[0]:
+        inside = _is_within(um, within_um) & (value > 0)
+    if (bright & ~inside).any():
+        band = um[bright], value[bright] / value[bright].sum()
+        raise _refusal(band, within_um, "narrow it (a filter among the files)")
+    kept = float(share[inside].sum())
+    return MeasuredSpectrum(um[inside], share[inside] / kept, max(0.0, 1 - kept))
 
 
-def _range_within(
-    nm: Array, value: Array, within_um: tuple[float, float]
-) -> tuple[int, int]:
-    """Index of the first point within the pillars' library, and of the last plus one.
-
-    A library of one wavelength cuts nothing off but points below 1e-4 of the largest.
-
-    Args:
-        nm: (n,) wavelengths, ascending.
-        value: (n,) of the spectrum.
-        within_um: (least, largest) wavelength of the library.
-
-    Raises:
-        PropagationError: points above 1e-4 of the largest lie outside.
-    """
-    bright = np.flatnonzero(value > 1e-4 * value.max())
-    low, high = (edge * 1e3 for edge in within_um)
-    if not high > low:
-        return int(bright[0]), int(bright[-1]) + 1
-    if not (low - 1e-3 <= nm[bright[0]] and nm[bright[-1]] <= high + 1e-3):
-        band = slice(int(bright[0]), int(bright[-1]) + 1)
-        raise _refusal(
-            (nm[band], value[band] / value[band].sum()),
-            within_um,
-            "narrow it (a filter among the files)",
-        )
-    inside = np.flatnonzero((nm >= low - 1e-3) & (nm <= high + 1e-3) & (value > 0))
-    return int(inside[0]), int(inside[-1]) + 1
+def _is_within(um: Array, within_um: tuple[float, float]) -> Array:
+    """Whether wavelengths lie in the range of a library, to 1e-6 um."""
+    return np.asarray((um >= within_um[0] - 1e-6) & (um <= within_um[1] + 1e-6))
 
 
 def _curve(file: Path) -> Array:
@@ -239,18 +207,14 @@ def _curve(file: Path) -> Array:
         ) from None
     for number, line in enumerate(lines, 1):
         words = reading.split_columns(line)
-        if (
-            not words
-            or words[0][0] in "#\"'"
-            or (words[0][0].isalpha() and not _number(words[0]))
-        ):
+        if not words or words[0][0] in "#\"'":
             continue
         try:
             nm, value = float(words[0]), float(words[1])
         except (ValueError, IndexError):
-            raise PropagationError(
-                f"{file}: line {number} is {line[:60]!r}, need wavelength in nm and value"
-            ) from None
+            if not rows:  # names of columns
+                continue
+            nm = value = math.nan
         if not (100 <= nm < np.inf and 0 <= value < np.inf):
             raise PropagationError(
                 f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 or more) and a value of 0 or "
@@ -262,21 +226,9 @@ def _curve(file: Path) -> Array:
             f"{file}: {len(rows)} rows, need two or more of wavelength in nm and value; a single line is wavelengths_nm"
         )
     table = np.array(sorted(rows))
-    repeated = np.flatnonzero(np.diff(table[:, 0]) == 0)
-    if len(repeated):
-        raise PropagationError(
-            f"{file}: {table[repeated[0], 0]:g} nm stands twice; need one value for each wavelength"
-        )
+    if not (np.diff(table[:, 0]) > 0).all():
+        raise PropagationError(f"{file}: need one value for each wavelength")
     return table
-
-
-def _number(word: str) -> bool:
-    """Whether a word is a number, nan or inf: a row, not a name of columns."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def spectral_nodes(
@@ -373,7 +325,7 @@ def share_outside_library(
     if not high > low or not isinstance(source, Source | MeasuredSpectrum):
         return 0.0
     um, share = spectrum_points(source)
-    return float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
+    return float(share[~_is_within(um, within_um)].sum())
 
 
 def nodes_inside_library(
@@ -397,17 +349,12 @@ def nodes_inside_library(
     if ((low - 1e-9 <= um) & (um <= high + 1e-9)).all():
         return nodes
     narrow = "narrow it (a filter among the files)"
-    if isinstance(
-        source, Source
-    ):  # no wavelength that stands for it lies beyond 2.5 widths
+    if isinstance(source, Source):  # no node lies beyond 2.5 widths
         width = min(source.peak_nm - low * 1e3, high * 1e3 - source.peak_nm) / 2.5
-        narrow = (
-            f"narrow it to a width of {math.floor(width * 10) / 10:g} nm"
-            if width >= LEAST_FWHM_NM
-            else ""
-        )
-    um, share = spectrum_points(source)
-    raise _refusal((um * 1e3, share), within_um, narrow)
+        narrow = ""
+        if width >= LEAST_FWHM_NM:
+            narrow = f"narrow it to a width of {math.floor(width * 10) / 10:g} nm"
+    raise _refusal(spectrum_points(source), within_um, narrow)
 
 
 def _refusal(
@@ -416,28 +363,22 @@ def _refusal(
     """The error for light outside the pillars' library, with its share and the cure.
 
     Args:
-        light: wavelengths in nm, ascending, and shares of sum 1.
+        light: wavelengths in um, ascending, and shares of sum 1.
         within_um: (least, largest) wavelength of the library.
         narrow: words for how to narrow the spectrum; may be empty.
     """
-    nm, share = light
+    um, share = light
     low, high = (edge * 1e3 for edge in within_um)
-    library = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
-    part = (
-        float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum())
-        if high > low
-        else 1.0
-    )
+    library, part = f"at {low:g} nm alone", 1.0
+    if high > low:
+        library = f"from {low:g} to {high:g} nm"
+        part = float(share[~_is_within(um, within_um)].sum())
+    ends = math.floor(um[0] * 1e3) / 1e3, math.ceil(um[-1] * 1e3) / 1e3
     return PropagationError(
-        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {library}, and {part:.2g} of it lies "
-        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {library_sweep_hint(nm)})"
+        f"spectrum: light from {um[0] * 1e3:g} to {um[-1] * 1e3:g} nm, the pillars are known {library}, and {part:.2g} "
+        f"of it lies beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it "
+        f"([sweep] wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}])"
     )
-
-
-def library_sweep_hint(nm: Array) -> str:
-    """The key of CELL.toml that sweeps a library over wavelengths (n,), nm, ascending."""
-    ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
-    return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 
 
 def outside_library_text(
