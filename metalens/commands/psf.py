@@ -172,21 +172,10 @@ class PsfSettings:
 
     @property
     def samples_y(self) -> int:
-        """Samples along y."""
-        if not self.height_um:
+        """Samples along y, of a window with a width."""
+        if not self.height_um or self.window_um is None:
             return self.samples
-        return round(self.height_um / self.width_um * self.samples)
-
-    @property
-    def width_um(self) -> float:
-        """Of the window.
-
-        Raises:
-            ConfigError: it is that of a lens, and no lens was named (:meth:`about`).
-        """
-        if self.window_um is None:
-            raise ConfigError("window_um is left to the lens, and there is none")
-        return self.window_um
+        return round(self.height_um / self.window_um * self.samples)
 
     def about(
         self, device: lens.Lens, angles_rad: Array | None = None
@@ -227,31 +216,25 @@ class PsfSettings:
         """Depths, angles, window and source in um and rad.
 
         Raises:
-            ConfigError: depths, angles or window are left to the lens, and no lens was
-            named
-                (:meth:`about`).
+            ConfigError: what is left to the lens was not filled in (:meth:`about`).
         """
-        if self.sources_mm:
-            depths = np.array(self.sources_mm) * 1e3
-        elif self.depths_mm is None:
-            raise ConfigError("depths_mm are left to the lens, and there is none")
-        else:
+        depths = np.array(self.sources_mm)
+        if not self.sources_mm and self.depths_mm:
             near, far, step = self.depths_mm
-            intervals = int(np.ceil((far - near) / step - 1e-9))
-            depths = np.linspace(near, far, intervals + 1) * 1e3
-        if self.angles_deg is None:
-            raise ConfigError("angles_deg are left to the lens, and there is none")
+            depths = np.linspace(
+                near, far, int(np.ceil((far - near) / step - 1e-9)) + 1
+            )
+        if not depths.size or self.angles_deg is None or self.window_um is None:
+            raise ConfigError("depths, angles or window are left to a lens")
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
-        pairs = [
-            tuple(np.deg2rad([x, y]).tolist())
-            for x, y in zip(self.angles_deg, along_y, strict=True)
+        angles = [
+            propagate.to_angle_pair(np.deg2rad(pair))
+            for pair in zip(self.angles_deg, along_y, strict=True)
         ]
-        angles = tuple(propagate.to_angle_pair(pair) for pair in pairs)
-        window = self.width_um, self.width_um / self.samples * self.samples_y
         return psf.View(
-            tuple(depths.tolist()),
-            angles,
-            window,
+            tuple((depths * 1e3).tolist()),
+            tuple(angles),
+            (self.window_um, self.window_um / self.samples * self.samples_y),
             (self.samples, self.samples_y),
             self.offset_um,
             self.source,
@@ -562,10 +545,8 @@ def _write(path: Path, computed: ComputedPsfs, *, page: bool) -> None:
     from metalens.psf import plots as psf_plots
 
     psf_export.export_psf(path, computed.stack)
-    limit = max(
-        (metrics.limit for metrics in computed.figures),
-        key=lambda limit: limit.cutoff_per_um,
-    )
+    limits = (metrics.limit for metrics in computed.figures)
+    limit = max(limits, key=lambda limit: limit.cutoff_per_um)
     pictures = psf_plots.psf_pictures(computed.stack, limit=limit, scan=computed.scan)
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
@@ -607,8 +588,9 @@ def _of_built(path: Path, settings: PsfSettings, built: Any) -> psf.PsfStack:
                 "were fitted"
             )
     if settings.polarisation in ("flux", "vector"):
-        stated = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
-        raise ConfigError(f"{path}: {stated}")
+        raise ConfigError(
+            f"{path}: polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
+        )
     stack: psf.PsfStack = built.psf_stack(settings.view, tolerance=settings.tolerance)
     posterior = built.psf_posterior(settings.view)
     budget = replace(stack.budget, posterior=posterior)
@@ -637,10 +619,11 @@ def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens
         return device
     if device.pairs is not None:
         return device.for_polarization(settings.light)
-    response = (
-        f"know {device.one_light} alone" if device.one_light else "treat x and y alike"
-    )
-    response = "are turned, for circular light" if device.hand else response
+    response = f"know {device.one_light} alone"
+    if device.hand or not device.one_light:
+        response = (
+            "are turned, for circular light" if device.hand else "treat x and y alike"
+        )
     raise ConfigError(
         f"{path}: light = {settings.light!r} is for pillars of two sizes; these {response}"
     )

@@ -1,6 +1,7 @@
 from . import paths as paths
 from .choice import MethodChoice as MethodChoice
 from .choice import choose_method as choose_method
+from .choice import light_on_window as light_on_window
 from .choice import windowed as windowed
 from .direct import exact as exact
 from .direct import field_at as field_at
@@ -23,8 +24,6 @@ from .paths import chief_path as chief_path
 from .paths import ray_cosines as ray_cosines
 from .paths import rayleigh_sommerfeld_kernel as rayleigh_sommerfeld_kernel
 from .sincos import sincos_turns32 as sincos_turns32
-from .wide import light_wide as light_wide
 from .wide import plan_wide as plan_wide
 from .window import field_windowed as field_windowed
-from .window import light_windowed as light_windowed
 from .window import plan_window as plan_window

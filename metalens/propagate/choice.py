@@ -6,12 +6,18 @@ from typing import Any
 
 import torch
 
-from metalens.core.arrays import to_tensor
+from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
 from metalens.propagate.geometry import PropagationCase, make_case
-from metalens.propagate.wide import is_wide, wide_axes
-from metalens.propagate.window import field_windowed, plan_layout, plan_window
+from metalens.propagate.moments import Pupils, mix_components, reduce_to_moments
+from metalens.propagate.wide import WidePlan, is_wide, wide_axes
+from metalens.propagate.window import (
+    WindowPlan,
+    field_windowed,
+    plan_layout,
+    plan_window,
+)
 
 EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
 
@@ -61,6 +67,34 @@ def choose_method(
                 raise
             return MethodChoice("wide", "window by Fourier transforms")
     return MethodChoice("windowed", f"windowed: {rows} x {columns} nodes")
+
+
+def light_on_window(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    plan: WindowPlan | WidePlan,
+    pupils: Pupils | None = None,
+) -> tuple[torch.Tensor, Array, list[float]]:
+    """Irradiance on the window, Σ_c sign_c |field_c|², differentiable once.
+
+    Args:
+        maps: (map, y, x) phase in rad, and transmission.
+        plan: of :func:`plan_window` or :func:`plan_wide`.
+        pupils: factors on the light of the maps (of a window with a ``smooth`` plan);
+            None for the |U|² of one map.
+
+    Returns:
+        Irradiance (depth, y, x); light of every map on the nodes of the posterior
+        error; sums of squares of the transmissions.
+    """
+    reduced = [reduce_to_moments(*one, plan.moments) for one in zip(*maps, strict=True)]
+    moments = torch.stack([one_map for one_map, _ in reduced])
+    parts = mix_components(plan.on_nodes(moments), pupils, plan.whole_um)
+    total: Any = None
+    for sign, light in parts:
+        irradiance = plan.irradiance(light)
+        irradiance = irradiance if sign == 1 else sign * irradiance
+        total = irradiance if total is None else total + irradiance
+    return total, plan.on_judged_nodes(moments), [power for _, power in reduced]
 
 
 def windowed(

@@ -156,38 +156,28 @@ def axis_positions(count: int, step: float) -> Array:
     return (np.arange(count) - (count - 1) / 2) * step
 
 
-def window_tiles(
-    case: PropagationCase, parts: int
-) -> tuple[tuple[list[int], list[int]], tuple[tuple[PropagationCase, ...], ...]]:
-    """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size:
-    neighbours may overlap.
+def window_tiles(case: PropagationCase, parts: int) -> list[list[PropagationCase]]:
+    """Rows of tiles that cut the window into at most ``parts`` along each axis.
 
     Args:
         case: geometry of the propagation.
+        parts: tiles along an axis with as many samples or more.
     """
-    firsts, sizes = [], []
-    for count in case.samples:
-        tiles = min(parts, count)
-        sizes.append(-(-count // tiles))
-        firsts.append(
-            [i * (count - sizes[-1]) // max(tiles - 1, 1) for i in range(tiles)]
-        )
-    (my, mx), (rows, columns), (x, y) = case.samples, sizes, case.centre_um
-    tiles_of_rows = tuple(
-        tuple(
+    rows, columns = (
+        np.array_split(axis + centre, min(parts, len(axis)))
+        for axis, centre in zip(case.window_um, case.centre_um[::-1], strict=True)
+    )
+    return [
+        [
             replace(
                 case,
-                centre_um=(
-                    x + (first_x + (columns - mx) / 2) * case.step_um,
-                    y + (first_y + (rows - my) / 2) * case.step_um,
-                ),
-                samples=(rows, columns),
+                centre_um=(float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2),
+                samples=(len(y), len(x)),
             )
-            for first_x in firsts[1]
-        )
-        for first_y in firsts[0]
-    )
-    return (firsts[0], firsts[1]), tiles_of_rows
+            for x in columns
+        ]
+        for y in rows
+    ]
 
 
 def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> None:

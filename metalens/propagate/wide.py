@@ -19,13 +19,7 @@ from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
 from metalens.optics import media
 from metalens.propagate.geometry import PropagationCase
-from metalens.propagate.moments import (
-    PillarMoments,
-    Pupils,
-    mix_components,
-    plan_moments,
-    reduce_to_moments,
-)
+from metalens.propagate.moments import PillarMoments, plan_moments
 from metalens.propagate.paths import (
     over_blocks,
     ray_cosines,
@@ -386,6 +380,23 @@ class WidePlan:
         y, x = (grid_um(axis) for axis in self.axes)
         return y, x
 
+    whole_um = judged_um
+
+    def on_nodes(self, moments: torch.Tensor) -> torch.Tensor:
+        """(…, y, x) light on the grid: the moments themselves."""
+        return moments
+
+    def on_judged_nodes(self, moments: torch.Tensor) -> Array:
+        """(…, y, x) light on the grid."""
+        return moments.detach().numpy().astype(complex)
+
+    def irradiance(self, light: torch.Tensor) -> torch.Tensor:
+        """(depth, y, x) irradiance on the window from light (y, x) on the grid."""
+        fields, coefficients = self.fields, self.coefficients
+        if not light.requires_grad:
+            fields, coefficients = _fewer_fields(light, self)
+        return _mix_depths(fields_wide(light, fields, self), coefficients)
+
 
 @functools.lru_cache(maxsize=2)
 def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
@@ -553,37 +564,6 @@ def _fade(axis: WideAxis, excess: Array) -> Array:
         scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * excess / axis.guard - 1))
         / 2
     )
-
-
-def light_wide(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    plan: WidePlan,
-    pupils: Pupils | None = None,
-) -> tuple[torch.Tensor, Array, list[float]]:
-    """Irradiance on a wide window, Σ_c sign_c |field_c|², once differentiable.
-
-    Args:
-        maps: (map, y, x) phase in rad, and transmission.
-        plan: of :func:`plan_wide`.
-        pupils: factors on the light of the maps; None for the |U|² of one map.
-
-    Returns:
-        Irradiance (depth, y, x); light of every map on the lens grid; sums of squares
-        of the transmissions.
-    """
-    reduced = [
-        reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
-    ]
-    grid, total = torch.stack([g for g, _ in reduced]), None
-    for sign, light in mix_components(grid, pupils, plan.judged_um):
-        fields, coefficients = plan.fields, plan.coefficients
-        if not light.requires_grad:
-            fields, coefficients = _fewer_fields(light, plan)
-        irradiance = _mix_depths(fields_wide(light, fields, plan), coefficients)
-        irradiance = irradiance if sign == 1 else sign * irradiance
-        total = irradiance if total is None else total + irradiance
-    powers = [power for _, power in reduced]
-    return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
 def _fewer_fields(

@@ -17,13 +17,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
 from metalens.propagate.geometry import PropagationCase, window_tiles
-from metalens.propagate.moments import (
-    PillarMoments,
-    Pupils,
-    mix_components,
-    plan_moments,
-    reduce_to_moments,
-)
+from metalens.propagate.moments import PillarMoments, plan_moments, reduce_to_moments
 from metalens.propagate.paths import (
     chief_path,
     from_source,
@@ -95,7 +89,7 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout:
     most_parts = min(MOST_PARTS, max(case.samples))
     while True:
         parts = min(parts, most_parts)
-        rows = window_tiles(case, parts)[1]
+        rows = window_tiles(case, parts)
         tiles = {tile for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])}
         # the tile below the lens is seen under the largest angle
         tiles.add(min(itertools.chain(*rows), key=lambda t: math.hypot(*t.centre_um)))
@@ -467,6 +461,24 @@ class WindowPlan:
         ny, nx = self.layout.nodes
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
 
+    def on_nodes(self, moments: torch.Tensor) -> torch.Tensor:
+        """(…, e, x) light on the nodes of the whole window from moments (…, m, n)."""
+        ny, nx = self.layout.nodes
+        left, right = self.tensors["rows_to_nodes"], self.tensors["columns_to_nodes"]
+        return left.T @ moments[..., :ny, :nx] @ right
+
+    def on_judged_nodes(self, moments: torch.Tensor) -> Array:
+        """(…, e, x) light on the nodes of all moments (…, m, n)."""
+        m, n = moments.shape[-2:]
+        with one_blas_thread():
+            left, right = legendre.to_nodes(m).T, legendre.to_nodes(n)
+            return np.asarray(left @ moments.detach().numpy() @ right)
+
+    def irradiance(self, light: torch.Tensor) -> torch.Tensor:
+        """(depth, y, x) irradiance on the window from light (e, x) on its lens nodes."""
+        field = _from_nodes(light, self)
+        return field.real**2 + field.imag**2
+
 
 @functools.lru_cache(maxsize=32)
 def plan_window(
@@ -502,7 +514,7 @@ def plan_window(
         )
         counts = layout.counts
         depths = depth_basis(case, _nodes_um(case, counts.nodes), tolerance / 2)
-        cases = list(itertools.chain(*window_tiles(case, layout.parts)[1]))
+        cases = list(itertools.chain(*window_tiles(case, layout.parts)))
         tiles = [_plan_tile(tile, counts, depths, tolerance, dtype) for tile in cases]
         tensors = _window_tensors(case, cases, layout)
         for name in ("basis", "coefficients"):
@@ -557,49 +569,7 @@ def field_windowed(
         phase_rad, transmission: (y, x) maps. plan: of :func:`plan_window`.
     """
     moments, _ = reduce_to_moments(phase_rad, transmission, plan.moments)
-    return _from_nodes(_on_nodes(moments, plan), plan)
-
-
-def light_windowed(
-    maps: tuple[torch.Tensor, torch.Tensor], plan: WindowPlan, pupils: Pupils | None
-) -> tuple[torch.Tensor, Array, list[float]]:
-    """Irradiance on the window, Σ_c sign_c |field_c|², differentiable once.
-
-    Args:
-        maps: (map, y, x) phase in rad, and transmission.
-        plan: of :func:`plan_window`.
-        pupils: factors on the light of the maps, for a ``smooth`` plan; None for the
-            |U|² of one map.
-
-    Returns:
-        Irradiance (depth, y, x); light of every map on the nodes of the posterior
-        error; sums of squares of the transmissions.
-    """
-    reduced = [
-        reduce_to_moments(phase, transmission, plan.moments)
-        for phase, transmission in zip(*maps, strict=True)
-    ]
-    moments = torch.stack([one_map for one_map, _ in reduced])
-    powers = [power for _, power in reduced]
-    parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
-    total: Any = 0
-    for sign, light in parts:
-        field = _from_nodes(light, plan)
-        total = total + sign * (field.real**2 + field.imag**2)
-    m, n = moments.shape[-2:]
-    with one_blas_thread():
-        rows, columns = legendre.to_nodes(m).T, legendre.to_nodes(n)
-        return total, rows @ moments.detach().numpy() @ columns, powers
-
-
-def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
-    """(…, e, x) light on the nodes of the whole window from moments (…, m, n)."""
-    ny, nx = plan.layout.nodes
-    return (
-        plan.tensors["rows_to_nodes"].T
-        @ gathered[..., :ny, :nx]
-        @ plan.tensors["columns_to_nodes"]
-    )
+    return _from_nodes(plan.on_nodes(moments), plan)
 
 
 def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
@@ -615,41 +585,32 @@ def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
         @ (light * tensors["turn"])
         @ tensors["columns_to_tile"]
     )
-    basis = tensors["basis"]
+    basis, coefficients = tensors["basis"], tensors["coefficients"]
     fields = [
-        _zoom_to_tile(one_light, basis, tile)
+        _zoom_to_tile(one_light, basis, coefficients, tile)
         for one_light, tile in zip(tile_light.to(basis), plan.tiles, strict=True)
     ]
-    # (tile, depth, Y, X)
-    at_depths = torch.tensordot(
-        torch.stack(fields), tensors["coefficients"], ([1], [1])
-    )
-    return _join_tiles(at_depths.movedim(-1, 1), plan)
+    columns = min(plan.layout.parts, plan.case.samples[1])
+    rows = [
+        torch.cat(fields[start : start + columns], -1)
+        for start in range(0, len(fields), columns)
+    ]
+    return torch.cat(rows, -2)
 
 
-def _zoom_to_tile(light: torch.Tensor, basis: torch.Tensor, tile: Tile) -> torch.Tensor:
-    """(b, Y, X) field on a tile of the light (e, x) with every depth field (b, e, x)."""
+def _zoom_to_tile(
+    light: torch.Tensor, basis: torch.Tensor, coefficients: torch.Tensor, tile: Tile
+) -> torch.Tensor:
+    """(depth, Y, X) field on a tile of the light (e, x) at all depths.
+
+    Args:
+        light: on the tile's lens nodes.
+        basis: (b, e, x) depth fields.
+        coefficients: (depth, b) of each depth.
+        tile: its operators.
+    """
     terms, depth = tile.pairs
     sources = light * tile.lens_terms[terms] * basis[depth]
-    waves = tile.along_y @ (sources @ tile.along_x)
-    window = waves.new_zeros((len(basis), *waves.shape[1:]))
-    return window.index_add(0, depth, waves * tile.window_terms[terms])
-
-
-def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
-    """(depth, y, x) field of the window from its overlapping tiles (tile, depth, Y, X).
-
-    Each tile is cut where the next one begins.
-    """
-    (rows, columns), _ = window_tiles(plan.case, plan.layout.parts)
-    my, mx = plan.case.samples
-    n = len(columns)
-    heights = np.diff([*rows, my]).tolist()
-    widths = np.diff([*columns, mx]).tolist()
-    bands = [
-        torch.cat(
-            [field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1
-        )
-        for i, height in enumerate(heights)
-    ]
-    return torch.cat(bands, -2)
+    waves = tile.along_y @ (sources @ tile.along_x) * tile.window_terms[terms]
+    window = waves.new_zeros((len(basis), *waves.shape[1:])).index_add(0, depth, waves)
+    return torch.tensordot(coefficients, window, 1)

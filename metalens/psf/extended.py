@@ -97,8 +97,8 @@ def _sinc_slope(u: Any) -> Array:
 def source_to_image_matrices(case: PropagationCase, extent: SourceExtent) -> Array:
     """(depth, 2, 2) matrices from the source, in its sizes, to the sensor, in um.
 
-    Rows and columns are [x, y]. A matrix is the product, times the size, of
-    ∂(place on sensor)/∂(tangents) and ∂(tangents)/∂(place of source).
+    Rows and columns are [x, y]. A matrix is the product of ∂(place on
+    sensor)/∂(tangents) and :func:`_tangent_change`.
 
     Args:
         case: direction, depths and films.
@@ -108,12 +108,8 @@ def source_to_image_matrices(case: PropagationCase, extent: SourceExtent) -> Arr
         PropagationError: a size in um at infinity.
     """
     to_sensor = _slopes(lambda t: _sensor_place(case, t), case)
-    return np.array(
-        [
-            to_sensor @ _tangent_change(case, extent, inverse)
-            for inverse in case.inverse_depths_per_um
-        ]
-    )
+    changes = [_tangent_change(case, extent, z) for z in case.inverse_depths_per_um]
+    return to_sensor @ np.array(changes)
 
 
 def _tangent_change(
@@ -141,14 +137,8 @@ def _tangent_change(
 
 def _sensor_place(case: PropagationCase, tangents: tuple[float, float]) -> list[float]:
     """(x, y) where the chief ray of these tangents meets the sensor, um."""
-    return [
-        float(
-            propagate.chief_ray_offset(
-                case.behind, case.sensor_distance_um, tangents, i
-            )
-        )
-        for i in (0, 1)
-    ]
+    reach = case.behind, case.sensor_distance_um, tangents
+    return [propagate.chief_ray_offset(*reach, axis) for axis in (0, 1)]
 
 
 def _source_place(
@@ -226,7 +216,9 @@ def blur_by_source(
         extent: size and shape of the source.
         more: (y, x) samples added on each side of the window.
     """
+    rows, columns = (slice(margin, -margin) for margin in more)
     whole = _filtered(light, case, extent, 0)
+    blurred = whole[..., rows, columns]
     with torch.no_grad():
         down, across = (
             (n - reach) // 2
@@ -234,9 +226,9 @@ def blur_by_source(
         )
         inner = torch.zeros_like(light)
         inner[..., down:-down, across:-across] = light[..., down:-down, across:-across]
-        change = _cropped(_filtered(inner, case, extent, 0) - whole, more)
-        error = float(change.norm() / _cropped(whole, more).norm())
-    return _cropped(whole, more).clamp_min(0), error
+        change = (_filtered(inner, case, extent, 0) - whole)[..., rows, columns]
+        error = float(change.norm() / blurred.norm())
+    return blurred.clamp_min(0), error
 
 
 def source_image_reach(case: PropagationCase, extent: SourceExtent) -> tuple[int, int]:
@@ -249,10 +241,6 @@ def source_image_reach(case: PropagationCase, extent: SourceExtent) -> tuple[int
     size_um = np.abs(source_to_image_matrices(case, extent)).sum(2).max(0)
     x, y = np.ceil(size_um * REACH[extent.shape] / case.step_um)
     return int(y), int(x)
-
-
-def _cropped(light: torch.Tensor, more: tuple[int, int]) -> torch.Tensor:
-    return light[..., more[0] : -more[0], more[1] : -more[1]]
 
 
 def _filtered(

@@ -15,8 +15,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 
 MOST_NODES = 64
-STEP_NM = 0.25  # at most, between points of a measured spectrum
-LINE_POINTS = 601  # of the line of a diode
+STEP_NM = 0.25  # at most, between points of a spectrum
 PATHS = 129  # from 0 to the longest, at which a rule is judged
 SUM_ERROR = 1e-6  # of the sum of weights: a relative error of all light
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
@@ -97,7 +96,7 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
     """Wavelengths (n,) in um and weights of sum 1 of a diode on a silicon sensor.
 
     weight ∝ exp(-4 ln 2 ((λ - peak) / FWHM)²) λ (1 - exp(-4π k thickness / λ)) over
-    ±2.5 FWHM, at ``LINE_POINTS`` even steps.
+    ±2.5 FWHM, every 0.25 nm or FWHM / 40, whichever is less.
 
     Args:
         source: peak, width and thickness of silicon.
@@ -107,7 +106,9 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
     """
     from metalens.cell import materials
 
-    widths = np.linspace(-2.5, 2.5, LINE_POINTS)
+    step_nm = min(STEP_NM, source.fwhm_nm / 40)
+    count = round(2.5 * source.fwhm_nm / step_nm)
+    widths = np.arange(-count, count + 1) * step_nm / source.fwhm_nm
     um = (source.peak_nm + widths * source.fwhm_nm) * 1e-3
     k = np.array([materials.index("Si", w).imag for w in um])
     response = um * (1 - np.exp(-4 * np.pi * k * source.silicon_um / um))

@@ -126,27 +126,28 @@ def psf_stack(
     maps, waves, weight = _maps(phase_rad, transmission, wavelength_um, weights)
     shape = maps[0].shape
     maps, mixing = _polarised(maps, polarisation, neighbours, pitch_um)
-    depths = np.atleast_1d(np.asarray(_value(depths_um), float))
+    depths = np.atleast_1d(np.asarray(depths_um, float))
     geometry: dict[str, Any] = {
         "pitch_um": pitch_um,
         "row_um": row_um,
         "site_um2": site_um2,
         "window_um": window_um,
-        "sensor_distance_um": _value(sensor_distance_um),
+        "sensor_distance_um": sensor_distance_um,
         "samples": samples,
         "layers": layers and layers.open,
         "depths_um": depths,
-        "offset_um": _value(offset_um),
+        "offset_um": offset_um,
     }
-    has_angle_axis, angles = _directions(angle_rad)
+    has_angle_axis = np.ndim(angle_rad) == 2
+    angles = angle_rad if has_angle_axis else [angle_rad]
+    if not len(angles):
+        raise PropagationError("angle_rad is empty: need one direction or more")
     lenses = [m.reshape(-1, *m.shape[-3:]) for m in maps]
     cases: list[PropagationCase] = []
     results: list[list[IntensityResult]] = []
     for angle in angles:
         by_wave = [
-            propagate.make_case(
-                shape, wavelength_um=wave, angle_rad=_value(angle), **geometry
-            )
+            propagate.make_case(shape, wavelength_um=wave, angle_rad=angle, **geometry)
             for wave in waves
         ]
         cases.append(by_wave[int(weight.argmax())])  # all wavelengths share its window
@@ -212,16 +213,6 @@ def _polarised(
     return maps, PolarizationMixing(polarisation == "flux", neighbours is not None)
 
 
-def _directions(angle_rad: Any) -> tuple[bool, Any]:
-    """Whether several field angles are given, and each of them."""
-    shape = np.shape(_value(angle_rad))
-    if len(shape) == 2 and 0 in shape:
-        raise PropagationError(
-            f"angle_rad of shape {shape}: need one direction or more"
-        )
-    return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
-
-
 def _record(
     by_direction: list[list[IntensityResult]],
     batch: tuple[int, ...],
@@ -242,10 +233,8 @@ def _record(
         tolerance: relative L2 error that was asked for.
         layers: films and stop; None for a bare lens.
     """
-    by_lens = zip(*by_direction, strict=True)
-    results = [result for row in by_lens for result in row]
-    lights = [result.intensity for result in results]
-    light = lights[0][None] if len(lights) == 1 else torch.stack(lights)
+    results = [result for row in zip(*by_direction, strict=True) for result in row]
+    light = torch.stack([result.intensity for result in results])
     light = light.view(*batch, *light.shape[1:])
     energy = light.sum((-1, -2))
     power = np.reshape([result.power for result in results], energy.shape)
@@ -253,13 +242,13 @@ def _record(
     share = share / (power * cases[0].area_um2)
     worst = max(results, key=lambda result: result.budget.computed)
     error = worst.budget.computed
-    divide = torch.div if light.requires_grad else torch.Tensor.div_  # in place
     reason = worst.reason
     if error > tolerance:
         reason += f"; above the tolerance by its {worst.budget.largest}"
     if tolerance < (least := torch.finfo(light.dtype).eps):
         name = str(light.dtype).removeprefix("torch.")
         reason += f"; {name} holds {least:.2g}, give float64 maps"
+    divide = torch.div if light.requires_grad else torch.Tensor.div_  # in place
     light = divide(light, energy[..., None, None])
     budget = replace(worst.budget, outside=max(0.0, 1 - float(share.min())))
     if layers is not None and layers.stop is not None:
@@ -308,24 +297,6 @@ def _stop_error(
         for z, blur, part in zip(axes[0].tolist(), blurs, parts, strict=True)
         for wave in axes[1].tolist()
     )
-
-
-def _value(argument: Any) -> Any:
-    """An argument as numbers; sequences of tensors become arrays.
-
-    Raises:
-        PropagationError: a tensor that requires a gradient.
-    """
-    if isinstance(argument, torch.Tensor):
-        if argument.requires_grad:
-            raise PropagationError(
-                "the geometry carries a gradient, but PSFs are differentiable in the maps alone: detach it, and take "
-                "differences of two stacks"
-            )
-        return argument.cpu().numpy()
-    if isinstance(argument, list | tuple):
-        return np.array([_value(a) for a in argument])
-    return argument
 
 
 def _maps(

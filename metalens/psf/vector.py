@@ -15,8 +15,8 @@ from metalens.optics import media
 from metalens.propagate import PropagationCase, Pupils, ray_cosines
 from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 
-# blocks of pillars along an axis, each with one cosine of its rays
-POOLED = 64
+# pillars along an axis whose rays are computed for a mean
+SAMPLED = 64
 NOTHING = 1e-12  # of the light of the strongest combination of factors: rounding
 
 
@@ -115,23 +115,18 @@ class PolarizationMixing:
     def _steep(self, case: PropagationCase, level: Tensor) -> float:
         """Mean of 1/cos θ of the rays to the sensor, weighted with the pillars' light.
 
-        Computed from means over ``POOLED`` x ``POOLED`` blocks of pillars.
+        Computed from some ``SAMPLED`` x ``SAMPLED`` of the pillars.
 
         Args:
             case: geometry of the rays.
             level: (y, x) transmission of a map.
         """
-        counts = min(POOLED, case.shape[0]), min(POOLED, case.shape[1])
-        pool = torch.nn.functional.adaptive_avg_pool2d
-        light = pool(level.detach()[None] ** 2, counts)[0].double().cpu()
-        halves = [
-            (n * step) / 2 for n, step in zip(case.shape, case.steps_um, strict=True)
-        ]
-        y, x = (
-            half * ((2 * np.arange(n) + 1) / n - 1)
-            for half, n in zip(halves, counts, strict=True)
+        y, x = (slice(None, None, max(1, n // SAMPLED)) for n in case.shape)
+        light = level.detach()[y, x].double() ** 2
+        rows, columns = case.pillars_um
+        return float(
+            (light / rays_to(case, (rows[y], columns[x]))[2]).sum() / light.sum()
         )
-        return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
 
 
 def has_faces(case: PropagationCase) -> bool:

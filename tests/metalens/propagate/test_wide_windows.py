@@ -65,7 +65,7 @@ def test_against_the_exact_sum_where_it_is_bright_and_in_the_corners(
     phase, level = lens()
     case = propagate.make_case(phase.shape, **ABOUT, **WINDOW, angle_rad=angle)
     made = propagate.plan_wide(case, tolerance / 2, torch.float64)
-    light = propagate.light_wide(
+    light = propagate.light_on_window(
         (torch.tensor(phase)[None], torch.tensor(level)[None]), made
     )[0].numpy()
     at = points(light)
@@ -91,7 +91,7 @@ def test_through_films_it_is_the_windowed_field_of_the_same_window():
     case = dataclasses.replace(
         propagate.make_case(lens()[0].shape, **ABOUT, **WINDOW), behind=films
     )
-    light = propagate.light_wide(
+    light = propagate.light_on_window(
         (phase[None], level[None]), propagate.plan_wide(case, 1e-6, torch.float64)
     )[0]
     # of the middle, both counts odd
@@ -135,7 +135,9 @@ def test_gradients_are_those_of_differences():
     way = torch.randn(phase.shape, generator=draw, dtype=torch.float64)
 
     def merit(at):
-        return (weight * propagate.light_wide((at[None], level[None]), made)[0]).sum()
+        return (
+            weight * propagate.light_on_window((at[None], level[None]), made)[0]
+        ).sum()
 
     start = phase.clone().requires_grad_()
     (slope,) = torch.autograd.grad(merit(start), start)
@@ -159,8 +161,8 @@ def test_dark_corners_of_the_lens_take_fewer_fields_and_change_no_light():
         1e-4,
         torch.float64,
     )
-    few, _, _ = propagate.light_wide((phase[None], level[None]), made)
-    want = propagate.light_wide((phase[None].requires_grad_(), level[None]), made)[
+    few, _, _ = propagate.light_on_window((phase[None], level[None]), made)
+    want = propagate.light_on_window((phase[None].requires_grad_(), level[None]), made)[
         0
     ].detach()
     # of a field rms 1e-4 over the whole plane: of the intensity twice that at most
