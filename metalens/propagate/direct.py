@@ -283,19 +283,10 @@ def field_at(
     out = np.zeros((len(case.inverse_depths_per_um), len(points)), complex)
     for start in range(0, case.shape[0], 16):
         rows = slice(start, start + 16)
-        level = np.asarray(transmission[rows], float)
-        open_columns = np.nonzero(level.any(0))[0]
-        if open_columns.size == 0:
-            continue
-        columns = slice(open_columns[0], open_columns[-1] + 1)
-        light = sum_field(
-            np.asarray(phase_rad[rows], float)[:, columns],
-            level[:, columns],
-            case,
-            y[rows],
-            x[columns],
-        )
-        add_point_waves(light, (y[rows], x[columns]), points, wave, out)
+        if transmission[rows].any():
+            maps = (np.asarray(one[rows], float) for one in (phase_rad, transmission))
+            light = sum_field(*maps, case, y[rows], x)
+            add_point_waves(light, (y[rows], x), points, wave, out)
     return out * case.area_um2
 
 

@@ -195,23 +195,14 @@ def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> 
             raise PropagationError(
                 f"{name} has shape {array.shape}, need {case.shape} (y, x)"
             )
-    nonzero = 0.0
-    for start in range(0, case.shape[0], 256):
-        rows = slice(start, start + 256)
-        # NaN and infinity survive a sum
-        total = float(phase_rad[rows].sum()) + float(transmission[rows].sum())
-        if not np.isfinite(total):
-            invalid = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
-            row, column = (int(i) for i in np.argwhere(invalid)[0])
-            raise PropagationError(
-                f"phase or transmission at row {start + row}, column {column} is not finite"
-            )
-        nonzero = (
-            nonzero
-            or float(transmission[rows].max())
-            or float(transmission[rows].min())
+    total = float(phase_rad.sum(dtype=float)) + float(transmission.sum(dtype=float))
+    if not np.isfinite(total):  # NaN and infinity survive a sum
+        invalid = ~np.isfinite(phase_rad) | ~np.isfinite(transmission)
+        row, column = np.unravel_index(int(invalid.argmax()), case.shape)
+        raise PropagationError(
+            f"phase or transmission at row {row}, column {column} is not finite"
         )
-    if nonzero == 0:
+    if not transmission.any():
         raise PropagationError(
             "empty aperture: transmission is 0 everywhere; check the aperture and the lens"
         )

@@ -298,37 +298,31 @@ def depth_basis(
         )
     )
     inverse = np.array(case.inverse_depths_per_um)
+
+    def fields(inverse: Array) -> Array:
+        """(depth, e · x) weighted lens fields."""
+        phase_rad = depth_factors(case, e, x, case.tangents, inverse[:, None, None])
+        return np.asarray((np.exp(1j * phase_rad) * weight).reshape(len(inverse), -1))
+
     count = 48
     # Depth nodes are doubled until the rank shows that they resolve all depths: nodes
     # need pi a period, the fields two.
     while True:
-        is_sampled = len(inverse) > count
         samples = inverse
-        if is_sampled:
-            samples = legendre.mapped_nodes(count, inverse.min(), inverse.max())
-            samples = np.clip(samples, 0, None)
-        samples = samples[:, None, None]
-        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, samples)) * weight
-        _, singular, right = np.linalg.svd(
-            fields.reshape(len(fields), -1), full_matrices=False
-        )
+        if len(inverse) > count:
+            nodes = legendre.mapped_nodes(count, inverse.min(), inverse.max())
+            samples = np.clip(nodes, 0, None)
+        _, singular, right = np.linalg.svd(fields(samples), full_matrices=False)
         tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1] / (singular**2).sum())
         rank = int(max(1, (tail > tolerance).sum()))
-        if not is_sampled or rank <= 2 / np.pi * count:
+        if len(inverse) <= count or rank <= 2 / np.pi * count:
             break
         count *= 2
-    basis = right[:rank].reshape(rank, len(e), len(x))
-    coefficients = np.empty((len(inverse), rank), complex)
-    for start in range(0, len(inverse), 16):
-        chunk = inverse[start : start + 16, None, None]
-        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, chunk)) * weight
-        coefficients[start : start + 16] = (
-            fields.reshape(len(chunk), -1) @ basis.reshape(rank, -1).conj().T
-        )
+    basis = right[:rank]
     return DepthBasis(
-        np.asarray(basis / weight),
-        coefficients,
-        np.asarray(singular[:rank] / singular[0]),
+        basis.reshape(rank, len(e), len(x)) / weight,
+        fields(inverse) @ basis.conj().T,
+        singular[:rank] / singular[0],
     )
 
 

@@ -20,7 +20,6 @@ BEAM = 10.0
 WIDEST_BEAM = 0.05  # of that radius, direction cosine: small apertures
 BEAMS, LEAST = 12, 0.01  # largest number of beams, and least share of the light of each
 SPOT = 0.75  # of the light of a beam, within half the radius
-_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +150,7 @@ def _behind(
 ) -> Array:
     """(y, x) complex64 field behind every pillar: |t| S exp(i (φ + k path)).
 
-    S is the shadow of a stop, and path that from the source. Phases are float64 before
-    the cast.
+    S is the shadow of a stop, and path that from the source.
 
     Args:
         lens: pillars, response and films.
@@ -168,20 +166,12 @@ def _behind(
     d = lens.diameters
     k = 2 * math.pi / wavelength_um
     tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
-    level = lens.transmission(wavelength_um, tilt)
-    field = np.empty(level.shape, np.complex64)
-    for start in range(0, len(level), _ROWS):
-        rows = slice(start, start + _ROWS)
-        places = d.x_um, d.y_um[rows][:, None]
-        path = source_path(*places, tangents, 1 / source_um)
-        phase = np.remainder(
-            lens.phase_rad(wavelength_um, tilt, rows=rows) + k * path, 2 * math.pi
-        )
-        shadow = lens.layers.shadow(
-            tangents, source_um, wavelength_um, places, d.pitch_um
-        )
-        field[rows] = level[rows] * shadow * np.exp(1j * phase)
-    return field
+    places = d.x_um, d.y_um[:, None]
+    phase = lens.phase_rad(wavelength_um, tilt)
+    phase = phase + k * source_path(*places, tangents, 1 / source_um)
+    light = lens.transmission(wavelength_um, tilt) * np.exp(1j * phase)
+    shadow = lens.layers.shadow(tangents, source_um, wavelength_um, places, d.pitch_um)
+    return np.asarray(light * shadow, np.complex64)
 
 
 def _spectrum(
@@ -351,11 +341,7 @@ def _plain_power(
             (sine_x, sine_y), steps, light.shape[::-1], strict=True
         )
     )
-    total = np.zeros((len(sine_y), len(sine_x)), complex)
-    for start in range(0, len(light), _ROWS):
-        rows = slice(start, start + _ROWS)
-        total += ey[rows].T @ (light[rows].astype(complex) @ ex)
-    return np.asarray(np.abs(total) ** 2)
+    return np.asarray(np.abs(ey.T @ (light @ ex)) ** 2)
 
 
 def _peak(

@@ -13,7 +13,6 @@ from metalens.lens import NeighbourRows
 # pillars to each side over which phasors are averaged: single pillars err, slopes of
 # lenses hardly change
 REACH = 2
-ROWS = 256  # of pillars at a time
 _FLAT = 1e-8  # (rad/um)² below which a slope has no azimuth
 
 
@@ -78,11 +77,8 @@ def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> 
         neighbours: solved rows of non-identical pillars.
         pitch_um: lattice constant, um.
     """
-    parts = []
-    for inner, rows in _shares(light):
-        s, sine2, _ = _turned(*phase_slopes(rows, pitch_um), neighbours)
-        parts.append(neighbours.of_both(s, sine2)[..., inner, :])
-    return torch.cat(parts, -2)
+    s, sine2, _ = _turned(*phase_slopes(light, pitch_um), neighbours)
+    return neighbours.of_both(s, sine2)
 
 
 def apply_scalar_coupling(
@@ -114,32 +110,13 @@ def apply_jones_coupling(
         neighbours: solved rows of non-identical pillars.
         pitch_um: lattice constant, um.
     """
-    parts = []
-    for inner, rows in _shares(torch.polar(level, phase)):
-        s, sine2, (cosine2, both) = _turned(*phase_slopes(rows, pitch_um), neighbours)
-        along, across = (neighbours.of_field(field, s, sine2) for field in (0, 1))
-        change = along - across
-        factors = across + change * cosine2, along - change * cosine2, change * both
-        parts.append([factor[..., inner, :] for factor in factors])
+    slopes = phase_slopes(torch.polar(level, phase), pitch_um)
+    s, sine2, (cosine2, both) = _turned(*slopes, neighbours)
+    along, across = (neighbours.of_field(field, s, sine2) for field in (0, 1))
+    change = along - across
     return NeighbourJonesFactors(
-        *(torch.cat(factor, -2) for factor in zip(*parts, strict=True))
+        across + change * cosine2, along - change * cosine2, change * both
     )
-
-
-def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
-    """Blocks of rows with the rows around them, each with the slice of its own rows.
-
-    Args:
-        light: (…, y, x) map that is cut into blocks of ``ROWS``.
-    """
-    rows = light.shape[-2]
-    shares = []
-    for start in range(0, rows, ROWS):
-        first = max(start - REACH - 1, 0)
-        last = min(start + ROWS + REACH + 1, rows)
-        inner = slice(start - first, min(start + ROWS, rows) - first)
-        shares.append((inner, light[..., first:last, :]))
-    return shares
 
 
 def _turned(
