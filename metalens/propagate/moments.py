@@ -542,7 +542,7 @@ def _spread(
         gradients: (y, x) outputs, written in place; None where not needed.
     """
     phase, level = (one_map.detach().numpy() for one_map in maps)
-    empty = np.empty((0, 0), phase.dtype)
+    empty = np.empty((len(phase), 0), phase.dtype)
     targets = [empty if target is None else target.numpy() for target in gradients]
     rows = plan.blocks[0]
     sums = plan.rows @ grad.movedim(0, 1).flatten(1)
@@ -601,14 +601,6 @@ carrier_at: Any = _carrier_of_order(ORDER[8])
 @overload(carrier_at, inline="always")
 def _carrier_at(table, u, j, like):  # type: ignore[no-untyped-def]
     return _carrier_of_order(ORDER[like.dtype.bitwidth // 8])
-
-
-@numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)
-def _phasors(phase, table, u, re, im):  # type: ignore[no-untyped-def]
-    """Cosine and sine of phase plus carrier along a row."""
-    for j in range(phase.size):
-        t = whole_turns_off(phase[j], re) + carrier_at(table, u, j, re)
-        re[j], im[j] = sincos_turns(t - np.rint(t), re)
 
 
 @numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)
@@ -762,17 +754,13 @@ def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _phase_gradient(row, re, im, level, out):  # type: ignore[no-untyped-def]
-    """Gradient in phase of a row: level · Im(conj(phasor) row)."""
-    for j in range(out.size):
-        out[j] = level[j] * (row[1, j] * re[j] - row[0, j] * im[j])
-
-
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _level_gradient(row, re, im, out):  # type: ignore[no-untyped-def]
-    """Gradient in transmission of a row: Re(conj(phasor) row)."""
-    for j in range(out.size):
-        out[j] = row[0, j] * re[j] + row[1, j] * im[j]
+def _write_gradients(row, re, im, level, out_phase, out_level):  # type: ignore[no-untyped-def]
+    """Gradients of a row: Re(conj(phasor) row) in transmission, and level ·
+    Im(conj(phasor) row) in phase."""
+    for j in range(out_phase.size):
+        out_phase[j] = level[j] * (row[1, j] * re[j] - row[0, j] * im[j])
+    for j in range(out_level.size):
+        out_level[j] = row[0, j] * re[j] + row[1, j] * im[j]
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
@@ -783,11 +771,12 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
     :func:`grid_pillars`, which has the other arguments.
 
     grad: as ``out`` there. out_phase, out_level: (row, x), written in place; an empty
-    array: no gradient is computed.
+    array (row, 0): no gradient is computed.
     """
     nodes, chunk = grad.shape[0], table.shape[2]
     row = np.empty((2, chunk), grad.dtype)
     re, im = np.empty(chunk, grad.dtype), np.empty(chunk, grad.dtype)
+    ones = np.ones(chunk, level.dtype)
     sums = np.zeros(((nodes + 3) // 4 * 4, 2, chunk), grad.dtype)
     padded = np.zeros((len(sums), u.size), grad.dtype)
     padded[:nodes] = shares[0][:, : u.size]
@@ -799,8 +788,7 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
         _spread_columns(grad, (x0, x1), shares[1], bases, sums)
         for i in range(u.size):
             _spread_row(sums, padded, i, row)
-            _phasors(phase[i, x0:x1], table[c], u[i], re, im)
-            if out_phase.size:
-                _phase_gradient(row, re, im, level[i, x0:x1], out_phase[i, x0:x1])
-            if out_level.size:
-                _level_gradient(row, re, im, out_level[i, x0:x1])
+            _light(phase[i, x0:x1], ones, table[c], u[i], re, im)
+            _write_gradients(
+                row, re, im, level[i, x0:x1], out_phase[i, x0:x1], out_level[i, x0:x1]
+            )

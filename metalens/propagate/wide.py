@@ -27,7 +27,7 @@ from metalens.propagate.paths import (
     reference_depth,
     to_sensor,
 )
-from metalens.propagate.window import depth_basis, depth_nodes
+from metalens.propagate.window import depth_basis, coarse_lens_nodes
 
 RAYS = 33  # along an axis, to whose reach the quadratic is fitted
 
@@ -436,7 +436,9 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
         table = torch.empty((coefficients.shape[1], *lens.shape), dtype=complex_dtype)
         for slot, field in zip(table, fields, strict=True):
             slot.copy_(torch.from_numpy(field * lens))
-    return WidePlan(case, axes, pillars, table, *tensors, tolerance)
+    return WidePlan(
+        case, axes, pillars, table, tensors[0], tensors[1], tensors[2], tolerance
+    )
 
 
 def _depth_fields(
@@ -452,7 +454,7 @@ def _depth_fields(
         tolerance: relative root mean square error of the basis.
     """
     grids = [grid_um(axis) for axis in axes]
-    nodes = depth_nodes(case, [grid[-1] for grid in grids], tolerance)
+    nodes = coarse_lens_nodes(case, [grid[-1] for grid in grids], tolerance)
     depths = depth_basis(case, nodes, tolerance)
     rows, columns = (
         legendre.interpolation_matrix(len(at_um), grid / grid[-1])
@@ -609,7 +611,7 @@ def fields_wide(
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
     parts = []
-    for chunk in fields.split(step):
+    for chunk in torch.split(fields, step):
         # every transform is along the last axis
         light = torch.fft.fft(chunk * gathered, n=x.first)[..., : x.size].mT
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
@@ -631,7 +633,7 @@ def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tenso
         coefficients: (depth, b).
     """
     bands = []
-    for rows in fields.split(MIXED_ROWS, 1):
+    for rows in torch.split(fields, MIXED_ROWS, 1):
         squares = torch.view_as_real(coefficients @ rows.flatten(1)).square()
         irradiance = squares[..., 0] + squares[..., 1]
         bands.append(irradiance.view(len(coefficients), *rows.shape[1:]))

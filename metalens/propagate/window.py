@@ -253,11 +253,15 @@ def depth_factors(
     return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
 
 
-def depth_nodes(
+def coarse_lens_nodes(
     case: PropagationCase, half_um: Sequence[float], tolerance: float
 ) -> tuple[Array, Array]:
-    """(e,), (x,) Legendre nodes over -half_um to half_um (y, x) that interpolate the
-    fields of the extreme depths to a relative tolerance.
+    """(e,), (x,) Legendre nodes that interpolate the fields of the extreme depths.
+
+    Args:
+        case: geometry of the propagation.
+        half_um: (y, x) half sizes of the lens.
+        tolerance: relative error of the interpolation.
     """
 
     def field(x: Any, y: Any, inverse: Any) -> Any:
@@ -313,8 +317,7 @@ def depth_basis(
             nodes = legendre.mapped_nodes(count, inverse.min(), inverse.max())
             samples = np.clip(nodes, 0, None)
         _, singular, right = np.linalg.svd(fields(samples), full_matrices=False)
-        tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1] / (singular**2).sum())
-        rank = int(max(1, (tail > tolerance).sum()))
+        rank = _significant_rank(singular, tolerance)
         if len(inverse) <= count or rank <= 2 / np.pi * count:
             break
         count *= 2
@@ -324,6 +327,14 @@ def depth_basis(
         fields(inverse) @ basis.conj().T,
         singular[:rank] / singular[0],
     )
+
+
+def _significant_rank(singular: Array, tolerance: float) -> int:
+    """Number of singular values that leave a smaller root sum square than a tolerance,
+    relative to that of all.
+    """
+    tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1] / (singular**2).sum())
+    return int(max(1, (tail > tolerance).sum()))
 
 
 def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
@@ -345,7 +356,7 @@ def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tile:
+class WindowTile:
     """Operators from the lens nodes (e, x) of a tile to its samples (Y, X).
 
     The kernel is Σ_r window_terms[r] lens_terms[r] times the plane waves along_y
@@ -365,7 +376,7 @@ def _plan_tile(
     depths: DepthBasis,
     tolerance: float,
     dtype: torch.dtype,
-) -> Tile:
+) -> WindowTile:
     """Operators of a tile. The kernel over its plane waves is sampled on small Legendre
     grids of window and lens, factorised by an SVD, and interpolated.
 
@@ -389,8 +400,7 @@ def _plan_tile(
     left, size, right = np.linalg.svd(
         table.reshape(math.prod(counts.window), -1), full_matrices=False
     )
-    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
-    rank = int(max(1, (tail > tolerance / 2).sum()))
+    rank = _significant_rank(size, tolerance / 2)
     pairs = significant_pairs(size[:rank], depths.strength, tolerance / 2)
     left = (left[:, :rank] * size[:rank]).T.reshape(rank, *counts.window)
     right = right[:rank].reshape(rank, *counts.lens)
@@ -405,8 +415,10 @@ def _plan_tile(
         _interpolated(right, e_um / half_y, s_um / half_x),
         _interpolated(left, y_um / half_Y, x_um / half_X) * shared_phase,
     )
-    tensors = [torch.tensor(array, dtype=dtype.to_complex()) for array in arrays]
-    return Tile(*tensors, torch.tensor(pairs))
+    along_y, along_x, lens_terms, window_terms = (
+        torch.tensor(array, dtype=dtype.to_complex()) for array in arrays
+    )
+    return WindowTile(along_y, along_x, lens_terms, window_terms, torch.tensor(pairs))
 
 
 def _interpolated(values: Array, y: Array, x: Array) -> Array:
@@ -440,7 +452,7 @@ class WindowPlan:
     layout: WindowLayout
     moments: PillarMoments
     tensors: dict[str, torch.Tensor]
-    tiles: list[Tile]
+    tiles: list[WindowTile]
 
     @property
     def whole_um(self) -> tuple[Array, Array]:
@@ -593,7 +605,10 @@ def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
 
 
 def _zoom_to_tile(
-    light: torch.Tensor, basis: torch.Tensor, coefficients: torch.Tensor, tile: Tile
+    light: torch.Tensor,
+    basis: torch.Tensor,
+    coefficients: torch.Tensor,
+    tile: WindowTile,
 ) -> torch.Tensor:
     """(depth, Y, X) field on a tile of the light (e, x) at all depths.
 
@@ -607,4 +622,5 @@ def _zoom_to_tile(
     sources = light * tile.lens_terms[terms] * basis[depth]
     waves = tile.along_y @ (sources @ tile.along_x) * tile.window_terms[terms]
     window = waves.new_zeros((len(basis), *waves.shape[1:])).index_add(0, depth, waves)
-    return torch.tensordot(coefficients, window, 1)
+    at_depths: torch.Tensor = torch.tensordot(coefficients, window, 1)
+    return at_depths

@@ -3,7 +3,7 @@ from . import neighbour_coupling as neighbour_coupling
 from . import plots as plots
 from . import spectrum as spectrum
 from .budget import NEIGHBOURS as NEIGHBOURS
-from .budget import Budget as Budget
+from .budget import ErrorBudget as ErrorBudget
 from .budget import Polarisation as Polarisation
 from .budget import scalar_error as scalar_error
 from .budget import sine_aperture as sine_aperture

@@ -109,7 +109,7 @@ def source_to_image_matrices(case: PropagationCase, extent: SourceExtent) -> Arr
     """
     to_sensor = _slopes(lambda t: _sensor_place(case, t), case)
     changes = [_tangent_change(case, extent, z) for z in case.inverse_depths_per_um]
-    return to_sensor @ np.array(changes)
+    return np.asarray(to_sensor @ np.array(changes))
 
 
 def _tangent_change(

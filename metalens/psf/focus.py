@@ -21,7 +21,7 @@ from metalens.psf.metrics import (
     encircled_power,
     find_peak,
     half_maximum,
-    mtf50,
+    half_modulation,
 )
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import SpectralNodes
@@ -104,7 +104,9 @@ def _point_metrics(
     share = encircled_power(light, peak, SPOT_FWHM / 2 * width)
     in_phase = in_phase_irradiance(lens, angle, depth_um, stack)
     strehl = peak[2] * energy_um2 / step**2 / in_phase
-    ends = [mtf50(light.sum(axis), step, limit.cutoff_per_um) for axis in (0, 1)]
+    ends = [
+        half_modulation(light.sum(axis), step, limit.cutoff_per_um) for axis in (0, 1)
+    ]
     return FocusMetrics(
         angle_rad=angle,
         depth_um=depth_um,

@@ -147,7 +147,7 @@ def _over_spectrum(
     """
     within = lens.proxy.wavelengths_um
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
-    shares = [np.zeros(span.shape) for span in spans]
+    shares: list[Array] = [np.zeros(span.shape) for span in spans]
     for share in shares:
         share[:, share.shape[1] // 2, share.shape[2] // 2] = 1
     for _ in range(TRIES):
@@ -330,7 +330,8 @@ def _at_wavelengths(
         if mapped != (mapped := (library_incidence(lens, angle), is_scalar)):
             maps, fields = all_maps(lens, nodes, angle, dtype, scalar=is_scalar)
         part = psf_stack(
-            *maps,
+            maps[0],
+            maps[1],
             **lens.diameters.grid._asdict(),
             wavelength_um=nodes.wavelengths_um.tolist(),
             weights=nodes.weights.tolist(),
@@ -357,7 +358,7 @@ def _at_wavelengths(
         AT_NORMAL if budget.angle else "",
         neighbours_text(lens.neighbours),
     ]
-    joined = {
+    joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("intensity", "energy_um2", "angles_rad", "centres_um")
     }

@@ -238,7 +238,9 @@ def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
     return total
 
 
-def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, float]:
+def half_modulation(
+    line: Array, step_um: float, cutoff_per_um: float
+) -> tuple[float, float]:
     """Lowest frequency of modulation 1/2, and its change per unit of modulation, 1/um.
 
     Both are nan where the modulation stays above 1/2 up to the cut-off.

@@ -87,7 +87,7 @@ class SpectralNodes:
 
 
 def single_wavelength(wavelength_um: float) -> SpectralNodes:
-    """The rule of one wavelength, um."""
+    """The rule of one wavelength, ``wavelength_um``."""
     return SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
 
 
@@ -199,7 +199,7 @@ def _curve(file: Path) -> Array:
     Raises:
         PropagationError: a file that is no such table, naming the line.
     """
-    rows = []
+    rows: list[list[float]] = []
     try:
         lines = reading.read_text(file).splitlines()
     except (OSError, UnicodeDecodeError) as error:
