@@ -202,7 +202,9 @@ class PsfSettings:
                 near, far, int(np.ceil((far - near) / step - 1e-9)) + 1
             )
         if not depths.size or self.angles_deg is None or self.window_um is None:
-            raise ConfigError("depths, angles or window are left to a lens")
+            raise ConfigError(
+                "depths_mm, angles_deg or window_um are left to the lens, and there is none"
+            )
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
         angles = [
             propagate.to_angle_pair(np.deg2rad(pair))

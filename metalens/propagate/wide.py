@@ -27,7 +27,7 @@ from metalens.propagate.paths import (
     reference_depth,
     to_sensor,
 )
-from metalens.propagate.window import depth_basis, coarse_lens_nodes
+from metalens.propagate.window import coarse_lens_nodes, depth_basis
 
 RAYS = 33  # along an axis, to whose reach the quadratic is fitted
 
