@@ -284,8 +284,10 @@ def field_at(
     for start in range(0, case.shape[0], 16):
         rows = slice(start, start + 16)
         if transmission[rows].any():
-            maps = (np.asarray(one[rows], float) for one in (phase_rad, transmission))
-            light = sum_field(*maps, case, y[rows], x)
+            phase, level = (
+                np.asarray(m[rows], float) for m in (phase_rad, transmission)
+            )
+            light = sum_field(phase, level, case, y[rows], x)
             add_point_waves(light, (y[rows], x), points, wave, out)
     return out * case.area_um2
 

@@ -20,7 +20,7 @@ from metalens.propagate.window import depth_factors
 # least number of points, and pixels to a point in a large window
 POINTS, EVERY = 128, 32
 FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed WORK
-DEPTHS = 8  # largest number of depths that are sampled
+DEPTHS = 5  # largest number of depths that are sampled
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
 RAYS = 12  # points at which a polarisation mixing of their own is formed
@@ -58,10 +58,7 @@ def relative_error(waves: list[NodeLight], intensity: Array) -> float:
     nodes = max(wave.light[0].size for wave in waves)
     pixels = intensity[0].size
     count = min(max(POINTS, pixels // EVERY), max(FEWEST, int(WORK / nodes)))
-    is_limited = count * nodes > WORK / 2
-    light, energy, depths, points, chance = _sample(
-        intensity, count, DEPTHS // 2 if is_limited else DEPTHS
-    )
+    light, energy, depths, points, chance = _sample(intensity, count, DEPTHS)
     direct = sum(_direct_intensity(wave, wave.pupils, depths, points) for wave in waves)
     difference = direct / energy[:, None] - light[:, points]
     noise = 2 * sum(abs(wave.weight) * wave.noise**2 for wave in waves)

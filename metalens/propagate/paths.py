@@ -125,20 +125,11 @@ def films_error(case: PropagationCase, level: Array) -> float:
     """
     if case.behind is None:
         return 0.0
-    sampled = tuple(slice(n // SOME // 2, None, max(1, n // SOME)) for n in case.shape)
-    y, x = (
-        positions[span]
-        for positions, span in zip(case.pillars_um, sampled, strict=True)
-    )
-    light = np.asarray(level[sampled], float) ** 2
-    if not light.sum() > 0:
-        light = np.ones_like(light)
-    far_y, far_x = (
-        abs(centre - positions) + half_window
-        for centre, positions, half_window in zip(
-            case.centre_um[::-1], (y, x), case.half_window_um, strict=True
-        )
-    )
+    rows, columns = (slice(None, None, max(1, n // SOME)) for n in case.shape)
+    light = np.maximum(np.asarray(level[rows, columns], float) ** 2, 1e-300)
+    (y, x), (half_y, half_x) = case.pillars_um, case.half_window_um
+    far_x = np.abs(case.centre_um[0] - x[columns]) + half_x
+    far_y = np.abs(case.centre_um[1] - y[rows]) + half_y
     w = media.solve_direction_square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
     error = saddle_correction(case.behind, case.wavenumber, case.reach_um).error(w)
     return 2 * float(np.sqrt((light * error**2).sum() / light.sum()))

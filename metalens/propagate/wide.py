@@ -111,31 +111,28 @@ def wide_axes(
         case: geometry of the propagation.
         tolerance: relative error of the field.
     """
-    sizes = list(zip(case.half_window_um, case.half_size_um, strict=True))
-    half_um = list(case.half_window_um)
+    sizes = np.add(case.half_window_um, case.half_size_um)
+    half_um, steepest = list(case.half_window_um), STEEPEST * case.media.layers[0][0]
     for _ in range(3):
-        fitted = _fit_quadratics(case, half_um)
-        if fitted is None or any(
-            fit.extra_um > 2 * (window + lens)
-            for fit, (window, lens) in zip(fitted, sizes, strict=True)
-        ):
+        fits = _fit_quadratics(case, half_um)
+        extra_um = [fit.extra_um for fit in fits]
+        if fits[0].steepest > steepest or (np.array(extra_um) > 2 * sizes).any():
             return None
-        fits = fitted
-        half_um = [w + f.extra_um for f, (w, _) in zip(fits, sizes, strict=True)]
+        half_um = np.add(case.half_window_um, extra_um).tolist()
     sharp = math.sqrt(2 * FADED * math.log(1 / tolerance))
     fade = 2 * sharp**2 / case.wavenumber
     guards = [
         math.sqrt(fade * fit.most / half)
         for half, fit in zip(half_um, fits, strict=True)
     ]
-    if fits[0].steepest + max(guards) > STEEPEST * case.media.layers[0][0]:
+    if fits[0].steepest + max(guards) > steepest:
         return None
     strays = _stray_reach(case, fits, guards)
-    axes = [
+    y, x = (
         _axis(case, i, fits[i], (guards[i], sharp, strays[i]), tolerance)
         for i in (0, 1)
-    ]
-    return None if axes[0] is None or axes[1] is None else (axes[0], axes[1])
+    )
+    return (y, x) if y and x else None
 
 
 def _stray_reach(
@@ -183,9 +180,8 @@ def is_wide(case: PropagationCase, tolerance: float) -> bool:
 
 def _fit_quadratics(
     case: PropagationCase, half: list[float]
-) -> tuple[QuadraticFit, QuadraticFit] | None:
-    """Quadratics along y and x, fitted to rays from the lens to the window; None if
-    rays are too steep.
+) -> tuple[QuadraticFit, QuadraticFit]:
+    """Quadratics along y and x, fitted to rays from the lens to the window.
 
     The reach of each ray is fitted by a line in its direction cosine, A + D (p - p0).
 
@@ -204,8 +200,6 @@ def _fit_quadratics(
         for point in ((y[:, None], x), (x, y[:, None]))
     ]
     steepest = float(np.sqrt((cosines[0] ** 2 + cosines[1] ** 2).max()))
-    if steepest > STEEPEST * case.media.layers[0][0]:
-        return None
     fits = []
     for along, p in zip((y[:, None], x), cosines, strict=True):
         reach = np.broadcast_to(along, p.shape)

@@ -27,7 +27,6 @@ from .metrics import find_peak as find_peak
 from .metrics import fwhm as fwhm
 from .metrics import mtf as mtf
 from .pixels import integrate_pixels as integrate_pixels
-from .pixels import on_pixels as on_pixels
 from .pixels import pixel_count as pixel_count
 from .pixels import pixel_weights as pixel_weights
 from .pixels import whole_pixels as whole_pixels

@@ -147,14 +147,14 @@ class IntensityResult:
     """Irradiance on a window and its error by cause.
 
     intensity: (depth, y, x). reason: method, and why it stopped.
-    power: (depth,) sum of squares of what the pillars let through the faces behind
-    them, wavelengths weighted.
+    power: sum of squares of what the pillars let through the faces behind them,
+    wavelengths weighted; of each depth where they were computed in shares.
     """
 
     intensity: torch.Tensor
     budget: ErrorBudget
     reason: str
-    power: Array
+    power: Any
 
 
 def _shadow(case: PropagationCase, layers: Layers) -> Array:
@@ -220,16 +220,13 @@ def compute_intensity(request: IntensityRequest) -> IntensityResult:
         reason += (
             f"; light integrated over cells of {fine.points} x {fine.points} points"
         )
-    intensities = [result.intensity for result in results]
-    power = np.concatenate([result.power for result in results])
-    intensity = intensities[0] if len(intensities) == 1 else torch.cat(intensities)
-    return IntensityResult(intensity, budget, reason, power * _passed(request.cases[0]))
-
-
-def _passed(case: PropagationCase) -> float:
-    """Power that the faces behind the lens let through along the chief ray."""
-    steep = 1 + case.tangents[0] ** 2 + case.tangents[1] ** 2
-    return float(media.passed_at(case.media.order, 1 - 1 / steep))
+    intensity = results[0].intensity
+    if len(results) > 1:
+        intensity = torch.cat([result.intensity for result in results])
+    power = [np.full(len(result.intensity), result.power) for result in results]
+    steep = 1 + np.square(request.cases[0].tangents).sum()
+    passed = media.passed_at(request.cases[0].media.order, 1 - 1 / steep)
+    return IntensityResult(intensity, budget, reason, np.concatenate(power) * passed)
 
 
 def _shares(
@@ -388,9 +385,7 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
         math.hypot(EXACT, 2 * math.sqrt(squares)),
         polarisation=_mixing_error(request, checked, total),
     )
-    return IntensityResult(
-        torch.as_tensor(total), budget, reason, np.full(len(total), power)
-    )
+    return IntensityResult(torch.as_tensor(total), budget, reason, power)
 
 
 def _pillar_light(
@@ -466,7 +461,7 @@ def _windowed(
     if is_wide:
         error = math.hypot(error, ROUNDING[dtype][1])
     budget = ErrorBudget(error, polarisation=_mixing_error(request, checked, values))
-    return IntensityResult(total, budget, choice.reason, np.full(len(total), power))
+    return IntensityResult(total, budget, choice.reason, power)
 
 
 def _noisy_power(powers: list[float], mixing: tuple[Array, Array] | None) -> float:

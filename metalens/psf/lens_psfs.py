@@ -204,12 +204,8 @@ def paths_um(
     turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
     x = (radius * np.cos(turn)).ravel()
     y = (radius * np.sin(turn)).ravel()
-    from_source = np.array(
-        [
-            paths.from_source(case, x, y, case.tangents, inverse)
-            for inverse in case.inverse_depths_per_um
-        ]
-    )
+    inverse = np.array(case.inverse_depths_per_um)[:, None]
+    from_source = np.asarray(paths.from_source(case, x, y, case.tangents, inverse))
     rows, columns = (
         np.linspace(-1, 1, min(PLACES, n)) * ((n - 1) / 2 + extra) * case.step_um
         + centre

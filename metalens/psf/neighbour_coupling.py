@@ -78,7 +78,8 @@ def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> 
         pitch_um: lattice constant, um.
     """
     s, sine2, _ = _turned(*phase_slopes(light, pitch_um), neighbours)
-    return neighbours.of_both(s, sine2)
+    coupling: Tensor = neighbours.of_both(s, sine2)
+    return coupling
 
 
 def apply_scalar_coupling(

@@ -1,63 +1,10 @@
 """PSFs as a sensor sees them: pixels of any pitch, and binned pixels."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
-
-from metalens.core.errors import PropagationError
-from metalens.psf.record import PsfStack
-
-
-def on_pixels(
-    stack: PsfStack,
-    *,
-    pitch_um: Any,
-    bins: int = 1,
-    shift_um: tuple[float, float] = (0.0, 0.0),
-    count: int | None = None,
-) -> PsfStack:
-    """PSF stack with light summed over pixels, each PSF of sum 1 over the pixels.
-
-    A PSF without light on the pixels is 0, with no energy.
-
-    Args:
-        stack: PSFs over angle, depth and wavelength.
-        pitch_um: of one pixel, a number or a torch scalar (the result is differentiable
-            in it, continuously).
-        bins: 1, 2, 3 … pixels along each axis that are added.
-        shift_um: (y, x) of the pixel grid towards +; the energy is that of the pixels.
-        count: binned pixels along each axis; by default as many as cover the window.
-
-    Raises:
-        PropagationError: bins below 1, or pixels finer than the samples.
-    """
-    pitch = pitch_um * bins
-    width = float(pitch.detach()) if isinstance(pitch, torch.Tensor) else float(pitch)
-    if bins < 1 or not width >= stack.step_um:
-        raise PropagationError(
-            f"pixels of {width / max(bins, 1)} um binned {bins} x {bins} on samples of {stack.step_um} um; "
-            "need bins of 1 or more and pixels at least as wide as the samples"
-        )
-    light = torch.as_tensor(stack.intensity)
-    shape = None if count is None else (count, count)
-    pixels = integrate_pixels(
-        light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um
-    )
-    total = pixels.sum((-1, -2))
-    least = torch.finfo(total.dtype).tiny
-    result: tuple[Any, Any] = (
-        pixels / total.clamp_min(least)[..., None, None],
-        torch.as_tensor(stack.energy_um2) * total,
-    )
-    if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
-        result = result[0].numpy(), result[1].numpy()
-    return dataclasses.replace(
-        stack, intensity=result[0], energy_um2=result[1], step_um=width
-    )
 
 
 def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:

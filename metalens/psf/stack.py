@@ -26,6 +26,7 @@ from metalens.psf.intensity import (
 from metalens.psf.metrics import blur_um
 from metalens.psf.neighbour_coupling import NeighbourJonesFactors
 from metalens.psf.record import PsfStack
+from metalens.psf.spectrum import SpectralNodes
 from metalens.psf.vector import PolarizationMixing, jones_maps
 
 
@@ -316,36 +317,25 @@ def _maps(
     Returns:
         ((phase, transmission), wavelengths, weights); maps (…, wavelength, y, x).
     """
-    waves = np.atleast_1d(np.asarray(wavelength_um, float)).ravel().tolist()
-    if not waves:
-        raise PropagationError("wavelength_um is empty, need one wavelength or more")
-    share = (
-        np.full(len(waves), 1 / len(waves))
-        if weights is None
-        else np.asarray(weights, float)
-    )
-    if share.shape != (len(waves),) or not (share >= 0).all() or not share.sum() > 0:
-        raise PropagationError(
-            f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each"
-        )
+    waves = np.ravel(np.asarray(wavelength_um, float))
+    share = np.asarray(np.ones(len(waves)) if weights is None else weights, float)
+    nodes = SpectralNodes(waves, share / max(share.sum(), 1e-300), 0.0)
     phase = to_tensor(phase).cpu()  # pillars are summed on the processor
     if phase.dtype not in ROUNDING:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
-    level = to_tensor(level).to(phase)
-    if phase.ndim < 2 or 0 in phase.shape[:-2] or not _broadcasts(level, phase):
-        shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {tuple(level.shape)}"
-        raise PropagationError(f"{shapes}: need the same (…, y, x) of both")
-    level = level.expand(phase.shape)
+    try:
+        level = to_tensor(level).to(phase).expand(phase.shape)
+    except RuntimeError:
+        shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {np.shape(level)}"
+        raise PropagationError(f"{shapes}: need the same (…, y, x) of both") from None
+    if phase.ndim < 2 or 0 in phase.shape[:-2]:
+        raise PropagationError(
+            f"phase_rad of shape {tuple(phase.shape)}: need (…, y, x)"
+        )
     if np.ndim(wavelength_um) == 0:
         phase, level = phase.unsqueeze(-3), level.unsqueeze(-3)
     elif phase.ndim < 3 or phase.shape[-3] != len(waves):
         raise PropagationError(
             f"{len(waves)} wavelengths, but maps of shape {tuple(phase.shape)}; need (…, wavelength, y, x)"
         )
-    return (phase, level), waves, share / share.sum()
-
-
-def _broadcasts(level: torch.Tensor, phase: torch.Tensor) -> bool:
-    """Whether the transmission's shape broadcasts to that of the phase."""
-    lengths = zip(level.shape[::-1], phase.shape[::-1], strict=False)
-    return level.ndim <= phase.ndim and all(n in (1, m) for n, m in lengths)
+    return (phase, level), waves.tolist(), nodes.weights

@@ -98,29 +98,26 @@ def test_file_round_trip_and_same_bytes(tmp_path):
 @settings(max_examples=15)
 @given(pitch=st.floats(1.0, 7.0), bins=st.integers(1, 3))
 def test_pixels_keep_all_light(pitch, bins):
-    stack = gaussian_stack([2.0, 3.0])
-    seen = psf.on_pixels(stack, pitch_um=pitch, bins=bins)
-    assert seen.step_um == pytest.approx(pitch * bins)
-    assert seen.intensity.sum((1, 2)) == pytest.approx(1, abs=1e-12)
-    assert seen.energy_um2 == pytest.approx(1, abs=1e-6)
+    light = torch.tensor(gaussian_stack([2.0, 3.0]).intensity)
+    seen = psf.integrate_pixels(light, 0.5, pitch_um=pitch * bins)
+    assert seen.sum((1, 2)).numpy() == pytest.approx(1, abs=1e-6)
 
 
 def test_binning_twice_equals_pixels_twice_as_wide():
-    stack = gaussian_stack([2.0], n=80)
-    fine = psf.on_pixels(stack, pitch_um=2.5).intensity
-    wide = psf.on_pixels(stack, pitch_um=2.5, bins=2).intensity
-    assert abs(fine.reshape(1, 8, 2, 8, 2).sum((2, 4)) - wide).max() < 1e-12
-    with pytest.raises(PropagationError, match="bins"):
-        psf.on_pixels(stack, pitch_um=0.1)
+    light = torch.tensor(gaussian_stack([2.0], n=80).intensity)
+    fine, wide = (
+        psf.integrate_pixels(light, 0.5, pitch_um=pitch).numpy() for pitch in (2.5, 5.0)
+    )
+    assert np.abs(fine.reshape(1, 8, 2, 8, 2).sum((2, 4)) - wide).max() < 1e-12
 
 
 def test_pixels_are_differentiable_in_pitch():
-    stack = gaussian_stack([2.0])
+    light = torch.tensor(gaussian_stack([2.0]).intensity)
     pitch = torch.tensor(3.13, dtype=torch.float64, requires_grad=True)
 
     def score(p):
-        seen = psf.on_pixels(stack, pitch_um=p, count=9).intensity
-        return (torch.as_tensor(seen) ** 2).sum()
+        seen = psf.integrate_pixels(light, 0.5, pitch_um=p, shape=(9, 9))
+        return ((seen / seen.sum()) ** 2).sum()
 
     score(pitch).backward()
     want = (score(3.13 + 1e-6) - score(3.13 - 1e-6)) / 2e-6
