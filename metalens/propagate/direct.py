@@ -281,32 +281,12 @@ def field_at(
     points = np.ascontiguousarray(points_um, float)
     wave = point_wave(case, points)
     out = np.zeros((len(case.inverse_depths_per_um), len(points)), complex)
+    inverse = np.array(case.inverse_depths_per_um)[:, None, None]
     for start in range(0, case.shape[0], 16):
         rows = slice(start, start + 16)
-        if transmission[rows].any():
-            phase, level = (
-                np.asarray(m[rows], float) for m in (phase_rad, transmission)
-            )
-            light = sum_field(phase, level, case, y[rows], x)
+        path = from_source(case, x, y[rows, None], case.tangents, inverse)
+        phase = np.asarray(phase_rad[rows], float) + case.wavenumber * path
+        light = np.asarray(transmission[rows], float) * np.exp(1j * phase)
+        if light.any():
             add_point_waves(light, (y[rows], x), points, wave, out)
     return out * case.area_um2
-
-
-def sum_field(
-    phase_rad: Array,
-    transmission: Array,
-    case: PropagationCase,
-    y_um: Array,
-    x_um: Array,
-) -> Array:
-    """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth:
-    (depth, y, x) complex128.
-
-    Args:
-        phase_rad: (y, x) phase of every pillar.
-        transmission: (y, x) magnitude |T| of every pillar.
-        case: geometry of the propagation.
-    """
-    inverse = np.array(case.inverse_depths_per_um)[:, None, None]
-    path = from_source(case, x_um[None, :], y_um[:, None], case.tangents, inverse)
-    return np.asarray(transmission * np.exp(1j * (phase_rad + case.wavenumber * path)))

@@ -252,7 +252,12 @@ def make_case(
     step_um, counts = window_of(window_um, samples)
     ax, ay = to_angle_pair(angle_rad)
     tangents = float(np.tan(ax)), float(np.tan(ay))
-    depths = _depths(depths_um, offset_um)
+    depths = np.atleast_1d(np.asarray(depths_um, float))
+    if depths.ndim != 1 or not (depths > 0).all() or np.shape(offset_um) != (2,):
+        raise PropagationError(
+            f"depths_um = {depths_um}, offset_um = {offset_um}: need source depths above "
+            "0 (inf for a far source), and a pair (x, y)"
+        )
     distance_um = float(sensor_distance_um)
     films = _films(layers, distance_um, float(wavelength_um))
     centre_um = [
@@ -320,15 +325,6 @@ def _check_rays(case: PropagationCase) -> None:
             f"layers: the films fill the way from lens to sensor, and rays of n sin θ = {steepest:.3g} from the rim to "
             f"the window do not leave the cover of index {cover_index:g}: need a gap, a nearer window or a smaller angle"
         )
-
-
-def _depths(depths_um: Any, offset_um: Any) -> Array:
-    """(depth,) source depths, um; NaN, for which a case raises, unless all exceed 0."""
-    depths = np.atleast_1d(np.asarray(depths_um, float))
-    if depths.ndim != 1 or np.shape(offset_um) != (2,):
-        words = f"depths_um of shape {depths.shape}, offset_um of {np.shape(offset_um)}"
-        raise PropagationError(f"{words}: need (depth,) and a pair (x, y)")
-    return depths if (depths > 0).all() else np.array([np.nan])
 
 
 def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:

@@ -103,7 +103,14 @@ class IntensityRequest:
         """This request with the stop's shadow, at the first depth, on the maps."""
         if self.layers is None or self.layers.stop is None:
             return self
-        shadows = [_shadow(case, self.layers) for case in self.cases]
+        shadows = []
+        for case in self.cases:
+            y, x = case.pillars_um
+            inverse, width = case.inverse_depths_per_um[0], math.sqrt(case.area_um2)
+            source = case.tangents, 1 / inverse if inverse else math.inf
+            shadows.append(
+                self.layers.shadow(*source, case.wavelength_um, (x, y[:, None]), width)
+            )
         shadow = torch.from_numpy(np.repeat(shadows, self.map_count, 0))
         phase, level = self.maps
         maps = phase + shadow.angle().to(phase), level * shadow.abs().to(level)
@@ -155,22 +162,6 @@ class IntensityResult:
     budget: ErrorBudget
     reason: str
     power: Any
-
-
-def _shadow(case: PropagationCase, layers: Layers) -> Array:
-    """(y, x) complex amplitude at each pillar over that without the stop.
-
-    Args:
-        case: its first depth and its direction are those of the light.
-        layers: with the stop.
-    """
-    y, x = case.pillars_um
-    inverse = case.inverse_depths_per_um[0]
-    depth = 1 / inverse if inverse else math.inf
-    width = math.sqrt(case.area_um2)
-    return layers.shadow(
-        case.tangents, depth, case.wavelength_um, (x, y[:, None]), width
-    )
 
 
 def compute_intensity(request: IntensityRequest) -> IntensityResult:

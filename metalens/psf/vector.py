@@ -241,17 +241,12 @@ def transmitted_polarization(a: Tensor, b: Tensor) -> Tensor:
     column = 3, *[1] * (b.ndim - 1)
     both = (a.reshape(column) + b) / (1 + torch.einsum("i,i...->...", a, b))
     out = []
-    for e in _polarisations(a):
+    unit = torch.eye(3, dtype=a.dtype, device=a.device)
+    axis = unit[2] + a
+    for e in unit[:2] - (unit[:2] @ a)[:, None] * axis / (1 + a[2]):
         turned = e.reshape(column) - both * torch.einsum("i,i...->...", e, b)
         out.append(turned / torch.sqrt(b[2]))
     return torch.cat(out)
-
-
-def _polarisations(a: Tensor) -> list[Tensor]:
-    """Two unit vectors normal to the direction a: x and y, rotated with z to a."""
-    unit = torch.eye(3, dtype=a.dtype, device=a.device)
-    axis = unit[2] + a
-    return [e - axis * (a @ e) / (1 + a[2]) for e in unit[:2]]
 
 
 def of_flux(electric: Tensor, b: Tensor) -> VectorPupil:
