@@ -244,16 +244,15 @@ def _delay_um(
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
     has_pillar = np.asarray(lens.diameters.diameter_um[rows]) > 0
     tilt = library_incidence(lens, angle_rad)
+    points = um[np.searchsorted(np.cumsum(share), (0.05, 0.5, 0.95))]
     delays = []
-    for quantile in (0.05, 0.5, 0.95):
-        point = um[np.searchsorted(np.cumsum(share), quantile)]
-        middle = float(np.clip(point, low, high))
+    for middle in np.clip(points, low, high).tolist():
         ends = max(low, middle * (1 - NEARBY)), min(high, middle * (1 + NEARBY))
-        turns = [
+        first, last = (
             lens.phase_rad(wave, tilt, rows=rows)[has_pillar] / (2 * np.pi)
             for wave in ends
-        ]
-        change = turns[0] - turns[1]
+        )
+        change = first - last
         delays.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
     return float(max(delays))
 
@@ -272,26 +271,6 @@ def light_shares(light: Array, places: tuple[int, ...]) -> Array:
         first = np.ceil(borders / max(count - 1, 1)).astype(int)
         square = np.add.reduceat(square, [0, *first], axis=axis)
     return np.asarray(square / square.sum())
-
-
-def _quadrature_error(
-    lens: Lens,
-    view: View,
-    angle_rad: tuple[float, float],
-    stack: PsfStack,
-    nodes: SpectralNodes,
-) -> float:
-    """Relative error of the quadrature over a spectrum, for one direction.
-
-    The root mean square over the window of the error at each place's range of paths,
-    weighted with the squared light at that place.
-    """
-    if nodes.source is None:
-        return nodes.error
-    span = paths_um(lens, view, angle_rad, nodes.source)
-    share = light_shares(stack.intensity[0], span.shape[1:])
-    rule = nodes.wavelengths_um, nodes.weights
-    return spectra.quadrature_error(nodes.source, rule, span.ravel(), share.ravel())
 
 
 def _at_wavelengths(
@@ -316,7 +295,7 @@ def _at_wavelengths(
         provenance: settings and input files.
     """
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
-    share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
+    psf_tolerance = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
     budgets, parts = [], []
     mapped: tuple[float, bool] | None = None
     for angle in view.angles_rad:
@@ -334,20 +313,28 @@ def _at_wavelengths(
             sensor_distance_um=lens.sensor_distance_um,
             angle_rad=[list(angle)],
             **view.arguments,
-            tolerance=share,
+            tolerance=psf_tolerance,
             layers=lens.layers,
             polarisation=decided,
             neighbours=fields,
         ).numpy()
         parts.append(part)
-        error = _quadrature_error(lens, view, angle, part, nodes)
-        judged = dataclasses.replace(nodes, error=error)
+        judged = nodes
+        if nodes.source is not None:
+            # rms over the window of the error at each place's range of paths
+            span = paths_um(lens, view, angle, nodes.source)
+            share = light_shares(part.intensity[0], span.shape[1:])
+            rule = nodes.wavelengths_um, nodes.weights
+            error = spectra.quadrature_error(
+                nodes.source, rule, span.ravel(), share.ravel()
+            )
+            judged = dataclasses.replace(nodes, error=error)
         budgets.append(with_model(part.budget, lens, angle, judged, decided))
     budget = worst_of_budgets(budgets)
     worst = max(parts, key=lambda part: part.error)
     words = [
         worst.reason,
-        ABOVE if budget.computed > tolerance and worst.error <= share else "",
+        ABOVE if budget.computed > tolerance and worst.converged else "",
         f"of {lens.one_light}: these pillars respond to x and y separately"
         if lens.one_light
         else "",
