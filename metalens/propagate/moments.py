@@ -105,7 +105,7 @@ class AxisBlocks:
             legendre.interpolation_matrix(self.nodes, self.along).T
         )
 
-    def own(self, block: int) -> slice:
+    def pillars_of(self, block: int) -> slice:
         """Pillars that belong to a block."""
         start = block * self.length
         return slice(start, min(start + self.length, self.pillars))
@@ -481,7 +481,7 @@ def _block_rows(plan: PillarMoments, dtype: Any) -> Callable[[int], tuple[Any, .
     column_shares, column_bases = columns.weights.astype(dtype), columns.bases
 
     def block_row(block: int) -> tuple[Any, ...]:
-        own = rows.own(block)
+        own = rows.pillars_of(block)
         first = own.start - bases[block]
         shares = np.ascontiguousarray(row_shares[:, first:]), column_shares
         return own, plan.table[block], along[first:], shares, column_bases

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.fft
 import torch
-from scipy.special import j1, jv
+from scipy.special import j1, jv, spherical_jn
 
 from metalens import propagate
 from metalens.core.arrays import Array
@@ -74,24 +74,18 @@ class SourceExtent:
         if self.shape == "square":
             along = np.sinc(u)
             across = np.sinc(v)
-            slope = np.hypot(_sinc_slope(u) * across, along * _sinc_slope(v))
-            return along * across, slope / (2 * np.pi)
+            # d sinc(u) / du = -π j1(πu)
+            along_slope, across_slope = (
+                spherical_jn(1, np.pi * np.abs(axis)) for axis in (u, v)
+            )
+            slope = np.hypot(along_slope * across, along * across_slope)
+            return along * across, slope / 2
         rho = np.hypot(u, v)
         if self.shape == "gaussian":
             level = np.exp(-((np.pi * rho) ** 2) / (4 * math.log(2)))
             return level, level * np.pi * rho / (4 * math.log(2))
         z = np.pi * np.maximum(rho, 1e-9)
         return 2 * j1(z) / z, jv(2, z) / z
-
-
-def _sinc_slope(u: Any) -> Array:
-    """d sinc(u) / du, sinc(u) = sin(πu)/(πu)."""
-    safe = np.where(np.abs(u) < 1e-4, 1.0, u)
-    return np.where(
-        np.abs(u) < 1e-4,
-        -(np.pi**2) * u / 3,
-        (np.cos(np.pi * safe) - np.sinc(safe)) / safe,
-    )
 
 
 def source_to_image_matrices(case: PropagationCase, extent: SourceExtent) -> Array:

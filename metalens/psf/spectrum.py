@@ -37,11 +37,11 @@ class Source:
     silicon_um: float = 6.0
 
     def __post_init__(self) -> None:
-        if not (self.peak_nm > 0 and self.fwhm_nm > 0 and self.silicon_um > 0):
-            raise PropagationError(f"{self}: peak, width and thickness must be above 0")
-        if self.fwhm_nm < LEAST_FWHM_NM:
+        positive = self.peak_nm > 0 and self.silicon_um > 0
+        if not (positive and self.fwhm_nm >= LEAST_FWHM_NM):
             raise PropagationError(
-                f"{self}: a line of less than {LEAST_FWHM_NM:g} nm is one wavelength; give no width for it"
+                f"{self}: need a peak and a thickness above 0, and a width of "
+                f"{LEAST_FWHM_NM:g} nm or more; a narrower line is one wavelength"
             )
 
 
