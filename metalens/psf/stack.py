@@ -124,6 +124,12 @@ def psf_stack(
         raise PropagationError(
             f"tolerance is {tolerance}, need a relative error above 0 and below 1"
         )
+    places = sensor_distance_um, depths_um, angle_rad, offset_um
+    if any(getattr(place, "requires_grad", False) for place in places):
+        raise PropagationError(
+            "the geometry carries a gradient, but PSFs are differentiable in the maps alone: detach it, and take "
+            "differences of two stacks"
+        )
     maps, waves, weight = _maps(phase_rad, transmission, wavelength_um, weights)
     shape = maps[0].shape
     maps, mixing = _polarised(maps, polarisation, neighbours, pitch_um)
