@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.linalg import interpolative
 
 from metalens.core import legendre
 from metalens.core.arrays import Array
@@ -378,7 +379,8 @@ def _plan_tile(
     dtype: torch.dtype,
 ) -> WindowTile:
     """Operators of a tile. The kernel over its plane waves is sampled on small Legendre
-    grids of window and lens, factorised by an SVD, and interpolated.
+    grids of window and lens, factorised by an SVD from its interpolative decomposition,
+    and interpolated.
 
     Args:
         case: geometry of the tile.
@@ -397,13 +399,13 @@ def _plan_tile(
     ]
     Y, X, y, x = np.ix_(*grids)
     table = _residual_kernel(case, x, y, X, Y) * case.area_um2
-    left, size, right = np.linalg.svd(
-        table.reshape(math.prod(counts.window), -1), full_matrices=False
+    left, size, right = interpolative.svd(
+        table.reshape(math.prod(counts.window), -1), tolerance / 8, rand=False
     )
     rank = _significant_rank(size, tolerance / 2)
     pairs = significant_pairs(size[:rank], depths.strength, tolerance / 2)
     left = (left[:, :rank] * size[:rank]).T.reshape(rank, *counts.window)
-    right = right[:rank].reshape(rank, *counts.lens)
+    right = right.conj().T[:rank].reshape(rank, *counts.lens)
     y_um, x_um = case.window_um
     e_um, s_um = _nodes_um(case, counts.nodes)
     (half_Y, half_X), (half_y, half_x) = case.half_window_um, case.half_size_um
