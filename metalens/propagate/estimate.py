@@ -23,7 +23,7 @@ FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed
 DEPTHS = 5  # largest number of depths that are sampled
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
-RAYS = 12  # points at which a polarisation mixing of their own is formed
+RAYS = 32  # points at which a polarisation mixing of their own is formed
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -3,8 +3,8 @@ from . import neighbour_coupling as neighbour_coupling
 from . import plots as plots
 from . import spectrum as spectrum
 from .budget import NEIGHBOURS as NEIGHBOURS
-from .budget import ErrorBudget as ErrorBudget
 from .budget import Polarisation as Polarisation
+from .budget import PsfErrorBudget as PsfErrorBudget
 from .budget import scalar_error as scalar_error
 from .budget import sine_aperture as sine_aperture
 from .directions import FarField as FarField

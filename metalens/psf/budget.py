@@ -50,7 +50,7 @@ def neighbours_text(rows: NeighbourRows | None) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorBudget:
+class PsfErrorBudget:
     """Relative L2 errors of the PSFs by cause, the worst over angles; nan if unknown.
 
     numerical: of the propagation, measured on the result.
@@ -137,25 +137,25 @@ def _together(*terms: float) -> float:
     return math.hypot(*(term for term in terms if not math.isnan(term)))
 
 
-def worst_of_budgets(budgets: list[ErrorBudget]) -> ErrorBudget:
+def worst_of_budgets(budgets: list[PsfErrorBudget]) -> PsfErrorBudget:
     """The largest of every term of ``budgets``."""
 
     def worst(name: str) -> float:
         known = [getattr(b, name) for b in budgets if not math.isnan(getattr(b, name))]
         return max(known, default=math.nan)
 
-    return ErrorBudget(
-        **{field.name: worst(field.name) for field in fields(ErrorBudget)}
+    return PsfErrorBudget(
+        **{field.name: worst(field.name) for field in fields(PsfErrorBudget)}
     )
 
 
 def with_model(
-    budget: ErrorBudget,
+    budget: PsfErrorBudget,
     lens: Lens,
     angle_rad: tuple[float, float],
     nodes: SpectralNodes,
     polarisation: Polarisation,
-) -> ErrorBudget:
+) -> PsfErrorBudget:
     """The budget of one direction with the errors of spectrum and lens model added.
 
     Model errors are those of a perfect lens of the same aperture. ``proxy`` is the

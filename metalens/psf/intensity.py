@@ -31,7 +31,7 @@ from metalens.propagate import (
     relative_error,
 )
 from metalens.psf import extended
-from metalens.psf.budget import ErrorBudget, worst_of_budgets
+from metalens.psf.budget import PsfErrorBudget, worst_of_budgets
 from metalens.psf.cells import (
     FINER,
     MOST,
@@ -159,7 +159,7 @@ class IntensityResult:
     """
 
     intensity: torch.Tensor
-    budget: ErrorBudget
+    budget: PsfErrorBudget
     reason: str
     power: Any
 
@@ -372,7 +372,7 @@ def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
             total = total + weight * sign * np.abs(field) ** 2
     whole = np.maximum(np.abs(total.sum((1, 2))), 1e-300)
     squares = float((2 * noise**2 / whole).sum() / (total.T**2 / whole**2).sum())
-    budget = ErrorBudget(
+    budget = PsfErrorBudget(
         math.hypot(EXACT, 2 * math.sqrt(squares)),
         polarisation=_mixing_error(request, checked, total),
     )
@@ -451,7 +451,7 @@ def _windowed(
     error = relative_error(checked, values)
     if is_wide:
         error = math.hypot(error, ROUNDING[dtype][1])
-    budget = ErrorBudget(error, polarisation=_mixing_error(request, checked, values))
+    budget = PsfErrorBudget(error, polarisation=_mixing_error(request, checked, values))
     return IntensityResult(total, budget, choice.reason, power)
 
 

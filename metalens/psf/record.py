@@ -13,10 +13,10 @@ from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.store import Provenance, typed_reader
 from metalens.propagate import axis_positions
-from metalens.psf.budget import ErrorBudget
+from metalens.psf.budget import PsfErrorBudget
 
 SourceShape = Literal["disc", "square", "gaussian"]
-NO_BUDGET = ErrorBudget(math.nan)  # its error stands for it
+NO_BUDGET = PsfErrorBudget(math.nan)  # its error stands for it
 
 
 @functools.lru_cache(maxsize=1)
@@ -63,11 +63,11 @@ class PsfStack:
     error: float
     reason: str
     provenance: Provenance = field(default_factory=_made_here)
-    budget: ErrorBudget = NO_BUDGET
+    budget: PsfErrorBudget = NO_BUDGET
 
     def __post_init__(self) -> None:
         if math.isnan(self.budget.numerical):
-            object.__setattr__(self, "budget", ErrorBudget(self.error))
+            object.__setattr__(self, "budget", PsfErrorBudget(self.error))
 
     @property
     def irradiance_per_um2(self) -> Array:
@@ -153,7 +153,7 @@ def load(path: str | Path) -> PsfStack:
     } | stored.arrays
     terms = {
         f.name: stored.attributes.get(f"budget_{f.name}")
-        for f in dataclasses.fields(ErrorBudget)
+        for f in dataclasses.fields(PsfErrorBudget)
     }
-    budget = ErrorBudget(**{n: float(v) for n, v in terms.items() if v is not None})
+    budget = PsfErrorBudget(**{n: float(v) for n, v in terms.items() if v is not None})
     return PsfStack(**fields, provenance=stored.provenance, budget=budget)
