@@ -1,4 +1,4 @@
-"""What is placed on a die: the mask of a lens or a cell of a file made elsewhere, its
+"""What is placed on a die: the mask of a lens or a cell of another file, its
 doses, and boxes around its shapes.
 """
 

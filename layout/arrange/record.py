@@ -47,7 +47,7 @@ class PartInstances:
 class LensPart:
     """A lens on the die, drawn, corrected and checked by itself.
 
-    file: lens.h5, beside the arrangement. name: of its cell, and the beginning of the
+    file: lens.h5, in the folder of the arrangement. name: of its cell, and the beginning of the
     names of its pillars' cells.
     furnished: with marks, label, dose test and witness cells of its own, else with its
     aperture alone; left out: where no [die] is given.
@@ -65,7 +65,7 @@ class LensPart:
 
 @dataclass(frozen=True)
 class CellPart:
-    """A cell of a GDSII or OASIS file made elsewhere.
+    """A cell of another GDSII or OASIS file.
 
     file: beside the arrangement. cell: what is placed, with all below it; left out: the
     file's only top cell.
@@ -143,7 +143,7 @@ class WaferSettings:
         check_positive(self, "pitch_um", "diameter_mm", "mark_um", "mark_width_um")
         if any(abs(1e3 * pitch - round(1e3 * pitch)) > 1e-6 for pitch in self.pitch_um):
             raise ProcessError(
-                f"pitch_um = {list(self.pitch_um)}: need whole nanometres, so that all dies are alike"
+                f"pitch_um = {list(self.pitch_um)}: need whole nanometres, so that all dies are equal"
             )
         for name in ("edge_exclusion_mm", "flat_mm", "notch_mm"):
             if not 0 <= getattr(self, name) < self.diameter_mm / 2:

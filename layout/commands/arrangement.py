@@ -1,4 +1,4 @@
-"""``metalens layout ARRANGEMENT.toml``: every lens made and checked by itself, then all
+"""``metalens layout ARRANGEMENT.toml``: every lens written and checked by itself, then all
 put together in one mask.
 """
 
@@ -45,11 +45,13 @@ def make_floorplan(options: Options) -> int:
     inputs = [options.lens.parent / file for file in named]
     with options.claim_folder(options.output, inputs=inputs) as draft, options.shared():
         work = FloorplanWork(options, record, process, draft.path, options.console.say)
-        made = _whole(work)
-        _write(work, made)
+        library = _whole(work)
+        _write(work, library)
         work.say("report")
-        _accompany(work, made)
-    return options.console.judged(_values(work, made), _text(work, made), work.failures)
+        _accompany(work, library)
+    return options.console.judged(
+        _values(work, library), _text(work, library), work.failures
+    )
 
 
 def _refuse_negative(work: FloorplanWork) -> None:

@@ -43,20 +43,20 @@ def mask_summary(path: Path, top: str | None = None) -> dict[str, Any]:
     }
 
 
-def mask_summary_text(found: dict[str, Any]) -> str:
+def mask_summary_text(summary: dict[str, Any]) -> str:
     """Lines for people.
 
     Args:
-        found: from :func:`mask_summary`.
+        summary: from :func:`mask_summary`.
     """
     lines = [
-        f"{found['file']}: {found['kind']}, {found['shapes']:,} shapes in "
-        f"{found['cells']} cells, database unit {found['unit_nm']:g} nm",
-        f"  top cell{'s' * (len(found['tops']) > 1)} {', '.join(found['tops'][:8])}",
+        f"{summary['file']}: {summary['kind']}, {summary['shapes']:,} shapes in "
+        f"{summary['cells']} cells, database unit {summary['unit_nm']:g} nm",
+        f"  top cell{'s' * (len(summary['tops']) > 1)} {', '.join(summary['tops'][:8])}",
     ]
-    for number, entry in found["layers"].items():
+    for number, entry in summary["layers"].items():
         name = f" {entry['name']}" if entry["name"] else ""
         lines.append(f"  {number}{name}: {entry['shapes']:,}")
-    if found["skipped"]:
-        lines.append(f"  draw nothing: {format_counts(found['skipped'])}")
+    if summary["skipped"]:
+        lines.append(f"  draw nothing: {format_counts(summary['skipped'])}")
     return "\n".join(lines)

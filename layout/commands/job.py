@@ -75,7 +75,7 @@ class LayoutJob:
     say: announces each stage. written: {file name: bytes}. compared: {file name:
     outcome of reading it back}.
     verified: {file name: what the file and the dose table make, by the simulator}.
-    made_rows: the lens that comes out.
+    predicted: sizes of the lens that results.
     """
 
     options: Options
@@ -90,7 +90,7 @@ class LayoutJob:
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, compare.ReadbackComparison] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
-    made_rows: LensRows | None = None
+    predicted: LensRows | None = None
 
     @property
     def failures(self) -> list[str]:

@@ -124,9 +124,9 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
         source: with the height of the pillars.
         rules: process.
     """
-    drawn_nm = np.array([made.diameter_nm for made in plan.classes])
-    made = rules.made_diameter_nm(drawn_nm) + max(0.0, rules.bias.isolated_nm)
-    top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
+    drawn_nm = np.array([pillar.diameter_nm for pillar in plan.classes])
+    made_nm = rules.made_diameter_nm(drawn_nm) + max(0.0, rules.bias.isolated_nm)
+    top, foot = rules.top_foot_nm(made_nm, source.cell.height_um / nm)
     return np.maximum(top, foot)
 
 
@@ -210,13 +210,13 @@ def _verified(
     """Exposure report of a file; keeps the lens that comes out, up to a size."""
     lattice = job.plan.lattices[0]
     if lattice.rows * lattice.columns <= MOST_MADE:
-        job.made_rows = LensRows(job.plan)
+        job.predicted = LensRows(job.plan)
     return verify_exposure(
         content,
         job.plan,
         table,
         job.process,
-        keep=job.made_rows.take if job.made_rows else None,
+        keep=job.predicted.take if job.predicted else None,
     )
 
 
@@ -230,8 +230,8 @@ def _accompany(job: LayoutJob, target: Path) -> None:
         job.plan, job.process, job.fields, job.written, job.verdict
     )
     store.write_text(target / "job.txt", sheet)
-    if job.made_rows is not None:
-        lenses.save(target / "made.h5", job.made_rows.lens(job.source))
+    if job.predicted is not None:
+        lenses.save(target / "made.h5", job.predicted.lens(job.source))
     page.write_mask_page(job, target)
 
 

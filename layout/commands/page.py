@@ -1,4 +1,4 @@
-"""report.html of a mask: what will be made, whether it can be, what was written and how
+"""report.html of a mask: what is drawn, whether it keeps the rules, what was written and how
 it was checked.
 """
 

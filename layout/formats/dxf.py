@@ -92,7 +92,7 @@ def _ezdxf() -> Any:
 
 @contextmanager
 def _fixed_stamps() -> Iterator[None]:
-    """No time stamps and no random identifiers while a drawing is made and written; the
+    """No time stamps and no random identifiers while a drawing is built and written; the
     option of ezdxf, which all its users share, is as before afterwards.
     """
     options = vars(_ezdxf())["options"]  # exported, and not said to be

@@ -29,7 +29,7 @@ def read_gdsii(
     """Read a GDSII file.
 
     Args:
-        limit: most placements, arrays of references taken apart, that are read.
+        limit: most placements, arrays of references expanded, that are read.
         keep: most placements of one structure that are kept; of more only the sums are
             (:mod:`layout.formats.digest`),
             in bounded memory. None: all are kept.

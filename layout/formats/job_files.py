@@ -1,4 +1,4 @@
-"""What the writer's operator gets beside the mask: the write fields in their order, and
+"""What the writer's operator gets with the mask: the write fields in their order, and
 a job sheet as text.
 """
 

@@ -188,7 +188,7 @@ class MaskCell:
     sums: {child: count, sums of x and y, number turned, hash} of its placements, where
         there are more than are kept.
     skipped: elements of the file that draw nothing, by kind.
-    pillars: a lattice of cells beside these.
+    pillars: a lattice of cells in addition.
     """
 
     name: str
@@ -434,7 +434,7 @@ class MaskLibrary:
         total = sum(count * self.cells[name].shapes for name, count in times.items())
         if total > limit:
             raise MaskFileError(
-                f"the mask draws {total:,} shapes when its arrays are taken apart, at "
+                f"the mask draws {total:,} shapes when its arrays are expanded, at "
                 f"most {limit:,} are taken (metalens check --max-shapes sets another "
                 "limit, at 25 to 150 bytes of memory for each)"
             )

@@ -222,8 +222,8 @@ def _vernier(
 ) -> tuple[list[Array], list[Array]]:
     """Bars of a vernier about (0, 0), in database units; the middle one is longer.
 
-    The drawn bars, ``pitch`` apart, stand above the axis. The bars opened in the film,
-    ``pitch + step`` apart, are below it. An upright scale has its drawn bars on the
+    The drawn bars, in steps of ``pitch``, stand above the axis. The bars opened in the film,
+    in steps of ``pitch + step``, are below it. An upright scale has its drawn bars on the
     left.
 
     Returns:

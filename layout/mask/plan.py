@@ -135,7 +135,7 @@ class PillarArray:
     def of(
         cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int
     ) -> "PillarArray":
-        """A square lattice held in memory.
+        """A square lattice in memory.
 
         Args:
             name: of its cell.

@@ -125,7 +125,7 @@ def _steps(
         raise ProcessError(
             f"a pillar would be drawn below one step of {step} nm; check the bias"
         )
-    return np.asarray(np.where(design_nm > 0, drawn, 0))
+    return np.where(design_nm > 0, drawn, 0)
 
 
 def _class(

@@ -458,7 +458,7 @@ def _classes(
 def _redrawn(
     doses: WantedDoses, ladder: DoseLadder, number: int, lookup: Array
 ) -> PillarArray:
-    """A lattice with the numbers of the new classes, held on disk.
+    """A lattice with the numbers of the new classes, in a scratch file.
 
     Args:
         doses: doses of the plan.

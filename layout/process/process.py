@@ -114,7 +114,7 @@ class LayerTable:
 
 @dataclass(frozen=True)
 class EtchProfile:
-    """Shape of what is made.
+    """Shape of the fabricated structure.
 
     sidewall_deg: tilt of the wall from the vertical, above 0 where the foot is wider
     than the top.
@@ -247,7 +247,7 @@ class DieSettings:
     vernier_pitch_um: from bar to bar of the scale that is drawn with the pillars.
     vernier_step_nm: by how much the pitch of the other scale, opened with the aperture,
     is longer: what a bar reads.
-    label: text on the die; left out: made from the lens.
+    label: text on the die; left out: from the lens.
     margin_um: around the aperture, where no size is given.
     """
 
@@ -274,7 +274,7 @@ class DieSettings:
         )
         if self.vernier_pitch_um < 4:
             raise ProcessError(
-                f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for bars that can be seen"
+                f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for visible bars"
             )
 
 
@@ -285,7 +285,7 @@ class Process:
     tone: ``positive``: the drawn shapes become pillars; ``negative``: the gaps between
     pillars are drawn.
     name: on report and job sheet. rules: what can be made. layers: where shapes are
-    drawn. bias: made less drawn size.
+    drawn. bias: fabricated less drawn size.
     etch: how widths change with the density around. exposure: spread of the dose.
     write_field: fields of the writer.
     die: what stands around the lens. spread: of the process, for ``--study`` and the
@@ -369,7 +369,7 @@ class Process:
 
 
 def load_process(path: str | Path | None) -> Process:
-    """Read PROCESS.toml; CSV files that it names lie beside it.
+    """Read PROCESS.toml; CSV files that it names lie in its folder.
 
     Args:
         path: of PROCESS.toml; None: the defaults.

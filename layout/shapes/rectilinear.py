@@ -1,4 +1,4 @@
-"""Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
+"""Polygons of horizontal and vertical edges, cut into rectangles, exactly."""
 
 import itertools
 from collections.abc import Iterable

@@ -30,7 +30,7 @@ def classify_pillars(lens: Lens, sens: ResponseRates) -> tuple[Array, Array, Cur
 
     Returns:
         (y, x) kind of each site, from 1 on, 0 for none; (kinds,) number of pillars of
-        each; and their transmission for local biases (bias,) in um and one made lens.
+        each; and their transmission for local biases (bias,) in um and one process state.
     """
     kinds = PillarKinds.of(lens.diameters)
     index = (kinds.index(lens.diameters) + 1) % (len(kinds.count) + 1)
