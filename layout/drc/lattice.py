@@ -30,7 +30,6 @@ from layout.mask.plan import (
 from layout.process.jit import compile_loop
 from layout.process.process import DesignRules
 from layout.shapes import rectilinear, region
-from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -194,8 +193,8 @@ class _LatticeCheck:
                         rule,
                         value,
                         (
-                            _moved_box(pillar.outline, x, y)
-                            for x, y in self._sites_of(k)
+                            contour_box([pillar.outline + site])
+                            for site in self._sites_of(k)
                         ),
                         count=int(self.counts[k]),
                         layer=pillar.layer[0],
@@ -307,11 +306,11 @@ class _LatticeCheck:
             text=f"feet of etched pillars in {lattice.name}",
         )
 
-    def _sites_of(self, class_number: int) -> Iterator[tuple[int, int]]:
-        """(x, y) of all sites of a class."""
+    def _sites_of(self, class_number: int) -> Iterator[Array]:
+        """(2,) x and y of all sites of a class."""
         for top, block in self.lattice.blocks():
             for row, column in np.argwhere(block == class_number).tolist():
-                yield self._place(top + row, column)
+                yield np.array(self._place(top + row, column))
 
     def _place(self, row: int, column: int) -> tuple[int, int]:
         """(x, y) of a site, database units."""
@@ -635,8 +634,3 @@ def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> N
                 cell=names[first],
                 text=f"{names[first]} to {names[second]}",
             )
-
-
-def _moved_box(outline: Array, x: int, y: int) -> IntBox:
-    """Left, bottom, right, top of an outline about the site (x, y)."""
-    return contour_box([outline + np.array([x, y])])

@@ -54,7 +54,9 @@ def add_die_frame(
             which would overlap, or the label cannot be drawn.
     """
     unit = DatabaseUnits(plan)
-    die = _outline(process, unit, radius_um)
+    size = process.die.size_um or (2 * (radius_um + process.die.margin_um),) * 2
+    half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
+    die = MarkBox(-half_x, -half_y, half_x, half_y)
     classes, lattices, windows = _tests(plan, process, unit, radius_um, die)
     crosses, mark_windows = marks.alignment_crosses(process, unit, die)
     scales, scale_openings = marks.vernier_scales(process, unit, die)
@@ -158,14 +160,6 @@ def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> A
     """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
     return polygon.disc_polygon(radius, centre, count, grid)
-
-
-def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
-    """Outline of the die about the lens axis; without a size, as large as needed."""
-    die = process.die
-    size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
-    half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
-    return MarkBox(-half_x, -half_y, half_x, half_y)
 
 
 def _tests(

@@ -80,11 +80,6 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
             float(study.change.mean()),
             float(study.change.max()),
         ],
-        [
-            "move of its centroid / nm",
-            float(study.moved_nm.mean()),
-            float(study.moved_nm.max()),
-        ],
     ]
     text = (
         f"Each of {study.fields} fields misplaced by up to ±{study.stitching_nm:g} nm along x and y, evenly spread, "
@@ -156,7 +151,7 @@ def tolerance_section(lens: Lens, process: Process, rates: ResponseRates) -> Sec
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
         f"derivatives of the solver (known to {100 * rates.error:.0f} %), {route}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
-    ) + _beside(lens, process)
+    ) + _limits_text(lens, process)
     about = (
         "Effect of each cause. I(z): axial information (Eq. 11), summed over depths."
     )
@@ -165,7 +160,7 @@ def tolerance_section(lens: Lens, process: Process, rates: ResponseRates) -> Sec
     return Section("Tolerance", text, tables)
 
 
-def _beside(lens: Lens, process: Process) -> str:
+def _limits_text(lens: Lens, process: Process) -> str:
     """Text on what the tolerances leave out.
 
     That is light that keeps its handedness, and sidewalls of the process that differ

@@ -7,7 +7,7 @@ import numpy as np
 
 from layout.mask.fields import FieldPlan
 from layout.process.process import Process
-from layout.study.focus import FocusSums, FocusWindow, focus_window, prepare_focus
+from layout.study.focus import FocusSums, focus_window, prepare_focus
 from metalens.core.arrays import Array
 from metalens.lens import Lens
 from metalens.psf import find_peak
@@ -18,14 +18,12 @@ class StitchReport:
     """Change of the PSF over random field offsets, uniform within +- ``stitching_nm``.
 
     strehl: (draws,) peak intensity relative to perfect fields. change: (draws,)
-    relative L2 change of the PSF on the window. moved_nm: (draws,) move of its
-    centroid. fields: number that hold pillars.
+    relative L2 change of the PSF on the window. fields: number that hold pillars.
     """
 
     stitching_nm: float
     strehl: Array
     change: Array
-    moved_nm: Array
     fields: int
 
 
@@ -68,14 +66,8 @@ def simulate_stitching(
     perfect = abs(unmoved) ** 2
     psf = abs(amplitude) ** 2
     change = np.sqrt(((psf - perfect) ** 2).sum((1, 2)) / (perfect**2).sum())
-    moved = (
-        np.hypot(
-            *(_centroid(psf, focus.window) - _centroid(perfect[None], focus.window))
-        )
-        * 1e3
-    )
     strehl = np.array([find_peak(image)[2] for image in psf]) / find_peak(perfect)[2]
-    return StitchReport(process.write_field.stitching_nm, strehl, change, moved, fields)
+    return StitchReport(process.write_field.stitching_nm, strehl, change, fields)
 
 
 def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, Array]:
@@ -126,11 +118,3 @@ def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array,
         (f[1, 1] + f[-1, -1] - along_x - along_y) / 2 + f[0, 0],
     ]
     return f[0, 0].sum(0), np.stack(terms)
-
-
-def _centroid(psf: Array, window: FocusWindow) -> Array:
-    """(2, draws) x and y of the centroids of PSFs (draws, y, x), um."""
-    total = psf.sum((1, 2))
-    return np.stack(
-        [(psf.sum(1) @ window.x_um) / total, (psf.sum(2) @ window.y_um) / total]
-    )
