@@ -621,3 +621,23 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
     assert (
         check_plan(plan, PROCESS.rules).shapes > (made.diameters.diameter_um > 0).sum()
     )
+
+
+@pytest.mark.parametrize(("shape", "classes"), [(Rectangle(0.55), 12), (U, 24)])
+def test_turns_of_a_shape_that_repeats_after_half_a_turn_are_half_as_many(
+    shape, classes
+):
+    """All turns in steps of 15 degrees."""
+    made = lens(shape, rows=4, columns=6)
+    grid = DiameterMap(
+        np.full((4, 6), 0.24),
+        0.4,
+        angle_rad=np.radians(15.0 * np.arange(24)).reshape(4, 6),
+    )
+    rules = dataclasses.replace(PROCESS.rules, angle_step_deg=15.0)
+    plan = build.plan(
+        dataclasses.replace(made, diameters=grid),
+        dataclasses.replace(PROCESS, rules=rules),
+        furnished=False,
+    )
+    assert len(plan.classes) == classes
