@@ -280,22 +280,17 @@ def _wave_front(
     if scatter > ROUGH:
         why = f"meets no wave front: phases scatter by {scatter:.2f} rad rms"
         raise PropagationError(_failure_text(lens, angle_rad, why))
-    by_power = dict(zip(POWERS, series / k, strict=True))
-    slope = np.array([by_power[1, 0], by_power[0, 1]]) / radius
-    deviation_columns = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
-    deviations = [
-        _curvature(dict(zip(POWERS, column, strict=True)), radius)
-        for column in deviation_columns.T
-    ]
-    return slope, _curvature(by_power, radius), deviations
+    slope = series[[POWERS.index((1, 0)), POWERS.index((0, 1))]] / (k * radius)
+    columns = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
+    deviations = [_curvature(column, radius) for column in columns.T]
+    return slope, _curvature(series / k, radius), deviations
 
 
-def _curvature(by_power: dict[tuple[int, int], float], radius: float) -> Array:
+def _curvature(series: Array, radius: float) -> Array:
     """(2, 2) second derivatives at 0 of a polynomial in place / radius, per um²."""
-    mixed = by_power[1, 1]
-    return (
-        np.array([[2 * by_power[2, 0], mixed], [mixed, 2 * by_power[0, 2]]]) / radius**2
-    )
+    by_power = dict(zip(POWERS, series, strict=True))
+    xx, xy, yy = by_power[2, 0], by_power[1, 1], by_power[0, 2]
+    return np.array([[2 * xx, xy], [xy, 2 * yy]]) / radius**2
 
 
 def _patch(

@@ -62,11 +62,6 @@ def read_npz(path: Path) -> dict[str, Array]:
         raise LensError(f"{path}: not an NPZ file: {error}") from error
 
 
-def _check_size(size: int) -> None:
-    if size > _LARGEST:
-        raise ValueError(f"holds {size:,} bytes, need at most {_LARGEST:,}")
-
-
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     """Type and bytes of the data elements of a MATLAB file of level 5 in turn.
 
@@ -111,7 +106,8 @@ def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
             stream = zlib.decompressobj()
             tag = stream.decompress(data, 8)
             size = int(np.frombuffer(tag, f"{order}u4")[1])
-            _check_size(size)
+            if size > _LARGEST:
+                raise ValueError(f"holds {size:,} bytes, need at most {_LARGEST:,}")
             data = stream.decompress(stream.unconsumed_tail, size + 1)
             if not stream.eof or len(data) != size:
                 raise ValueError("cut short")

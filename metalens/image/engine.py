@@ -83,7 +83,14 @@ def imager(
     leave it above the
         tolerance (``edge``: light that the rim of a small aperture diffracts beyond the window).
     """
-    _check(field, polarisation)
+    if not all(abs(angle) < math.pi / 2 for angle in field):
+        raise SceneError(
+            f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2"
+        )
+    if polarisation not in get_args(Polarisation):
+        raise SceneError(
+            f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}"
+        )
     if layers is None:
         layers = lens.layers if isinstance(lens, Lens) else Layers()
     wave = wave_of(lens, layers, scene_grid.window * scene_grid.step_um, distance_um)
@@ -121,18 +128,6 @@ def imager(
     if stray is not None:
         stray = stray.to(device)
     return replace(prepared, parts=parts, stray=stray)
-
-
-def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
-    """Raise for a field angle beyond 90 degrees or an unknown polarisation."""
-    if not all(abs(angle) < math.pi / 2 for angle in field):
-        raise SceneError(
-            f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2"
-        )
-    if polarisation not in get_args(Polarisation):
-        raise SceneError(
-            f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}"
-        )
 
 
 def node_psfs(

@@ -163,14 +163,14 @@ def gathering_error(
     grid = sampling(optics, window, wavelength_um)
     # points per sample, at half of Nyquist's step: its triangle is then summed to
     # 2e-3 of fine detail, at Nyquist's step to 5e-3
-    finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
+    per_sample = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
     most = 256  # points along an axis
-    finer *= 2 if (window.samples + 2) * 2 * finer <= most else 1
-    count = min(window.samples, max(most // finer - 2, 3) | 1)
-    share = _triangles(count, finer)
+    per_sample *= 2 if (window.samples + 2) * 2 * per_sample <= most else 1
+    count = min(window.samples, max(most // per_sample - 2, 3) | 1)
+    weights = _triangles(count, per_sample)
     edge = (window.samples - count) // 2
     middle = slice(edge, edge + count)
-    sampled = window.step_um, count + 1, finer
+    sampled = window.step_um, count + 1, per_sample
     with torch.no_grad():
         light = [
             _of_pillars(optics, wave, wavelength_um, (place, at[1]), sampled)
@@ -179,21 +179,23 @@ def gathering_error(
         psf = psfs(
             optics, at[0], depths_um=at[1], wavelength_um=wavelength_um, window=window
         )[..., middle, middle]
-    reference = share @ torch.stack(light) @ share.T
+    reference = weights @ torch.stack(light) @ weights.T
     units = [part / part.sum((-1, -2), keepdim=True) for part in (psf, reference)]
     return weigh_by_light(texture_error(*units), psf.sum((-1, -2)))
 
 
-def _triangles(count: int, finer: int) -> Tensor:
+def _triangles(count: int, per_sample: int) -> Tensor:
     """(samples, points) weights that average points over each sample: a unit triangle.
 
     It is the convolution of the source's square with that of the sample.
 
     Args:
         count: samples; the points cover one more.
-        finer: points per sample.
+        per_sample: points per sample.
     """
-    points = (np.arange((count + 1) * finer) - ((count + 1) * finer - 1) / 2) / finer
+    points = (
+        np.arange((count + 1) * per_sample) - ((count + 1) * per_sample - 1) / 2
+    ) / per_sample
     distance = np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None])
     return torch.from_numpy(np.maximum(1 - distance, 0))
 
@@ -214,7 +216,7 @@ def _of_pillars(
         sampled: step of a sample in um, number of samples, points per sample.
     """
     place, depths_um = at
-    step_um, count, finer = sampled
+    step_um, count, per_sample = sampled
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place.cpu() / after.reduced_um
     slope = math.hypot(*tangents.tolist())
@@ -231,7 +233,7 @@ def _of_pillars(
         depths_um=depths_um.tolist(),
         angle_rad=torch.atan(tangents).tolist(),
         window_um=count * step_um,
-        samples=count * finer,
+        samples=count * per_sample,
         layers=optics.layers,
         offset_um=(place.cpu() - landing).tolist(),
         integrate=False,
