@@ -161,7 +161,7 @@ class PhaseMap:
         if self.levels is not None and (self.levels < 2 or self.unit is not None):
             raise ConfigError(
                 f"levels = {self.levels}, unit = {self.unit} of the phase map: "
-                "need 2 levels or more, and no unit beside them"
+                "need 2 levels or more, and no unit with them"
             )
         if self.pitch_um is not None and not np.min(self.pitch_um) > 0:
             raise ConfigError(

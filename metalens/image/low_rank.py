@@ -400,14 +400,14 @@ def smooth_planes(planes: Tensor, nodes: torch.Size, error: float) -> Tensor:
     """(depths, y, x) planes without rings, by least squares with the fewest splines.
 
     The image of an even plane is smooth. Sums over samples and splines between nodes
-    have rings of 0.1 to 0.2 % rms beside it. Splines are fitted where all light reaches.
+    add rings of 0.1 to 0.2 % rms. Splines are fitted where all light reaches.
 
     Args:
         planes: (depths, y, x) images of uniformly illuminated planes.
         nodes: (rows, columns, depths, h, w) of the PSFs.
         error: relative RMS change of a plane that is allowed.
     """
-    frame = planes.shape[-2:]
+    frame = planes.shape[1], planes.shape[2]
     inside = [
         slice(n // 2, size - n // 2) for n, size in zip(nodes[-2:], frame, strict=True)
     ]

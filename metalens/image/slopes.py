@@ -10,12 +10,7 @@ from torch.autograd.function import once_differentiable
 from metalens.image.low_rank import PsfField, fast_shape, frame_maps
 from metalens.image.plan import ImagingPlan, sum_over_spectrum
 from metalens.image.points import Optics, psfs
-from metalens.image.splines import (
-    TAPS,
-    depth_position,
-    spline_coefficients,
-    spline_taps,
-)
+from metalens.image.splines import depth_position, spline_basis, spline_coefficients
 
 
 def by_nodes(
@@ -38,7 +33,9 @@ def by_nodes(
         asked: numbers of the nodes whose derivatives are computed, those of other nodes
             being 0; None for all.
     """
-    shares = depth_shares(depth_um, field.depths_um)
+    vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
+    unit = depth_position(depth_um, vergence)
+    shares = spline_basis(unit, len(field.depths_um)).movedim(-1, 0)
     options = field.illumination.detach(), illuminated, asked
     zeros: Tensor = _ByNodes.apply(field.psf, shares, content, options)  # type: ignore[no-untyped-call]
     return zeros
@@ -88,21 +85,6 @@ class _ByNodes(torch.autograd.Function):
         if illuminated:
             by_psf *= illumination[..., None, None].to(by_psf)
         return by_psf, None, None, None
-
-
-def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
-    """(coefficients, …) value of each B-spline in 1/z at these depths.
-
-    Args:
-        depth_um: (…) depths of the sources.
-        depths_um: (depths,) nodes, at equal steps of 1/z, ascending.
-    """
-    nodes = len(depths_um)
-    vergence = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
-    first, taps = spline_taps(depth_position(depth_um, vergence), nodes)
-    number = first[..., None] + torch.arange(TAPS, device=first.device)
-    shares = taps.new_zeros(*depth_um.shape, max(nodes + 2, TAPS))
-    return shares.scatter_(-1, number, taps).movedim(-1, 0)
 
 
 def node_light(optics: Optics, plan: ImagingPlan) -> Tensor:

@@ -54,14 +54,23 @@ def spline_coefficients(nodes: int) -> Tensor:
     return inverse[:, :nodes]
 
 
+def spline_basis(unit: Tensor, nodes: int) -> Tensor:
+    """(…, coefficients) value of each B-spline of an axis.
+
+    Args:
+        unit: (…) positions from the first node, 0, to the last, 1.
+        nodes: number of nodes.
+    """
+    first, taps = spline_taps(unit, nodes)
+    number = first[..., None] + torch.arange(TAPS, device=first.device)
+    basis = taps.new_zeros(*unit.shape, max(nodes + 2, TAPS))
+    return basis.scatter_(-1, number, taps)
+
+
 def spline_matrix(unit: Tensor, nodes: int) -> Tensor:
     """(positions, nodes) interpolation at positions 0 … 1 of an axis, float64.
 
     Args:
         unit: (positions,) from the first node, 0, to the last, 1.
     """
-    first, taps = spline_taps(unit.double(), nodes)
-    coefficients = spline_coefficients(nodes)
-    basis = torch.zeros(len(unit), len(coefficients), dtype=torch.float64)
-    basis.scatter_(1, first[:, None] + torch.arange(TAPS), taps)
-    return basis @ coefficients
+    return spline_basis(unit.double(), nodes) @ spline_coefficients(nodes)
