@@ -142,9 +142,9 @@ class Sweep:
         """
         if self.tolerance is not None:
             return self
-        kind = (
-            "axes" if self.lengths_um is not None else "modal" if cell.round else "rcwa"
-        )
+        kind = "modal" if cell.round else "rcwa"
+        if self.lengths_um is not None:
+            kind = "axes"
         return dataclasses.replace(self, tolerance=USUAL[kind])
 
     def span_um(self, cell: Cell) -> tuple[float, float]:
