@@ -31,7 +31,7 @@ class WithinModel:
     is as stated; empty where not computed.
 
     covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by
-    profile over all valleys.
+    profile over all modes.
     draws: (m, p) of the posterior where it is no parabola.
     """
 

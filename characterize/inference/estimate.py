@@ -53,7 +53,7 @@ from metalens.lens import Lens
 
 _ROUGH = 0.1  # relative error of the slopes of pillars above which it is said
 # score tests, shifts by unstated effects, and stated values that the frames contradict
-Looked = tuple[list[ScoreTest], UnmodelledShifts, list[ResidualFinding]]
+ResidualAnalysis = tuple[list[ScoreTest], UnmodelledShifts, list[ResidualFinding]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def _fit(
     prior = multistart.prior_of(("distance_um",), known, lens)
     reach_um = float(min(2 * prior.sigma[0], prior.high[0]))
     arrangement = find_arrangement(
-        model, data, scan_um=scan_um, start=start, reach_um=reach_um
+        model, data, start, scan_um=scan_um, reach_um=reach_um
     )
     task = SearchTask(
         model.about(multistart.window_um(arrangement, model)),
@@ -151,21 +151,21 @@ def _fit(
         )
     task, ends = multistart.search_modes(task)
     task, ends = multistart.place_windows(task, ends)
-    task, ends, looked = _with_likely_causes(task, ends, frames.gain, cautions)
-    _refuse(_problems(task, ends[0], frames.gain), options, looked[0])
+    task, ends, analysis = _with_likely_causes(task, ends, frames.gain, cautions)
+    _refuse(_problems(task, ends[0], frames.gain), options, analysis[0])
     posterior = uncertainty.explore_posterior(task, ends, frames.gain)
     if posterior.best is not ends[0]:
         tests, shifts = unmodelled_effects.run_score_tests(task, posterior.best)
-        looked = tests, shifts, looked[2]
-    result = _result(capture, task, posterior, cautions, frames.gain, looked)
-    _refuse(result.problems, options, looked[0])
+        analysis = tests, shifts, analysis[2]
+    result = _result(capture, task, posterior, cautions, frames.gain, analysis)
+    _refuse(result.problems, options, analysis[0])
     return result
 
 
 def _refuse(
     problems: Sequence[str], options: FitOptions, score_tests: list[ScoreTest]
 ) -> None:
-    """Raise FitRefused with the problems and the causes the residuals lean to."""
+    """Raise FitRefused with the problems and the effects that score tests name."""
     if problems and not options.insist:
         leaning = (
             finding.words for finding in unmodelled_effects.score_test_text(score_tests)
@@ -176,7 +176,7 @@ def _refuse(
 
 def _with_likely_causes(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
-) -> tuple[SearchTask, list[FitSolution], Looked]:
+) -> tuple[SearchTask, list[FitSolution], ResidualAnalysis]:
     """The task with the parameters of likely causes (:func:`unmodelled_effects.to_fit`) freed.
 
     At most four, one after the other, each the largest fall of the misfit; none without
@@ -252,16 +252,16 @@ def _result(
     posterior: FitPosterior,
     cautions: list[str],
     gain: SensorNoise,
-    looked: Looked,
+    analysis: ResidualAnalysis,
 ) -> AsBuilt:
     """The as-built lens of a posterior, with its checks, intervals and texts.
 
     Errors of causes that nobody stated widen covariance and intervals.
 
     Args:
-        looked: score tests, shifts by unstated effects, contradicted statements.
+        analysis: score tests, shifts by unstated effects, contradicted statements.
     """
-    tests, unstated, doubts = looked
+    tests, unstated, doubts = analysis
     model, data, names = task.model, task.data, task.names
     solution, value = posterior.best, posterior.best.value
     fitted = dict(zip(names, value.tolist(), strict=True))

@@ -19,7 +19,7 @@ from characterize.captures import (
     shift_frames,
 )
 from characterize.inference.leastsquares import FitImages
-from characterize.model import PLACE, ForwardModel, FrameSetting, parameter_vector
+from characterize.model import PLACE, ForwardModel, FrameSetting
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitRefused
@@ -85,10 +85,10 @@ def few_frames(setting: FrameSetting) -> Array:
 def find_arrangement(
     model: ForwardModel,
     data: FitImages,
+    start: Array,
     *,
     scan_um: float,
-    start: Array | None = None,
-    reach_um: float = 0.0,
+    reach_um: float,
 ) -> FrameArrangement:
     """Stage zero and orientation of the frames, by comparison with the design.
 
@@ -101,15 +101,14 @@ def find_arrangement(
     Args:
         model: the forward model.
         data: frames, masks and noise that are fitted.
+        start: all parameters about which is searched.
         scan_um: half range of the stage zero, um.
-        start: (p,) parameters to start from; the nominal ones without it.
         reach_um: half range of the distance, um; 0 for no scan.
 
     Raises:
         FitRefused: frames of another lens, or in another order than stated.
     """
     frames = _Frames.of(model, data)
-    start = parameter_vector() if start is None else start.copy()
     nearest = float(model.setting.depth_um.min())
     zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS)
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))

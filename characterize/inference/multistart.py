@@ -1,5 +1,5 @@
-"""Where a fit may end: short fits from many starts, the best of them to the end, and
-every other valley as good.
+"""Modes of the posterior by multistart: short fits from many starts, the best of them
+to the end.
 """
 
 import contextlib
@@ -34,13 +34,13 @@ from metalens.fabrication import wavelength_scale
 from metalens.lens import Lens
 
 WAVES_RAD = 0.9
-MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
+MODES_WITHIN = 10.0  # rise of -2 ln L up to which another mode is reported
 _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-_LEANING_RAD = 0.3  # of the starts that look for a twin
+_LEANING_RAD = 0.3  # of the astigmatic starts
 _ASIDE_UM = 50.0  # largest offset of a window
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
-_PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of a prior
+_PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of the prior
 _TRIAL = SolverSettings(iterations=6, step_tolerance=0.5, near=math.inf, finish=False)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 _WORTH = 10.0
@@ -137,7 +137,7 @@ def find_other_modes(
     """The modes, and those that other starts lead to, until the best stays.
 
     Starts are ``begins``, mirror images of the best (:func:`mirrored_starts`), and
-    places along the bias (:func:`starts_along`).
+    places along the bias (:func:`starts_along_bias`).
 
     Args:
         task: model, frames, priors and arrangement of the search.
@@ -146,9 +146,7 @@ def find_other_modes(
     """
     for _ in range(_AGAIN):
         best = ends[0]
-        starts = [*begins, *mirrored_starts(task, best)]
-        if "bias_nm" in task.names:
-            starts += starts_along(task, best, "bias_nm")
+        starts = [*begins, *mirrored_starts(task, best), *starts_along_bias(task, best)]
         ends = distinct_modes([*ends, *follow_starts(task, ends, starts)])
         if ends[0].merit > best.merit - 1:
             break
@@ -156,16 +154,17 @@ def find_other_modes(
     return ends
 
 
-def starts_along(task: SearchTask, best: FitSolution, name: str) -> list[Array]:
-    """(p,) starts at places of a parameter across its prior, the others at their
-    conditional mean.
+def starts_along_bias(task: SearchTask, best: FitSolution) -> list[Array]:
+    """(p,) starts at biases across their prior, the others at their conditional mean;
+    none where the bias is fixed.
 
     Args:
         task: model, frames, priors and arrangement of the search.
         best: the best fit so far.
-        name: of the parameter.
     """
-    i = task.names.index(name)
+    if "bias_nm" not in task.names:
+        return []
+    i = task.names.index("bias_nm")
     prior = task.prior
     along = best.covariance[:, i] / best.covariance[i, i]
     sigma = min(prior.sigma[i], (prior.high[i] - prior.low[i]) / 4)
