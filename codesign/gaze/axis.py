@@ -4,7 +4,9 @@ Camera frame: z towards the eye, x right and y down on the image.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,7 +35,7 @@ class EyeGeometry:
             )
 
 
-def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Tensor:
+def optical_axis(pupil_mm: Any, slip_mm: Any, geometry: EyeGeometry) -> Any:
     """(batch, 3) optical axis: the ray through the pupil's image meets the sphere on
     which the pupil moves.
 
@@ -41,31 +43,32 @@ def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Te
     u the first intersection is at t = u·C - sqrt((u·C)² - |C|² + R²). A ray that
     misses gives the place on the sphere nearest to it, with a finite gradient.
 
+    Arrays of numpy or torch; differentiable.
+
     Args:
         pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the
             lens axis.
         slip_mm: (batch, 3) displacement of the camera. geometry: of the person.
     """
+    xp: Any = torch if isinstance(pupil_mm, Tensor) else np
     x, y = pupil_mm[..., 0], pupil_mm[..., 1]
-    ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
-    ray = ray / ray.norm(dim=-1, keepdim=True)
-    centre = (
-        torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
-    )
+    ray = _unit(xp.stack([x, y, xp.full_like(x, geometry.sensor_distance_mm)], -1))
+    centre = xp.asarray(geometry.centre_mm, dtype=ray.dtype) - slip_mm
     along = (ray * centre).sum(-1)
     # from the closest point of the ray to the centre
     perpendicular = centre - along[..., None] * ray
     discriminant = geometry.radius_mm**2 - (perpendicular**2).sum(-1)
     hit = discriminant > 0
-    depth = (
-        torch.sqrt(torch.where(hit, discriminant, torch.ones_like(discriminant))) * hit
-    )
-    offset = -perpendicular - depth[..., None] * ray
-    direction: Tensor = offset / offset.norm(dim=-1, keepdim=True)
-    return direction
+    depth = xp.sqrt(xp.where(hit, discriminant, 1.0)) * hit
+    return _unit(-perpendicular - depth[..., None] * ray)
 
 
-def angle_rad(one: Tensor, other: Tensor) -> Tensor:
+def _unit(vectors: Any) -> Any:
+    """Vectors (..., 3) over their lengths."""
+    return vectors / ((vectors**2).sum(-1) ** 0.5)[..., None]
+
+
+def angle_rad(one: Any, other: Any) -> Any:
     """(batch,) angle between directions, 2 atan2(|a - b|, |a + b|) of unit vectors,
     rad.
 
@@ -74,10 +77,8 @@ def angle_rad(one: Tensor, other: Tensor) -> Tensor:
     Args:
         one: to compare. other: the reference.
     """
-    a = one / one.norm(dim=-1, keepdim=True)
-    b = other / other.norm(dim=-1, keepdim=True)
+    xp: Any = torch if isinstance(one, Tensor) else np
+    a, b = _unit(one), _unit(other)
     square = ((a - b) ** 2).sum(-1)
-    distance = torch.sqrt(torch.where(square > 0, square, torch.ones_like(square))) * (
-        square > 0
-    )
-    return 2 * torch.atan2(distance, (a + b).norm(dim=-1))
+    distance = xp.sqrt(xp.where(square > 0, square, 1.0)) * (square > 0)
+    return 2 * xp.atan2(distance, ((a + b) ** 2).sum(-1) ** 0.5)

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.optimize import least_squares
 
 from codesign.eye import CameraRig
@@ -59,10 +58,8 @@ class PersonalGaze:
         geometry = EyeGeometry(
             (x, y, z), self.mean.radius_mm + self.own[3], self.mean.sensor_distance_mm
         )
-        ray = optical_axis(
-            torch.from_numpy(pupil_mm), torch.from_numpy(-slip_mm), geometry
-        )
-        angles = face_angles(ray.numpy(), self.rig) + self.own[4:6]
+        ray = optical_axis(pupil_mm, -slip_mm, geometry)
+        angles = face_angles(ray, self.rig) + self.own[4:6]
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 
@@ -216,8 +213,8 @@ def angle_deg(one: Array, other: Array) -> Array:
     Args:
         one: to compare. other: the reference.
     """
-    a, b = (torch.from_numpy(gaze_direction(np.radians(v))) for v in (one, other))
-    return np.asarray(np.degrees(angle_rad(a, b).numpy()))
+    a, b = (gaze_direction(np.radians(v)) for v in (one, other))
+    return np.asarray(np.degrees(angle_rad(a, b)))
 
 
 def gaze_direction(angles_rad: Array) -> Array:

@@ -217,10 +217,6 @@ def _steps(samples: Tensor, reach: int) -> Tensor:
     kinds = []
     for taps in STEPS:
         norm = math.sqrt(sum(weight**2 for _, _, weight in taps))
-        kinds.append(
-            sum(
-                (weight / norm * shifted(x, y) for x, y, weight in taps),
-                torch.zeros_like(samples),
-            )
-        )
+        first, *rest = (weight / norm * shifted(x, y) for x, y, weight in taps)
+        kinds.append(sum(rest, first))
     return torch.cat(kinds, 1)
