@@ -322,7 +322,7 @@ def describe_image(
             return record | {"error": error}
         imager = make_imager(settings, coefficients_rad, frame, margin=margin)
         return record | {
-            "error": float(getattr(imager, "error", math.nan)),
+            "error": imager.error,
             "above": image_tolerance_problem(settings, imager),
         }
     except (SceneError, PropagationError) as problem:

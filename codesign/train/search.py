@@ -103,26 +103,25 @@ def search_architectures(
     """
     settings = run.settings
     people = people_of(run, VALIDATION, settings.validation_batches)
-    shared_frames = (
-        None
-        if settings.search.inner_steps
-        else _measuring_and_people_frames(run.trainer, people)
-    )
+
+    def frames_through(trainer: Trainer) -> tuple[list[Tensor], assess.SensorFrames]:
+        """Training frames to measure batch statistics on, and frames of people."""
+        return assess.training_frames(trainer), assess.frames_of(trainer, people)
+
     plan = settings.search
+    shared = None if plan.inner_steps else frames_through(run.trainer)
     if "architecture" in settings.run.frozen:
         plan = EvolutionSettings(
             population=1, tournament=1, rounds=1, inner_steps=plan.inner_steps
         )
 
     def gaze_error(architecture: Architecture, budget: float) -> float:
-        if shared_frames is None:
+        trainer = run.trainer
+        if shared is None:
             trainer = specialise_candidate(run, architecture, budget)
-            measured, shown = _measuring_and_people_frames(trainer, people)
-        else:
-            trainer = run.trainer
-            measured, shown = shared_frames
+        measured, of_people = shared or frames_through(trainer)
         recalibrate_batch_norm(trainer.model.net, architecture, measured)
-        error_deg = assess.gaze_error_deg(trainer, architecture, people, shown)
+        error_deg = assess.gaze_error_deg(trainer, architecture, people, of_people)
         trainer.model.net.train()
         return error_deg
 
@@ -143,10 +142,3 @@ def search_architectures(
             reported = len(state.history)
             run.searches[i:] = [state]
             save_run(path, run)
-
-
-def _measuring_and_people_frames(
-    trainer: Trainer, people: bench.PeopleFrames
-) -> tuple[list[Tensor], assess.SensorFrames]:
-    """Training frames to measure batch statistics on, and frames of people."""
-    return assess.training_frames(trainer), assess.frames_of(trainer, people)
