@@ -176,6 +176,17 @@ def macs_of_size(
     return interpolate_counts(network_cost(space, architecture).at, size)
 
 
+@functools.lru_cache(maxsize=4096)
+def count_macs(space: SearchSpace, architecture: Architecture, size: float) -> float:
+    """:func:`macs_of_size` as a number, cached: training asks for the same every step.
+
+    Args:
+        space: architectures to choose from. architecture: member of the search space.
+        size: pixels along the edge of the input.
+    """
+    return float(macs_of_size(space, architecture, size))
+
+
 def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
     """Monotone cubic interpolation of integer-size counts at a continuous size.
 

@@ -521,7 +521,10 @@ class Trainer:
             pixels = size_um / pitch_um * member.resolution
             return cost.macs_of_size(space, member, pixels)
 
-        members = self._members(lambda a: float(macs_at(a, pitch.detach())))
+        pixels = size_um / float(pitch.detach())
+        members = self._members(
+            lambda a: cost.count_macs(space, a, pixels * a.resolution)
+        )
         resized = {a: pitch_moves and a.resolution < 1 for a in members}
         frames = {
             coarser: self._read_pixels(light, pitch, coarser)
