@@ -125,7 +125,7 @@ class CapturePlan:
 
     depth_um, angle_deg, exposure: (n,) of the frames.
     names, sigma: (p,) parameters and their standard errors within the model.
-    untold: (p,) standard deviation by causes that nobody states.
+    unstated_sigma: (p,) standard deviation by causes that nobody states.
     warnings: sentences on what these frames leave open.
     """
 
@@ -134,7 +134,7 @@ class CapturePlan:
     exposure: Array
     names: tuple[str, ...]
     sigma: Array
-    untold: Array
+    unstated_sigma: Array
     warnings: tuple[str, ...] = ()
 
 
@@ -292,7 +292,8 @@ def _missed_requirements(
     for requirement in requirements:
         if requirement.name not in names:
             sentences.append(
-                f"{requirement.name} is held, not fitted: no frame changes its interval"
+                f"{requirement.name} is fixed, not fitted: no frame changes its "
+                "interval"
             )
             continue
         index = names.index(requirement.name)

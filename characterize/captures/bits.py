@@ -13,7 +13,7 @@ _ROUNDING = 0.01  # counts: float32 keeps a share of 65535 to 0.004
 
 
 def right_align(
-    images: Array, bits: int | None, where: str, *, beside: Sequence[Array] = ()
+    images: Array, bits: int | None, where: str, *, companions: Sequence[Array] = ()
 ) -> tuple[Array, int, str, tuple[Array, ...]]:
     """Undo a left shift of counts in 16-bit words, and what is stated as ``bits``: a
     stretch over them, or shares of full scale.
@@ -26,18 +26,18 @@ def right_align(
         images: (n, y, x) frames.
         bits: of the converter, as stated; None: enough for the counts.
         where: file or folder, for messages.
-        beside: dark and flat. All tell of their shift together and are shifted alike: a
-            dark frame by itself fits into the bits that its shift takes.
+        companions: dark and flat. All stacks have one shift: a dark frame by itself
+            fits into the bits that its shift takes.
 
     Returns:
-        (counts, bits, note in words, counts of those beside).
+        (counts, bits, note in words, counts of the companions).
 
     Raises:
         CaptureError: the counts lie neither in the lowest of the stated bits nor in the
             highest of 16, or are real and above the stated bits; shares of full scale
             of which no counts can be made; unsigned words saved as signed ones.
     """
-    stacks = [images, *beside]
+    stacks = [images, *companions]
     if any(stack.dtype == np.int16 and stack.min() < _WRAPPED for stack in stacks):
         raise CaptureError(
             f"{where}: signed counts far below 0: words of 16 bits without a sign that "

@@ -1,5 +1,5 @@
 """Bench captures as they lie on disk: frames, stage positions, dark and flat, with
-their bit depth found out.
+their bit depth.
 """
 
 import dataclasses
@@ -205,7 +205,7 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
 
     Args:
         path: the file.
-        colours: which channel is lit, and how a mosaic lies.
+        colours: illuminated channel, and layout of a mosaic.
 
     Raises:
         CaptureError: unknown, lossy or truncated.
@@ -282,7 +282,7 @@ def _load_folder(path: Path) -> Capture:
     colours = ColourChannels.of(description, str(path))
     order = axes.stated_axes(description, str(path))
     texts = [
-        *(stage.left_out(files, rows) if rows else ()),
+        *(stage.unlisted_images_text(files, rows) if rows else ()),
         *stage.unread_keys_text(description),
         *folder.unread_images_text(path, companion_files),
     ]
@@ -307,7 +307,7 @@ def _load_folder(path: Path) -> Capture:
     ]
     bits = description.pop("bits", None)
     frames, depth, note, aligned = right_align(
-        frames, bits, str(path), beside=tuple(stacks.values())
+        frames, bits, str(path), companions=tuple(stacks.values())
     )
     aligned_companions = dict(zip(stacks, aligned, strict=True))
     if "step_um" in description and not np.isfinite(rows.position_um).any():

@@ -70,7 +70,7 @@ class ColourChannels:
         """One channel of (n, y, x, red green blue [alpha]) or of a raw mosaic (n, y,
         x); grey images as they are.
 
-        Of two green pixels that of the upper row: their lattices lie a pixel apart.
+        Of two green pixels that of the upper row is used.
 
         Args:
             grey: False where a channel can only be that of colour images.

@@ -93,10 +93,10 @@ def find_table(folder: Path, kind: str) -> Path | None:
     files = {
         path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()
     }
-    if found := next(
+    if table := next(
         (files[kind + suffix] for suffix in suffixes if kind + suffix in files), None
     ):
-        return found
+        return table
     if unread := next(
         (files[kind + suffix] for suffix in other_suffixes if kind + suffix in files),
         None,
@@ -108,12 +108,12 @@ def find_table(folder: Path, kind: str) -> Path | None:
     return None
 
 
-def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]:
-    """What to say of images in kinds of file that are not read; ``beside``: dark and
-    flat, where they are there.
+def unread_images_text(folder: Path, companions: Collection[str]) -> tuple[str, ...]:
+    """What to say of images in kinds of file that are not read.
 
     Args:
         folder: the capture folder.
+        companions: names of the dark and flat that are read.
 
     Raises:
         CaptureError: a dark frame or a flat is among them.
@@ -124,7 +124,7 @@ def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]
         if path.suffix.lower() in _CONVERSIONS and not path.name.startswith(".")
     )
     for path in unread:
-        if path.stem.lower() in {"dark", "flat"} - set(beside):
+        if path.stem.lower() in {"dark", "flat"} - set(companions):
             raise CaptureError(
                 f"{path}: cannot read {path.suffix}, and it would not be "
                 f"used{conversion_hint(path.suffix.lower())}"

@@ -389,7 +389,7 @@ def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str,
     return plain
 
 
-def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
+def unlisted_images_text(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
     """What to say of images in the folder that the stage file does not name.
 
     Args:

@@ -58,7 +58,9 @@ def _plan(options: Options, path: Path) -> int:
         "file": str(target),
         "frames": rows,
         "sigma": dict(zip(plan.names, plan.sigma.tolist(), strict=True)),
-        "untold_sigma": dict(zip(plan.names, plan.untold.tolist(), strict=True)),
+        "unstated_sigma": dict(
+            zip(plan.names, plan.unstated_sigma.tolist(), strict=True)
+        ),
         "warnings": list(plan.warnings),
     }
     lines = [
@@ -66,8 +68,10 @@ def _plan(options: Options, path: Path) -> int:
         for z, angle, time in rows
     ]
     lines.append("  half of a 95 % interval, with what nobody states; within the model")
-    for name, sigma, untold in zip(plan.names, plan.sigma, plan.untold, strict=True):
-        total = protocol.REACH * np.hypot(sigma, untold)
+    for name, sigma, unstated in zip(
+        plan.names, plan.sigma, plan.unstated_sigma, strict=True
+    ):
+        total = protocol.REACH * np.hypot(sigma, unstated)
         lines.append(f"  {name:<24} +- {total:<8.2g} {protocol.REACH * sigma:.2g}")
     lines += [f"  note: {words}" for words in plan.warnings]
     options.console.result(

@@ -16,7 +16,7 @@ from metalens.lens import DiameterMap
 
 Table = list[
     tuple[float, float, float, int]
-]  # drawn nm, made less drawn nm, its standard error, pillars
+]  # drawn nm, measured less drawn nm, its standard error, pillars
 # scatter at the best place over that at the next best, below which it is clear
 _CLEAR = 0.7
 _LEAST = 12  # least number of good pillars
@@ -159,8 +159,8 @@ def lattice_scale(
 
 
 def bias_table(overlay_fit: MaskOverlay, *, knots: int = 7) -> Table:
-    """Rows (drawn nm, made less drawn nm, its standard error, pillars) over groups of
-    equally many pillars by drawn diameter, without outliers.
+    """Rows (drawn nm, measured less drawn nm, its standard error, pillars) over groups
+    of equally many pillars by drawn diameter, without outliers.
 
     Args:
         overlay_fit: the micrograph's pillars on the mask.
@@ -209,7 +209,7 @@ def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
     """Variance of measured diameters about a line in the drawn ones, at every shift of
     the patch on the design; inf where a pillar lies off the design.
 
-    Least squares of made = a + b drawn, b limited to 2/3 to 4/3, by convolutions.
+    Least squares of measured = a + b drawn, b limited to 2/3 to 4/3, by convolutions.
 
     Args:
         patch: (j, i) measured diameters in nm, 0 without one.

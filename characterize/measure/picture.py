@@ -19,7 +19,7 @@ _FLAT, _NOISY = (
 
 
 def read_picture(path: Path) -> Array:
-    """(y, x) the one picture of a TIFF, PNG or HDF5 file; of colours that are alike,
+    """(y, x) the one picture of a TIFF, PNG or HDF5 file; of equal colours,
     red.
 
     Microscopes save grey pictures with three equal colours, and write into them in

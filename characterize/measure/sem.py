@@ -117,6 +117,16 @@ class MeasuredDiameters:
         )
 
 
+class _Cell(NamedTuple):
+    """Pixels about a lattice site: (2, n) row and column, (n,) level, (n,) whether they
+    belong to its pillar.
+    """
+
+    points: Array
+    level: Array
+    pillar: Array
+
+
 def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     """Diameters of all pillars on the lattice of a top-down micrograph.
 
@@ -150,38 +160,25 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
     cells = [_cell(flat, labels, place, pitch / 2) for place in places]
     area = np.array([cell.pillar.sum() for cell in cells])
     missing = area <= _SMALL * np.median(area)
-    discs = np.array([_first_disc(cell, pitch) for cell in cells])
+    discs = np.array([_first_disc(cell) for cell in cells])
     upright = ~missing & (np.hypot(*(discs[:, :2] - places).T) < _DISPLACED * pitch)
-    chosen = np.flatnonzero(upright).tolist()
-    rim_px = _rim_width([cells[k] for k in chosen], discs[chosen])
-    sigma = np.full(8, math.inf)
-    sigma[_BLUR] = 1.0
-    first = np.array(
-        [fit_blurred_disc(cells[k], discs[k], sigma, rim_px)[0] for k in chosen]
-    )
+    discs[~upright, :2] = places[~upright]
     errors = np.full(discs.shape, math.nan)
-    is_round = np.zeros(len(cells), bool)
-    if chosen:
-        blur, height = np.median(first[:, [_BLUR, _HEIGHT]], axis=0)
-        spread = 1.4826 * np.median(np.abs(first[:, _HEIGHT] - height))
-        discs[:, _BLUR], sigma[_BLUR] = blur, _COMMON
-        discs[:, _HEIGHT], sigma[_HEIGHT] = height, max(spread, _COMMON * height)
-    for k in chosen:
-        discs[k], errors[k] = fit_blurred_disc(cells[k], discs[k], sigma, rim_px)
-        is_round[k] = _elliptic_share(cells[k], discs[k]) > _ELLIPTIC
+    fitted = [
+        cell for cell, is_upright in zip(cells, upright, strict=True) if is_upright
+    ]
+    if fitted:
+        discs[upright], errors[upright] = _fit_pillars(fitted, discs[upright])
     radius = discs[:, 2]
     second = np.hypot(discs[:, 3], discs[:, 4])
-    collapsed = ~missing & ~(
-        is_round
-        & (np.hypot(*(discs[:, :2] - places).T) < _DISPLACED * pitch)
-        & (second < radius)
-    )
-    oval = (
-        ~missing
-        & ~collapsed
-        & (second > 4 * errors[:, 3])
-        & (radius + second > _OVAL * (radius - second))
-    )
+    is_round = [
+        is_upright and _elliptic_share(cell, disc) > _ELLIPTIC
+        for cell, disc, is_upright in zip(cells, discs, upright, strict=True)
+    ]
+    on_site = np.hypot(*(discs[:, :2] - places).T) < _DISPLACED * pitch
+    collapsed = ~missing & ~(on_site & np.array(is_round) & (second < radius))
+    oval = ~missing & ~collapsed & (second > 4 * errors[:, 3])
+    oval &= radius + second > _OVAL * (radius - second)
     good = ~(missing | collapsed | oval)
     diameter = 2 * np.sqrt(radius**2 + second**2 / 2) * about.pixel_nm
     return MeasuredDiameters(
@@ -195,6 +192,38 @@ def measure_diameters(image: Array, about: SemMicrograph) -> MeasuredDiameters:
         lattice,
         oval,
     )
+
+
+def _fit_pillars(cells: Sequence[_Cell], discs: Array) -> tuple[Array, Array]:
+    """(k, 8) discs fitted to the pillars of a picture, and their standard errors.
+
+    The first fit has a wide prior on the blur. The second has the median blur and
+    height of all pillars as priors.
+
+    Args:
+        cells: pixels of the pillars.
+        discs: (k, 8) their first discs.
+    """
+    rim_px = _rim_width(cells, discs)
+    sigma = np.full(8, math.inf)
+    sigma[_BLUR] = 1.0
+    first = np.array(
+        [
+            fit_blurred_disc(cell, disc, sigma, rim_px)[0]
+            for cell, disc in zip(cells, discs, strict=True)
+        ]
+    )
+    blur, height = np.median(first[:, [_BLUR, _HEIGHT]], axis=0)
+    spread = 1.4826 * np.median(np.abs(first[:, _HEIGHT] - height))
+    sigma[_BLUR] = _COMMON
+    sigma[_HEIGHT] = max(spread, _COMMON * height)
+    start = discs.copy()
+    start[:, _BLUR], start[:, _HEIGHT] = blur, height
+    fits = [
+        fit_blurred_disc(cell, disc, sigma, rim_px)
+        for cell, disc in zip(cells, start, strict=True)
+    ]
+    return np.array([disc for disc, _ in fits]), np.array([error for _, error in fits])
 
 
 def subtract_background(image: Array, pitch: float) -> Array:
@@ -224,16 +253,6 @@ def pillar_mask(flat: Array) -> Array:
     return np.asarray(ndimage.binary_fill_holes(grey > threshold))
 
 
-class _Cell(NamedTuple):
-    """Pixels about a lattice site: (2, n) row and column, (n,) level, (n,) whether they
-    belong to its pillar.
-    """
-
-    points: Array
-    level: Array
-    pillar: Array
-
-
 def _cell(flat: Array, labels: Array, place: Array, reach: float) -> _Cell:
     """Pixels within ``reach`` of a place that belong to its largest pillar or to none.
 
@@ -254,7 +273,7 @@ def _cell(flat: Array, labels: Array, place: Array, reach: float) -> _Cell:
     return _Cell(points[:, inside], flat[window].ravel()[inside], label[inside] > 0)
 
 
-def _first_disc(cell: _Cell, pitch: float) -> Array:
+def _first_disc(cell: _Cell) -> Array:
     """(8,) disc with the centroid and area of the cell's pillar."""
     pillar = cell.pillar
     if not pillar.any() or pillar.all():
@@ -284,7 +303,7 @@ def _rim_width(cells: Sequence[_Cell], discs: Array) -> float:
     level = np.concatenate([[0.0], *(cell.level for cell in cells)])
     bin_number, level = bin_number[bin_number >= 0], level[bin_number >= 0]
     profile = np.bincount(bin_number, level) / np.maximum(np.bincount(bin_number), 1)
-    gap = np.median(discs[:, 6]) if cells else 0.0
+    gap = np.median(discs[:, 6])
     crest = int(profile.argmax())
     below = np.flatnonzero(profile[crest:] - gap < _CREST * (profile[crest] - gap))
     return float(crest + below[0] - 1) if len(below) else math.inf
