@@ -31,10 +31,8 @@ class EdgeMtf:
         below = np.flatnonzero(self.modulation < 0.5)
         if len(below) == 0 or below[0] == 0:
             return math.nan
-        around = slice(int(below[0]), int(below[0]) - 2 if below[0] > 1 else None, -1)
-        return float(
-            np.interp(0.5, self.modulation[around], self.frequency_per_um[around])
-        )
+        pair = [int(below[0]), int(below[0]) - 1]
+        return float(np.interp(0.5, self.modulation[pair], self.frequency_per_um[pair]))
 
 
 @dataclass(frozen=True, slots=True)
