@@ -36,13 +36,13 @@ def printed(capsys: pytest.CaptureFixture[str]) -> Any:
 
 def run(*parts: object, cwd: Path | None = None) -> DONE:
     """Exit status and texts of ``metalens PARTS`` in the folder ``cwd``."""
-    told = split_words(parts)
+    words = split_words(parts)
     with _streams() as (shown, said), contextlib.chdir(cwd or Path()):
         try:
-            status = cli.main(told)
+            status = cli.main(words)
         except SystemExit as end:  # --help
             status = end.code or 0
-    return DONE(told, status, shown.getvalue(), said.getvalue())
+    return DONE(words, status, shown.getvalue(), said.getvalue())
 
 
 @contextlib.contextmanager

@@ -53,10 +53,18 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     return np.random.default_rng([seed, *name])
 
 
+def folder_of_run(factory: pytest.TempPathFactory) -> Path:
+    """The temporary folder that all workers of a run share."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 @pytest.fixture(scope="session")
 def small_chain(tmp_path_factory: pytest.TempPathFactory) -> small.Chain:
-    """Files of one small lens without symmetry; each is made when first asked for."""
-    return small.Chain(tmp_path_factory.mktemp("small"))
+    """Files of one small lens without symmetry, one set for all workers; each is made
+    when first asked for.
+    """
+    return small.Chain(folder_of_run(tmp_path_factory) / "small")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -64,10 +72,8 @@ def cache_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
     """What the code keeps for later runs goes to a folder of this run, one for all its
     workers.
     """
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder))
+        patch.setenv("XDG_CACHE_HOME", str(folder_of_run(tmp_path_factory) / "cache"))
         yield
 
 

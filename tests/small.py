@@ -2,12 +2,12 @@
 that a user types; tests share its files through the session fixtures of conftest.py.
 """
 
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from metalens.core import store
 from tests.command_line import run
 
 PITCH_UM, HEIGHT_UM, WAVELENGTH_UM, SITES = 0.30, 0.7, 0.85, 80
@@ -165,15 +165,16 @@ def write_settings(folder: Path) -> None:
 
 
 class Chain:
-    """The chain in a folder: ``chain["psf.h5"]`` is its path, made when first asked for.
-
-    said: numbers that each command printed.
+    """The chain in a folder: ``chain["psf.h5"]`` is its path, made when first asked for,
+    by whichever process of the run asks first.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.said: dict[str, dict] = {}
-        write_settings(folder)
+        folder.mkdir(exist_ok=True)
+        with store.hold_lock(self.folder, wait=True):
+            if not (folder / "phase.npy").exists():
+                write_settings(folder)
 
     def __getitem__(self, target: str) -> Path:
         for needed in STAGES[target]:
@@ -181,12 +182,11 @@ class Chain:
                 _ = self[needed]
         if target == "lens.h5":
             _ = self["library.h5"]
-        if target not in self.said:
-            words = (*STAGES[target], "-o", target, "--json", "--quiet")
-            done = run(*words, cwd=self.folder)
-            if done.returncode:
-                raise RuntimeError(f"{words}: {done.stderr or done.stdout}")
-            self.said[target] = json.loads(done.stdout)
+        with store.hold_lock(self.folder, wait=True):
+            if not (self.folder / target).exists():  # results appear whole
+                done = run(*STAGES[target], "-o", target, "--quiet", cwd=self.folder)
+                if done.returncode:
+                    raise RuntimeError(f"{target}: {done.stderr or done.stdout}")
         return self.folder / target
 
 
