@@ -25,9 +25,9 @@ from tests.command_line import call
 CAMERA = PinholeCamera(20, 4.8)
 RIG = replace(CameraRig(), elevation_rad=0.6)
 LENS = design.make(
-    design.phase_of(None, Focus(0.85, 300.0, 3000.0), radius_um=25.0),
-    Focus(0.85, 300.0, 3000.0),
-    aperture_um=50.0,
+    design.phase_of(None, Focus(0.85, 900.0, 9e3), radius_um=75.0),
+    Focus(0.85, 900.0, 9e3),
+    aperture_um=150.0,
     cell=m.CELL,
     proxy=m.PROXY,
 )[0]
@@ -65,10 +65,10 @@ def test_the_image_has_the_light_of_the_scene_and_less_of_its_detail(found):
 
 
 def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
-    """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field
+    """180 um of index 1.5 in the 900 um to the sensor: 840 um of air; scene and field
     angles alike.
     """
-    behind = replace(LENS, layers=Layers(behind=(Film(Index(1.5), 60.0),)))
+    behind = replace(LENS, layers=Layers(behind=(Film(Index(1.5), 180.0),)))
     states, seen = population.states_at(torch.arange(1), 5), []
 
     def rendered(camera, rig):
@@ -76,9 +76,9 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
         return render(states, rig=rig, camera=camera)
 
     made = scene_image.image_first_frames(behind, PinholeCamera(16, 8.0), RIG, rendered)
-    assert seen == [pytest.approx(280.0)]
+    assert seen == [pytest.approx(840.0)]
     beside = 18  # samples of 8 um: half a window of 288 um
-    rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 8.0 / 280.0))
+    rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 8.0 / 840.0))
     assert made.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert made.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert made.psf.shape[3:] == (37, 37)
