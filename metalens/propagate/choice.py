@@ -88,13 +88,13 @@ def light_on_window(
     """
     reduced = [reduce_to_moments(*one, plan.moments) for one in zip(*maps, strict=True)]
     moments = torch.stack([one_map for one_map, _ in reduced])
-    parts = mix_components(plan.on_nodes(moments), pupils, plan.whole_um)
+    parts = mix_components(plan.on_nodes(moments), pupils, plan.nodes_um)
     total: Any = None
     for sign, light in parts:
         irradiance = plan.irradiance(light)
         irradiance = irradiance if sign == 1 else sign * irradiance
         total = irradiance if total is None else total + irradiance
-    return total, plan.on_judged_nodes(moments), [power for _, power in reduced]
+    return total, plan.on_check_nodes(moments), [power for _, power in reduced]
 
 
 def windowed(

@@ -481,10 +481,10 @@ def _block_rows(plan: PillarMoments, dtype: Any) -> Callable[[int], tuple[Any, .
     column_shares, column_bases = columns.weights.astype(dtype), columns.bases
 
     def block_row(block: int) -> tuple[Any, ...]:
-        own = rows.pillars_of(block)
-        first = own.start - bases[block]
+        pillars = rows.pillars_of(block)
+        first = pillars.start - bases[block]
         shares = np.ascontiguousarray(row_shares[:, first:]), column_shares
-        return own, plan.table[block], along[first:], shares, column_bases
+        return pillars, plan.table[block], along[first:], shares, column_bases
 
     return block_row
 
@@ -514,8 +514,10 @@ def _gather(
 
     def work(low: int, high: int) -> None:
         for block in range(low, high):
-            own, *arrays = block_row(block)
-            row_maps = [np.asarray(values[own], node_array.dtype) for values in maps]
+            pillars, *arrays = block_row(block)
+            row_maps = [
+                np.asarray(values[pillars], node_array.dtype) for values in maps
+            ]
             powers.append(compiled_loop(*row_maps, *arrays, node_array[block]))
 
     run_split(rows.count, work)
@@ -553,9 +555,11 @@ def _spread(
 
     def work(low: int, high: int) -> None:
         for block in range(low, high):
-            own, *arrays = block_row(block)
-            out = [target[own] for target in targets]
-            compiled_loop(phase[own], level[own], *arrays, node_array[block], *out)
+            pillars, *arrays = block_row(block)
+            out = [target[pillars] for target in targets]
+            compiled_loop(
+                phase[pillars], level[pillars], *arrays, node_array[block], *out
+            )
 
     run_split(rows.count, work)
 

@@ -369,18 +369,18 @@ class WidePlan:
     left: float
 
     @property
-    def judged_um(self) -> tuple[Array, Array]:
+    def check_nodes_um(self) -> tuple[Array, Array]:
         """(e,), (x,) positions of the grid over the lens."""
         y, x = (grid_um(axis) for axis in self.axes)
         return y, x
 
-    whole_um = judged_um
+    nodes_um = check_nodes_um
 
     def on_nodes(self, moments: torch.Tensor) -> torch.Tensor:
         """(…, y, x) light on the grid: the moments themselves."""
         return moments
 
-    def on_judged_nodes(self, moments: torch.Tensor) -> Array:
+    def on_check_nodes(self, moments: torch.Tensor) -> Array:
         """(…, y, x) light on the grid."""
         return moments.detach().numpy().astype(complex)
 

@@ -407,14 +407,14 @@ def _plan_tile(
     left = (left[:, :rank] * size[:rank]).T.reshape(rank, *counts.window)
     right = right.conj().T[:rank].reshape(rank, *counts.lens)
     y_um, x_um = case.window_um
-    e_um, s_um = _nodes_um(case, counts.nodes)
+    rows_um, columns_um = _nodes_um(case, counts.nodes)
     (half_Y, half_X), (half_y, half_x) = case.half_window_um, case.half_size_um
     shared_phase = np.exp(1j * case.wavenumber * chief_path(case))
-    p, q = _plane_waves(case, s_um, e_um)
+    p, q = _plane_waves(case, columns_um, rows_um)
     arrays = (
         np.exp(-1j * case.wavenumber * y_um[:, None] * q),
         np.exp(-1j * case.wavenumber * p[:, None] * x_um),
-        _interpolated(right, e_um / half_y, s_um / half_x),
+        _interpolated(right, rows_um / half_y, columns_um / half_x),
         _interpolated(left, y_um / half_Y, x_um / half_X) * shared_phase,
     )
     along_y, along_x, lens_terms, window_terms = (
@@ -457,12 +457,12 @@ class WindowPlan:
     tiles: list[WindowTile]
 
     @property
-    def whole_um(self) -> tuple[Array, Array]:
+    def nodes_um(self) -> tuple[Array, Array]:
         """(e,), (x,) positions of the lens nodes of the whole window."""
         return _nodes_um(self.case, self.layout.nodes)
 
     @property
-    def judged_um(self) -> tuple[Array, Array]:
+    def check_nodes_um(self) -> tuple[Array, Array]:
         """(e,), (x,) positions of the nodes of all its moments, ``MORE`` than for the
         whole window.
         """
@@ -475,7 +475,7 @@ class WindowPlan:
         left, right = self.tensors["rows_to_nodes"], self.tensors["columns_to_nodes"]
         return left.T @ moments[..., :ny, :nx] @ right
 
-    def on_judged_nodes(self, moments: torch.Tensor) -> Array:
+    def on_check_nodes(self, moments: torch.Tensor) -> Array:
         """(…, e, x) light on the nodes of all moments (…, m, n)."""
         m, n = moments.shape[-2:]
         with one_blas_thread():
@@ -484,7 +484,7 @@ class WindowPlan:
 
     def irradiance(self, light: torch.Tensor) -> torch.Tensor:
         """(depth, y, x) irradiance on the window from light (e, x) on its lens nodes."""
-        field = _from_nodes(light, self)
+        field = _field_from_nodes(light, self)
         return field.real**2 + field.imag**2
 
 
@@ -577,10 +577,10 @@ def field_windowed(
         phase_rad, transmission: (y, x) maps. plan: of :func:`plan_window`.
     """
     moments, _ = reduce_to_moments(phase_rad, transmission, plan.moments)
-    return _from_nodes(plan.on_nodes(moments), plan)
+    return _field_from_nodes(plan.on_nodes(moments), plan)
 
 
-def _from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
+def _field_from_nodes(light: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     """(depth, y, x) field on the window from the light on the window's lens nodes.
 
     Args:

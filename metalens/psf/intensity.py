@@ -434,7 +434,7 @@ def _windowed(
         )
         light, nodes, powers = light_on_window(maps, plan, pupils)
         _check(maps, case, sum(powers), nodes)
-        at_um = plan.judged_um
+        at_um = plan.check_nodes_um
         mixing_at_nodes = None if pupils is None else pupils(*at_um)
         rounding = plan.moments.carrier.rounding_rad
         noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
