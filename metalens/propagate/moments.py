@@ -301,35 +301,33 @@ class ReferencePhase:
         longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
         return float(2 * np.pi * ROUNDED / 10 * longest)
 
-    def table(self, dtype: Any) -> Array:
-        """(block, chunk, order, column) coefficients of all block rows, in turns,
-        without whole turns.
+    def row_polynomials(self, block: int, order: int) -> Array:
+        """(chunk, order, column) coefficients of a block row, in turns, without whole
+        turns.
 
         The columns are cut in chunks of equal size; the last is padded with zeros.
         """
-        order = ORDER[np.dtype(dtype).itemsize]
         columns = self.case.shape[1]
         chunks = -(-columns // self.chunk)
-        table = np.zeros((self.rows.count, order, chunks * self.chunk), dtype)
         step_um = self.case.steps_um[0]
         half_um = (self.rows.length - 1) / 2 * step_um
-        for block, middle_um in enumerate(self.rows.middles_um(step_um)):
-            coefficients = _powers(
-                self.case,
-                self.reference,
-                (middle_um, half_um),
-                self.case.pillars_um[1],
-                order,
-            )
-            coefficients[0] -= np.rint(coefficients[0])
-            table[block, :, :columns] = coefficients
-        parts = table.reshape(self.rows.count, order, chunks, self.chunk)
-        return np.ascontiguousarray(parts.swapaxes(1, 2))
+        middle_um = self.rows.middles_um(step_um)[block]
+        coefficients = _powers(
+            self.case,
+            self.reference,
+            (middle_um, half_um),
+            self.case.pillars_um[1],
+            order,
+        )
+        coefficients[0] -= np.rint(coefficients[0])
+        row = np.zeros((order, chunks * self.chunk))
+        row[:, :columns] = coefficients
+        return row.reshape(order, chunks, self.chunk).swapaxes(0, 1)
 
 
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
-# factors on the light of several
-# maps: light on the window is Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
+# factors on the light of several maps: light on the window is
+# Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
 Pupils = Callable[[Array, Array], tuple[Array, Array]]
 
 
@@ -337,14 +335,15 @@ Pupils = Callable[[Array, Array], tuple[Array, Array]]
 class PillarMoments:
     """Plan of the reduction of a lens to moments.
 
-    blocks: of rows and columns. carrier: the phase that is removed. table: its
-    polynomials. dtype: of the maps. rows, columns: (y node, m) and (x node, n) weights
-    of the nodes in the moments, in the dtype of the sums.
+    blocks: of rows and columns. carrier: the phase that is removed. polynomials: its
+    coefficients by block row, kept where they take little memory. dtype: of the maps.
+    rows, columns: (y node, m) and (x node, n) weights of the nodes in the moments, in
+    the dtype of the sums.
     """
 
     blocks: tuple[AxisBlocks, AxisBlocks]
     carrier: ReferencePhase
-    table: Array
+    polynomials: Callable[[int], Array]
     dtype: torch.dtype
     rows: torch.Tensor
     columns: torch.Tensor
@@ -386,8 +385,15 @@ def plan_moments(
         torch.tensor(np.ascontiguousarray(weight(at_um)), dtype=sums)
         for weight, at_um in zip(weights, nodes_um, strict=True)
     ]
-    table = carrier.table(f"f{itemsize}")
-    return PillarMoments(blocks, carrier, table, dtype, *values)
+
+    def polynomials(block: int) -> Array:
+        row = carrier.row_polynomials(block, ORDER[itemsize])
+        return np.ascontiguousarray(row, f"f{itemsize}")
+
+    bytes_kept = rows.count * ORDER[itemsize] * case.shape[1] * itemsize
+    if bytes_kept < 1 << 26:  # lenses of some 5 mm
+        polynomials = functools.cache(polynomials)
+    return PillarMoments(blocks, carrier, polynomials, dtype, *values)
 
 
 def reduce_to_moments(
@@ -484,7 +490,7 @@ def _block_rows(plan: PillarMoments, dtype: Any) -> Callable[[int], tuple[Any, .
         pillars = rows.pillars_of(block)
         first = pillars.start - bases[block]
         shares = np.ascontiguousarray(row_shares[:, first:]), column_shares
-        return pillars, plan.table[block], along[first:], shares, column_bases
+        return pillars, plan.polynomials(block), along[first:], shares, column_bases
 
     return block_row
 
