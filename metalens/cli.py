@@ -116,9 +116,9 @@ VERBS: dict[str, tuple[str, str]] = {
 # modules of the packages above that commands load by name: the printable limits of
 # PROCESS.toml; the summary of a mask
 ABOVE = {"process": "layout.process.limits", "mask": "layout.commands.info"}
-# source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and
+# source of ``metalens psf`` by kind of file: record whose ``load`` gives its design and
 # its PSFs
-PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}
+PSF_SOURCES = {"asbuilt": "characterize.inference:AsBuilt"}
 # what ``metalens view`` shows of a kind: "module:function" with its panels
 VIEWS = {
     "mask": "layout.commands.view:mask_panels",

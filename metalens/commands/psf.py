@@ -4,8 +4,8 @@ stated error, with plots.
 An interruption leaves what stood at the output; the same command begins anew.
 """
 
-import importlib
 import math
+import pkgutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -286,7 +286,7 @@ class ComputedPsfs:
     scan: "psf.FocusScan | None" = None
 
 
-# by kind of file, the module whose ``load`` gives an as-built lens: its ``design``, the
+# by kind of file, the record whose ``load`` gives an as-built lens: its ``design``, the
 # (n, 2) field angles ``angle_rad`` of its captures, ``psf_stack(view, tolerance=)`` and
 # their relative L2 error ``psf_posterior(view)``; filled by the command line
 SOURCES: dict[str, str] = {}
@@ -469,7 +469,7 @@ def _read(path: Path) -> tuple[lens.Lens, Any]:
     kind = store.kind_of(path)
     if kind not in SOURCES:
         return lens.load(path), None
-    built = importlib.import_module(SOURCES[kind]).load(path)
+    built = pkgutil.resolve_name(SOURCES[kind]).load(path)
     return built.design, built
 
 
