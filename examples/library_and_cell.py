@@ -47,23 +47,26 @@ for d in diameters:
 # Ask for less error and pay in time. The true error is measured against the finest solution; it stays below the estimate.
 
 # %%
-reference = modal.solve(cell, 0.302, WAVELENGTH_UM, tolerance=1e-6).t
 figure, axes = plt.subplots(figsize=(6, 4))
-for solver, tolerances in ((modal, (5e-3, 1e-3, 1e-4)), (rcwa, (1e-1, 3e-2, 1e-2))):
-    seconds, error, estimate = [], [], []
+measured = {}
+for solver, tolerances in ((modal, (1e-3, 1e-4, 1e-5)), (rcwa, (1e-1, 3e-2, 1e-2))):
+    seconds, solved = [], []
     for tolerance in tolerances:
         start = time.perf_counter()
-        found = solver.solve(cell, 0.302, WAVELENGTH_UM, tolerance=tolerance)
+        solved.append(solver.solve(cell, 0.301, WAVELENGTH_UM, tolerance=tolerance))
         seconds.append(time.perf_counter() - start)
-        error.append(abs(found.t - reference))
-        estimate.append(found.t_error)
-    (line,) = axes.loglog(
-        seconds, error, "o-", label=f"{solver.__name__.split('.')[-1]}: true error"
-    )
+    measured[solver.__name__.split(".")[-1]] = seconds, solved
+
+# last: modes that it leaves in memory would make the solves above look free
+reference = modal.solve(cell, 0.301, WAVELENGTH_UM, tolerance=1e-6).t
+for name, (seconds, solved) in measured.items():
+    error = [abs(found.t - reference) for found in solved]
+    estimate = [found.t_error for found in solved]
+    (line,) = axes.loglog(seconds, error, "o-", label=f"{name}: true error")
     axes.loglog(
         seconds, estimate, "--", color=line.get_color(), label="its own estimate"
     )
-axes.set(xlabel="time / s", ylabel="|Δt|", title="302 nm pillar, the steep flank")
+axes.set(xlabel="time / s", ylabel="|Δt|", title="301 nm pillar, the steep flank")
 axes.legend()
 plt.show()
 
