@@ -72,7 +72,10 @@ def points_row(wave: SmoothWave) -> Row:
         -1,
     )
     waves = SpectralNodes(
-        *spectrum.gauss_rule(*spectrum.spectral_weight(Source(850.0, 30.0)), 9), 0.0
+        *spectrum.discrete_gauss_rule(
+            *spectrum.spectral_weight(Source(850.0, 30.0)), 9
+        ),
+        0.0,
     )
     optics = Optics(wave, Layers(), 2e3)
     window = Window(GRID.window, GRID.step_um)
@@ -108,7 +111,10 @@ def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
         -1,
     )
     waves = SpectralNodes(
-        *spectrum.gauss_rule(*spectrum.spectral_weight(Source(850.0, 30.0)), 9), 0.0
+        *spectrum.discrete_gauss_rule(
+            *spectrum.spectral_weight(Source(850.0, 30.0)), 9
+        ),
+        0.0,
     )
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     pillars = pillar_lens(wave.focus, wave.radius_um)

@@ -54,10 +54,10 @@ def parse_gdsii(
         keep: most placements of one structure that are kept; None: all.
         where: name of the bytes in errors.
     """
-    return _Reader(where, data, limit, keep).library()
+    return _GdsiiReader(where, data, limit, keep).library()
 
 
-class _Reader:
+class _GdsiiReader:
     """A cursor over the records."""
 
     def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:

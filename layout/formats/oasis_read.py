@@ -59,10 +59,10 @@ def parse_oasis(
         keep: most placements of one cell that are kept; None: all.
         where: name of the bytes in errors.
     """
-    return _Reader(ByteCursor(where, data), limit, keep).whole_file()
+    return _OasisReader(ByteCursor(where, data), limit, keep).whole_file()
 
 
-class _Reader:
+class _OasisReader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
     def __init__(self, cursor: ByteCursor, limit: int, keep: int | None) -> None:

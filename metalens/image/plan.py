@@ -347,7 +347,7 @@ def _coarse(
 ) -> SpectralNodes:
     """Gauss rule of ``count`` wavelengths, within those of the pillars' library."""
     rule = SpectralNodes(
-        *spectra.gauss_rule(*spectra.spectrum_points(source), count), np.nan
+        *spectra.discrete_gauss_rule(*spectra.spectrum_points(source), count), np.nan
     )
     if not isinstance(optics.wave, PillarWave):
         return rule

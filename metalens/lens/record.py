@@ -30,8 +30,6 @@ Hand = Literal["", "left", "right"]
 HANDS: dict[str, float] = {"": 0.0, "left": -2.0, "right": 2.0}
 # largest map of diameters that is loaded whole; masks read larger ones row by row
 MOST_HELD_BYTES = 1 << 26
-
-
 _BLOCK_ROWS = 256
 
 

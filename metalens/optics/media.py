@@ -136,16 +136,6 @@ def ray_direction(media: Media, reach_um: Any) -> Any:
     return reach_um / reach_per_direction(layers, w)
 
 
-def path_of_reach(media: Media, reach_um: Any) -> Any:
-    """Optical path of the ray that reaches so far, less the path along the normal, um.
-
-    Args:
-        media: plane-parallel media.
-        reach_um: lateral distance, um.
-    """
-    return relative_path(media, ray_direction(media, reach_um))
-
-
 def passed_at(order: Sequence[float], w: Any) -> Any:
     """Share of unpolarised power that passes the faces between media, in a single pass.
 

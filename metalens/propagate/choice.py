@@ -20,8 +20,6 @@ from metalens.propagate.window import (
 )
 
 EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
-
-
 WIDE_WORK = 1e9  # pillars x samples from which transforms are
 
 

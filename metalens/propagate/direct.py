@@ -56,8 +56,6 @@ def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
 
 
 DEGREES = (8, 16, 32, 64)  # coefficients of the series of a point wave through films
-
-
 ROUNDING = 1e-15  # of the largest coefficient: a tail below it has converged
 
 

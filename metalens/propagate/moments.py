@@ -27,33 +27,19 @@ LENGTHS = (
     (64, 32, 16, 8, 4, 2, 1),
     (512, 256, 128, 64, 32, 16, 8, 4, 2, 1),
 )  # of rows, of columns
-
-
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
-
-
 ACCURACY = {
     4: 2e-8,
     8: 1e-11,
 }  # of the carrier in turns, in addition to the rounding of the path
-
-
 # rounding of path and polynomial in float64, relative to the longest path (largest
 # measured: 3.5e-15)
 ROUNDED = 5e-15
-
-
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
-
-
 # positions in a block where the kernel is sampled; blocks that need more nodes keep
 # their pillars
 PROBES = 48
-
-
 NODES = 60  # default of the approximate number of nodes of a lens along an axis
-
-
 CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 
 
@@ -576,8 +562,6 @@ EXACT = {
     "nsz",
     "afn",
 }  # order of sums is kept: the phase is reduced in two steps
-
-
 PER_RAD = 1 / (2 * np.pi)
 
 

@@ -30,27 +30,17 @@ from metalens.propagate.paths import (
 from metalens.propagate.window import coarse_lens_nodes, depth_basis
 
 RAYS = 33  # along an axis, to whose reach the quadratic is fitted
-
-
 SPARE = 1.2  # ratio of the lens grid's density to the least for the kernel's band
-
-
 MOST = 20000  # points of a transform along an axis
-
-
 # Least number of lens points and of half-waves in the window for which this method is
 # the best. Below some 35 the fading and the grid beyond the lens's rim are as wide as
 # lens and window, and errors miss any setting (on random lenses of 20 to 120 pillars by
 # up to 3e-2; their estimates say so).
 WIDE = 120
-
-
 # Share of the requested digits that fading keeps where it acts most: on light of the
 # lens's rim at the opposite end of the window, which weighs little. Light that is even
 # over both misses the setting, as the estimate says, and is computed again.
 FADED = 0.4
-
-
 STEEPEST = 0.93  # |p| of a ray, fading included, in units of the rarest index
 
 
@@ -340,12 +330,8 @@ def spread_weights(axis: WideAxis, places_um: Array) -> Array:
 
 
 MIXED_ROWS = 32  # of the window, whose depths are mixed at once
-
-
 # step of the samples of the lens grid whose light selects the depth fields
 EVERY = 3
-
-
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
 

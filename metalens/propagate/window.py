@@ -30,17 +30,11 @@ from metalens.propagate.paths import (
     to_sensor,
 )
 
-MOST_NODES = 400
-
-
-MOST_TABLE = 4e6
-
-
+MOST_NODES = 400  # along an axis of the lens or of a tile
+MOST_TABLE = 4e6  # entries of the correction of a tile
 # ratio of the error of a truncated series at the corner of a tile, where a PSF may lie,
 # to its mean
 EDGE = 8
-
-
 MOST_PARTS = 16  # tiles along an axis
 
 
@@ -435,8 +429,6 @@ def _interpolated(values: Array, y: Array, x: Array) -> Array:
 # additional nodes over the lens, and in a block, where smooth factors (``Pupils``)
 # multiply the light
 SMOOTH = (4, 2)
-
-
 MORE = 8  # additional orders of the moments, for the posterior error
 
 

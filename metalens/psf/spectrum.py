@@ -258,7 +258,7 @@ def spectral_nodes(
     light = np.ones(1) if light is None else light
     um, share = spectrum_points(source)
     for count in range(1, MOST_NODES + 1):
-        rule = gauss_rule(um, share, count)
+        rule = discrete_gauss_rule(um, share, count)
         error = quadrature_error(source, rule, spans, light)
         if error <= tolerance:
             return SpectralNodes(*rule, error, source)
@@ -402,7 +402,7 @@ def outside_library_text(
     )
 
 
-def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
+def discrete_gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
     """Nodes (count,) and weights of the Gauss rule of a discrete weight.
 
     It is exact for polynomials of degree 2·count - 1. Polynomials that are orthogonal

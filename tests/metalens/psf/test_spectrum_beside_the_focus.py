@@ -86,7 +86,7 @@ def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
     beside the focus.
     """
     um, share = source.wavelengths_um, source.share
-    two = SpectralNodes(*spectrum.gauss_rule(um, share, 2), 0.0, source)
+    two = SpectralNodes(*spectrum.discrete_gauss_rule(um, share, 2), 0.0, source)
     errors = []
     for offset in ((0.0, 0.0), (0.0, 21.0)):
         view = View((300.0,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset)
