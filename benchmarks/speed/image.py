@@ -24,6 +24,12 @@ FRAMES = 8
 GRID = Grid((128, 128), 9.0, (15e3, 28e3), margin=16, window=41)
 
 
+def _led_nodes() -> SpectralNodes:
+    """Nine nodes of an LED of 30 nm at 850 nm."""
+    weight = spectrum.spectral_weight(Source(850.0, 30.0))
+    return SpectralNodes(*spectrum.discrete_gauss_rule(*weight, 9), 0.0)
+
+
 def rows() -> Iterator[Row]:
     """128² samples of 9 um, ±20° to the sides of what is rendered, a diode of 30 nm,
     lens of 1 mm at 2 mm, NA 0.24.
@@ -71,12 +77,7 @@ def points_row(wave: SmoothWave) -> Row:
         ),
         -1,
     )
-    waves = SpectralNodes(
-        *spectrum.discrete_gauss_rule(
-            *spectrum.spectral_weight(Source(850.0, 30.0)), 9
-        ),
-        0.0,
-    )
+    waves = _led_nodes()
     optics = Optics(wave, Layers(), 2e3)
     window = Window(GRID.window, GRID.step_um)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
@@ -110,12 +111,7 @@ def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
         ),
         -1,
     )
-    waves = SpectralNodes(
-        *spectrum.discrete_gauss_rule(
-            *spectrum.spectral_weight(Source(850.0, 30.0)), 9
-        ),
-        0.0,
-    )
+    waves = _led_nodes()
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     pillars = pillar_lens(wave.focus, wave.radius_um)
     for count in (0, 2, 3):
