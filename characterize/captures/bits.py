@@ -1,6 +1,7 @@
 """How many bits a converter has, and where they lie in the words of a file."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -44,73 +45,79 @@ def right_align(
             "were saved as signed, or with 32768 taken off; save them as unsigned "
             "(uint16)"
         )
-    note = ""
-    if bits is not None and _is_fraction(images):
-        scale = _full_scale(images, bits, where)
-        stacks = [stack * scale if _is_fraction(stack) else stack for stack in stacks]
-        note = f"shares of full scale multiplied by {scale}; "
-    counts = [_as_integers(stack) for stack in stacks]
-    whole = [stack for stack in counts if _is_whole(stack)]
-    if not _is_whole(counts[0]):
-        if bits is not None and images.max() >= 1 << bits:
-            raise CaptureError(
-                f"{where}: counts are real numbers up to {images.max():.6g}, the "
-                f"capture states {bits} bits (at most {(1 << bits) - 1}); correct "
-                "bits, or divide by the shift"
-            )
-        note += "counts are real numbers: taken as they are"
-        return counts[0], bits or 16, note, tuple(counts[1:])
-    step, depth, text = _step_of_counts(whole, bits, where)
-    if step > 1:
-        counts = [
-            np.rint(stack / step).astype(stack.dtype)
-            if _is_whole(stack)
-            else stack / step
-            for stack in counts
-        ]
-    return counts[0], depth, note + text, tuple(counts[1:])
+    stacks = [_as_integers(stack) for stack in stacks]
+    chosen = [stack for stack in stacks if _is_whole(stack)]
+    if not _is_whole(stacks[0]):
+        chosen = stacks[:1]
+    levels = np.unique(np.concatenate([np.unique(stack) for stack in chosen]))
+    if chosen[0].dtype.kind == "f" or levels[0] < 0:
+        unit, note = _unit_of_reals(levels, bits, where)
+        depth = bits or 16
+    elif bits is None:
+        unit, depth, note = _used_bits(levels.astype(np.int64), stacks[0].dtype)
+    else:
+        unit, note = _unit_of_counts(levels.astype(np.int64), bits, where)
+        depth = bits
+    scaled = []
+    for stack in stacks:
+        if unit < 1 < stack.max():  # counts beside shares of full scale
+            scaled.append(stack)
+        elif _is_whole(stack):
+            scaled.append(np.rint(stack / unit).astype(stack.dtype))
+        else:
+            scaled.append(_as_integers(stack / unit))
+    return scaled[0], depth, note, tuple(scaled[1:])
 
 
-def _step_of_counts(
-    whole: Sequence[Array], bits: int | None, where: str
-) -> tuple[float, int, str]:
-    """(values a count, bits of the converter, note in words) of whole numbers.
-
-    A stretch over 16 bits multiplies by 65535 / (2**bits - 1), or repeats the highest
-    bits in the lowest.
-    """
-    levels = np.unique(np.concatenate([np.unique(stack) for stack in whole]))
-    levels = levels.astype(np.int64)
+def _used_bits(levels: Array, word: np.dtype[Any]) -> tuple[float, int, str]:
+    """(values a count, bits of the converter, note) by the bits that counts use."""
     used = int(np.bitwise_or.reduce(levels))
     shift = (used & -used).bit_length() - 1  # -1 where all is dark
-    used_bits = used.bit_length()
-    word_bytes = whole[0].dtype.itemsize
-    if bits is None and shift > 0 and used_bits > 12 and word_bytes == 2:
+    if shift > 0 and used.bit_length() > 12 and word.itemsize == 2:
         text = f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
         return 1 << shift, 16 - shift, text
-    if bits is None:
-        deep_enough = (depth for depth in _DEPTHS if used_bits <= depth)
-        depth = 8 if word_bytes == 1 else next(deep_enough, 16)
-        return 1, depth, f"counts of {used_bits} bits: taken as a {depth}-bit converter"
-    if used_bits <= bits:
-        return 1, bits, f"{bits} bits as stated"
-    left = 16 - bits
-    if left > 0 and used_bits <= 16:
-        if shift >= left:
-            text = f"{bits}-bit counts were shifted left by {left} bits: shifted back"
-            return 1 << left, bits, text
-        stretch = 65_535 / ((1 << bits) - 1)
-        count = np.rint(levels / stretch).astype(np.int64)
-        repeated = (count << left) | (count >> max(2 * bits - 16, 0))
-        if any(
-            np.array_equal(levels, stretched)
-            for stretched in (np.rint(count * stretch), repeated)
-        ):
-            text = f"{bits}-bit counts were stretched over 16 bits: taken back"
-            return stretch, bits, text
+    least = 8 if word.itemsize == 1 else used.bit_length()
+    depth = next((depth for depth in _DEPTHS if least <= depth), 16)
+    text = f"counts of {used.bit_length()} bits: taken as a {depth}-bit converter"
+    return 1, depth, text
+
+
+def _unit_of_counts(levels: Array, bits: int, where: str) -> tuple[float, str]:
+    """(values a count, note) of whole numbers of a converter of stated bits.
+
+    A stretch over 16 bits multiplies by 65535 / (2**bits - 1), or repeats the highest
+    bits in the lowest: both within 1 of the multiple.
+    """
+    top = (1 << bits) - 1
+    shift = 1 << max(16 - bits, 0)
+    for unit, rest, words in (
+        (1, 0.0, f"{bits} bits as stated"),
+        (shift, 0.0, f"{bits}-bit counts were shifted left: shifted back"),
+        (65_535 / top, min(1.0, shift / 5), f"{bits}-bit counts were stretched"),
+    ):
+        count = np.rint(levels / unit)
+        if count[-1] <= top and np.abs(levels - count * unit).max() <= rest:
+            return unit, words
+    used = int(np.bitwise_or.reduce(levels))
+    low = (used & -used).bit_length() - 1
     raise CaptureError(
-        f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, the "
-        f"capture states {bits}; correct bits, or the bit shift"
+        f"{where}: counts use {used.bit_length() - low} bits above the lowest {low}, "
+        f"the capture states {bits}; correct bits, or the bit shift"
+    )
+
+
+def _unit_of_reals(levels: Array, bits: int | None, where: str) -> tuple[float, str]:
+    """(value of a count, note) of real numbers: counts, or shares of full scale."""
+    if bits is None or 1 < levels[-1] < 1 << bits:
+        return 1.0, "counts are real numbers: taken as they are"
+    for scale in ((1 << bits) - 1, 1 << bits):
+        counts = levels.astype(float) * scale
+        if levels[-1] <= 1 and np.abs(counts - np.rint(counts)).max() < _ROUNDING:
+            return 1 / scale, f"shares of full scale multiplied by {scale}"
+    raise CaptureError(
+        f"{where}: real numbers up to {levels[-1]:.6g}, neither counts of the stated "
+        f"{bits} bits nor counts over their full scale; save counts as they come from "
+        "the camera, or correct bits"
     )
 
 
@@ -132,25 +139,3 @@ def _as_integers(image: Array) -> Array:
     counts = np.rint(image)
     is_integer = np.abs(image - counts).max() < _ROUNDING
     return counts.astype(np.uint16) if is_integer else image
-
-
-def _is_fraction(image: Array) -> bool:
-    """Whether real numbers are shares of full scale: up to 1, and not all 0 or 1."""
-    return bool(
-        image.dtype.kind == "f"
-        and 0 < image.max() <= 1
-        and not np.array_equal(image, np.rint(image))
-    )
-
-
-def _full_scale(images: Array, bits: int, where: str) -> int:
-    """Factor from shares of full scale to counts: 2**bits - 1 or 2**bits."""
-    for scale in ((1 << bits) - 1, 1 << bits):
-        counts = images.astype(float) * scale
-        if np.abs(counts - np.rint(counts)).max() < _ROUNDING:
-            return scale
-    raise CaptureError(
-        f"{where}: real numbers up to {images.max():.3g}, no counts over the full "
-        f"scale of {bits} bits; save counts as they come from the camera, or multiply "
-        "frames, dark and flat by the full scale in counts"
-    )

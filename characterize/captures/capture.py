@@ -2,12 +2,11 @@
 their bit depth.
 """
 
-import dataclasses
 import logging
 import math
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import axes, folder, png, stage, tiff_pages, tiff_tags
+from characterize.captures import folder, png, stage
 from characterize.captures.bits import right_align
 from characterize.captures.colour import ColourChannels
+from characterize.captures.tiff import ImageFile, read_tiff
 from metalens.core import reading, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, MetalensError
@@ -27,7 +27,6 @@ PNG = (".png",)
 HDF5 = (".h5", ".hdf5")
 LOSSY = (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = ColourChannels()
-Stack = tuple[Array, str]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -124,7 +123,7 @@ def load(path: str | Path) -> Capture:
         logging.CRITICAL
     )  # what it makes of a damaged file is said in one error
     try:
-        return _load_folder(path) if path.is_dir() else _load_file(path)
+        return _load(path)
     except MetalensError:
         raise
     except (
@@ -148,23 +147,7 @@ def read_images(path: Path) -> Array:
     Raises:
         CaptureError: unknown, lossy, truncated or non-finite; colour.
     """
-    return check_images(_PLAIN.pick(read_all(path), path), path)
-
-
-def _file_frames(
-    path: Path, colours: ColourChannels, order: str | None, *, grey: bool = False
-) -> Stack:
-    """(n, y, x) frames of one file in one colour, and a note on their axes.
-
-    Args:
-        order: stated order of the axes, or None.
-        grey: whether grey images are taken where a channel is stated.
-    """
-    images = read_all(path, colours)
-    if order is None and path.suffix.lower() in TIFF:
-        order = tiff_pages.page_order(path)
-    images, note = axes.frames_first(images, path, order)
-    return check_images(colours.pick(images, path, grey=grey), path), note
+    return check_images(_PLAIN.pick(read_all(path).images, path), path)
 
 
 def check_images(images: Array, path: Path) -> Array:
@@ -199,9 +182,9 @@ def check_images(images: Array, path: Path) -> Array:
     return images
 
 
-def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
-    """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they
-    lie there.
+def read_all(path: Path, colours: ColourChannels = _PLAIN) -> ImageFile:
+    """Images of one file as they lie there, (n, y, x) or (n, y, x, red green blue
+    [alpha]), with what its tags state.
 
     Args:
         path: the file.
@@ -217,10 +200,10 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
             "TIFF, PNG or HDF5"
         )
     if suffix in TIFF:
-        images = tiff_pages.read_tiff(
+        return read_tiff(
             path, coloured=colours.channel is not None, mosaic=bool(colours.mosaic)
         )
-    elif suffix in PNG:
+    if suffix in PNG:
         images = png.read_png(path)
     elif suffix in HDF5:
         images = _read_hdf5(path)
@@ -230,148 +213,156 @@ def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
             f"{path}: cannot read {kind}; need TIFF, PNG or "
             f"HDF5{folder.conversion_hint(suffix)}"
         )
-    return images[None] if images.ndim == 2 else images
+    return ImageFile(images[None] if images.ndim == 2 else images)
 
 
-def _load_file(path: Path) -> Capture:
-    """Capture of a single stack, with the metadata of its TOML file or its tags."""
-    description = stage.read_beside(path)
+def _load(path: Path) -> Capture:
+    """Capture of a folder with its tables, or of one file with the TOML of its name.
+
+    The tags of a TIFF file count where it holds all frames and nothing else is stated.
+    """
+    description, rows, files = stage.read_beside(path), None, [path]
+    companions: dict[str, Path] = {}
+    notes: list[str] = []
+    if path.is_dir():
+        transaction.check_manifest(path)
+        description = stage.read_about(path)
+        rows = stage.read_stage(path)
+        files = folder.list_images(path, TIFF + PNG + HDF5 + LOSSY)
+        companions = {
+            file.stem.lower(): file
+            for file in files
+            if file.stem.lower() in ("dark", "flat")
+        }
+        files = [file for file in files if file not in companions.values()]
+        if rows:
+            notes += stage.unlisted_images_text(files, rows)
+        notes += stage.unread_keys_text(description)
+        notes += folder.unread_images_text(path, companions)
     colours = ColourChannels.of(description, str(path))
-    images, axes_note = _file_frames(
-        path, colours, axes.stated_axes(description, str(path))
-    )
-    tags = (
-        tiff_tags.read_tags(path)
-        if path.suffix.lower() in TIFF
-        else tiff_tags.TiffTags()
-    )
-    images, bits, note, _ = right_align(
-        images, description.pop("bits", None), str(path)
-    )
-    n = len(images)
-    step = description.get("step_um", math.nan)
-    position = np.arange(n) * step if math.isfinite(step) else tags.position_um
-    notes = [note, *([axes_note] if axes_note else []), *tags.notes, *colours.notes()]
-    return Capture(
-        images,
-        position if len(position) == n else np.full(n, np.nan),
-        np.zeros((n, 2)),
-        np.full(n, np.nan),
-        tuple(f"{reading.to_valid_utf8(path.name)}[{i}]" for i in range(n)),
-        bits,
-        pixel_um=description.pop("pixel_um", tags.pixel_um) * colours.pitch,
-        wavelength_um=description.pop("wavelength_um", math.nan),
-        about=description,
-        corrections=tuple(notes),
-        fill=1 / colours.pitch,
-    )
+    order = description.pop("axes", None)
+    tags = ImageFile(np.empty(0))
 
+    def read_frames(file: Path, *, is_frame: bool = True) -> Array:
+        """(n, y, x) frames of one file in one colour."""
+        nonlocal tags
+        content = read_all(file, colours)
+        tags = content if is_frame else tags
+        images = _frames_first(content, file, order, notes)
+        picked = colours.pick(images, file, grey=not is_frame)
+        return check_images(picked, file)
 
-def _load_folder(path: Path) -> Capture:
-    """Capture of a folder: frames, stage table, description, dark and flat frames."""
-    transaction.check_manifest(path)
-    description = stage.read_about(path)
-    rows = stage.read_stage(path)
-    files = folder.list_images(path, TIFF + PNG + HDF5 + LOSSY)
-    companion_files = {
-        file.stem.lower(): file
-        for file in files
-        if file.stem.lower() in ("dark", "flat")
-    }
-    files = [file for file in files if file not in companion_files.values()]
-    colours = ColourChannels.of(description, str(path))
-    order = axes.stated_axes(description, str(path))
-    texts = [
-        *(stage.unlisted_images_text(files, rows) if rows else ()),
-        *stage.unread_keys_text(description),
-        *folder.unread_images_text(path, companion_files),
-    ]
-    if rows is None:
-        names, frames, notes = _all_frames(files, path, colours, order)
-        rows = stage.StageRows.unknown(names)
+    if rows:
+        frames = _listed_frames(files, path, rows, read_frames)
     else:
-        frames, notes = _listed_frames(
-            {stage.normalize_spelling(file.name): file for file in files},
-            path,
-            rows,
-            colours,
-            order,
-        )
-    companions = {
-        name: _file_frames(file, colours, order, grey=True)
-        for name, file in companion_files.items()
-    }
-    stacks = {name: images for name, (images, _) in companions.items()}
-    texts += [
-        text for text in (*notes, *(text for _, text in companions.values())) if text
-    ]
-    bits = description.pop("bits", None)
-    frames, depth, note, aligned = right_align(
-        frames, bits, str(path), companions=tuple(stacks.values())
+        names, frames = _all_frames(files, path, read_frames)
+        rows = stage.StageRows.unknown(names)
+    stacks = [read_frames(file, is_frame=False) for file in companions.values()]
+    frames, bits, note, aligned = right_align(
+        frames, description.pop("bits", None), str(path), companions=stacks
     )
-    aligned_companions = dict(zip(stacks, aligned, strict=True))
-    if "step_um" in description and not np.isfinite(rows.position_um).any():
+    dark_and_flat = dict(zip(companions, aligned, strict=True))
+    if len(files) > 1:
+        tags = ImageFile(frames)
+    position = rows.position_um
+    if "step_um" in description and not np.isfinite(position).any():
         folder.check_steps(files if not rows.source else (), path)
-        rows = dataclasses.replace(
-            rows, position_um=np.arange(len(frames)) * float(description["step_um"])
-        )
+        position = np.arange(len(frames)) * float(description["step_um"])
+    elif not rows.source and len(tags.position_um) == len(frames):
+        position = tags.position_um
     return Capture(
         frames,
-        rows.position_um,
+        position,
         rows.angle_rad,
         rows.exposure_s,
         rows.files,
-        depth,
-        pixel_um=description.pop("pixel_um", math.nan) * colours.pitch,
+        bits,
+        pixel_um=description.pop("pixel_um", tags.pixel_um) * colours.pitch,
         wavelength_um=description.pop("wavelength_um", math.nan),
-        dark=aligned_companions.get("dark"),
-        flat=aligned_companions.get("flat"),
+        dark=dark_and_flat.get("dark"),
+        flat=dark_and_flat.get("flat"),
         about=description,
-        corrections=(note, *colours.notes(), *texts),
+        corrections=(note, *tags.notes, *colours.notes(), *notes),
         fill=1 / colours.pitch,
     )
 
 
+def _frames_first(
+    content: ImageFile, path: Path, order: str | None, notes: list[str]
+) -> Array:
+    """Images as (n, y, x), of colour images with these behind; appends to ``notes``
+    where they lay otherwise.
+
+    Args:
+        content: the file's images.
+        path: the file.
+        order: of the axes as the description states it, "nyx" or "yxn"; None where it
+            says nothing: that of the file.
+
+    Raises:
+        CaptureError: another order; or nothing is stated, and the last axis is the
+            shortest, as of stacks whose frames run along it.
+    """
+    if order not in (None, "nyx", "yxn"):
+        raise CaptureError(
+            f'{path}: axes = {order!r}; need "nyx" (frames along the first axis of a '
+            'stack) or "yxn" (along its last)'
+        )
+    stack, order = content.images, order or content.order
+    if stack.ndim < 3 or len(stack) == 1 or order == "nyx":
+        return stack
+    first, second, last = stack.shape[:3]
+    if order == "yxn":
+        notes.append(
+            f"{reading.to_valid_utf8(path.name)} taken as (y, x, n), {last} frames of "
+            f"{first} x {second} pixels, as stated"
+        )
+        return np.ascontiguousarray(np.moveaxis(stack, 2, 0))
+    if last < min(first, second):
+        raise CaptureError(
+            f"{path}: a stack of shape {stack.shape[:3]} is {first} frames of "
+            f"{second} x {last} pixels as (n, y, x), but reads like {last} frames of "
+            f'{first} x {second} as (y, x, n); say which: axes = "nyx" or axes = "yxn" '
+            "in capture.toml (of a single file, in the TOML of its name beside it)"
+        )
+    return stack
+
+
 def _all_frames(
-    files: Sequence[Path], folder_path: Path, colours: ColourChannels, order: str | None
-) -> tuple[tuple[str, ...], Array, list[str]]:
-    """Names, (n, y, x) frames and notes on the axes of all image files, in order."""
+    files: Sequence[Path], folder_path: Path, read: Callable[[Path], Array]
+) -> tuple[tuple[str, ...], Array]:
+    """Names and (n, y, x) frames of all image files, in order."""
     if not files:
         raise CaptureError(
             f"{folder_path}: no frames; need TIFF, PNG or HDF5 images in it"
         )
-    names: list[str] = []
-    stacks, notes = [], []
-    for path in files:
-        images, note = _file_frames(path, colours, order)
-        notes.append(note)
-        names += (
-            [f"{path.name}[{i}]" for i in range(len(images))]
-            if len(images) > 1
-            else [path.name]
-        )
-        stacks.append(images)
-    return tuple(map(reading.to_valid_utf8, names)), _join(stacks, files), notes
+    stacks = [read(file) for file in files]
+    names = [
+        f"{file.name}[{i}]" if len(images) > 1 else file.name
+        for file, images in zip(files, stacks, strict=True)
+        for i in range(len(images))
+    ]
+    return tuple(map(reading.to_valid_utf8, names)), _join(stacks, files)
 
 
 def _listed_frames(
-    files_by_name: Mapping[str, Path],
+    files: Sequence[Path],
     folder_path: Path,
     rows: stage.StageRows,
-    colours: ColourChannels,
-    order: str | None,
-) -> tuple[Array, list[str]]:
-    """(n, y, x) frames in the order of the stage file, and notes on their axes.
+    read: Callable[[Path], Array],
+) -> Array:
+    """(n, y, x) frames in the order of the stage file.
 
     Without a page column, rows of one file take its pages one after the other.
 
     Args:
-        files_by_name: image files of the folder by their normalized names.
+        files: image files of the folder.
         folder_path: folder of the capture.
         rows: rows of the stage file.
-        order: stated order of the axes, or None.
+        read: gives the (n, y, x) frames of a file.
     """
-    stacks: dict[str, Stack] = {}
+    files_by_name = {stage.normalize_spelling(file.name): file for file in files}
+    stacks: dict[str, Array] = {}
     images = []
     row_count = Counter(rows.files)
     pages_taken = Counter[str]()
@@ -383,8 +374,8 @@ def _listed_frames(
                 f"{folder.similar_name_hint(name, files_by_name)}"
             )
         if name not in stacks:
-            stacks[name] = _file_frames(path, colours, order)
-        stack = stacks[name][0]
+            stacks[name] = read(path)
+        stack = stacks[name]
         page = min(pages_taken[name], len(stack) - 1) if stated is None else stated
         pages_taken[name] += 1
         if stated is None and len(stack) not in (1, row_count[name]):
@@ -401,9 +392,7 @@ def _listed_frames(
                 f"holds {len(stack)}"
             )
         images.append(stack[page][None])
-    return _join(images, [folder_path / name for name in rows.files]), [
-        note for _, note in stacks.values()
-    ]
+    return _join(images, [folder_path / name for name in rows.files])
 
 
 def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:

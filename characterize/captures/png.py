@@ -5,7 +5,7 @@ import struct
 from pathlib import Path
 
 from characterize.captures.colour import red_first
-from characterize.captures.tiff_pages import DENSEST
+from characterize.captures.tiff import DENSEST
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 

@@ -9,11 +9,10 @@ import math
 import re
 import tomllib
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, nearest_name_hint
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_TAGGED = {**_LENGTHS, "micron": 1.0, "microns": 1.0, "inch": 25400.0}
 _BARE = ("depth", "z", "position", "exposure")
 # column of a stage table: (quantity, value of its unit in um, rad or s)
 _COLUMNS = {
@@ -110,6 +110,16 @@ class StageRows:
             np.full(n, np.nan),
             "",
         )
+
+
+def unit_um(unit: str) -> float:
+    """Length of a unit in um, as tags of files name it; nan for what is no length.
+
+    >>> unit_um("µm"), unit_um("inch"), unit_um("pixel")
+    (1.0, 25400.0, nan)
+    """
+    plain = unit.strip().lower().replace("\\u00b5", "u").replace("\\u03bc", "u")
+    return _TAGGED.get(plain.translate(_MICRO), math.nan)
 
 
 def read_stage(folder: Path) -> StageRows | None:
@@ -218,58 +228,6 @@ def _check_entries(description: dict[str, Any], path: Path) -> dict[str, Any]:
             )
     return description | (
         {"bits": int(description["bits"])} if "bits" in description else {}
-    )
-
-
-def ome_entries(xml: str, name: str) -> Iterator[dict[str, str]]:
-    """Attributes of each element of a name in OME-XML, of whatever namespace.
-
-    Args:
-        xml: OME-XML text.
-
-    Raises:
-        ElementTree.ParseError: no XML.
-    """
-    every = ElementTree.fromstring(xml).iter()
-    return (
-        entry.attrib for entry in every if str(entry.tag).rpartition("}")[2] == name
-    )
-
-
-def ome_positions(xml: str) -> Array:
-    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default
-    um), in the order of the pages.
-
-    Planes carry their place in the stack (TheZ, TheT), which need not be the order in
-    which they are written down;
-    empty where one has no position or one in a unit that is no length ("reference
-    frame").
-
-    Args:
-        xml: OME-XML text.
-
-    Raises:
-        ElementTree.ParseError: no XML.
-    """
-    order = next(ome_entries(xml, "Pixels"), {}).get("DimensionOrder", "XYZCT")
-    slow_axis, fast_axis = (
-        ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
-    )
-    planes = sorted(
-        ome_entries(xml, "Plane"),
-        key=lambda plane: (int(plane.get(slow_axis, 0)), int(plane.get(fast_axis, 0))),
-    )
-    units = [plane.get("PositionZUnit", "um").translate(_MICRO) for plane in planes]
-    if not all(
-        "PositionZ" in plane and unit in _LENGTHS
-        for plane, unit in zip(planes, units, strict=True)
-    ):
-        return np.empty(0)
-    return np.array(
-        [
-            float(plane["PositionZ"]) * _LENGTHS[unit]
-            for plane, unit in zip(planes, units, strict=True)
-        ]
     )
 
 

@@ -32,7 +32,7 @@ def read_picture(path: Path) -> Array:
         CaptureError: as :func:`characterize.captures.capture.read_images`; several
             pictures, or one in colours.
     """
-    images = capture.read_all(path)
+    images = capture.read_all(path).images
     if len(images) != 1:
         raise CaptureError(f"{path}: {len(images)} pictures; need one")
     if images.ndim == 3:

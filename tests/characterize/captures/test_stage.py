@@ -86,50 +86,6 @@ def test_tables_that_could_be_read_in_two_ways_are_refused(tmp_path, table, word
         stage.read_stage(tmp_path)
 
 
-def pixels(planes, about=""):
-    return f'<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://ome"><Pixels {about}>{planes}</Pixels></OME>'
-
-
-def test_planes_of_ome_xml_carry_their_unit():
-    units = {
-        "mm": 1e3,
-        "um": 1.0,
-        "&#181;m": 1.0,
-        "\u00b5m": 1.0,
-        "\u03bcm": 1.0,
-        "nm": 1e-3,
-        "m": 1e6,
-    }
-    planes = '<Plane PositionZ="-2"/>' + "".join(
-        f"<Plane PositionZUnit='{u}' PositionZ='1.5'/>" for u in units
-    )
-    assert stage.ome_positions(pixels(planes)) == pytest.approx(
-        [-2.0, *(1.5 * um for um in units.values())]
-    )
-    for strange in (
-        '<Plane PositionZ="3" PositionZUnit="reference frame"/>',
-        '<Plane DeltaT="0.1"/>',
-    ):
-        assert len(stage.ome_positions(pixels(planes + strange))) == 0
-
-
-@pytest.mark.parametrize(
-    ("order", "found"), [("XYZCT", [7, 5, 9, 11]), ("XYCTZ", [7, 9, 5, 11])]
-)
-def test_planes_of_ome_xml_stand_where_they_say(order, found):
-    """Two depths, two times: the first depth at both times, then the second; pages by
-    the order that is stated.
-    """
-    planes = "".join(
-        f'<Plane TheZ="{z}" TheT="{t}" TheC="0" PositionZ="{at}"/>'
-        for z, t, at in ((0, 0, 7), (0, 1, 9), (1, 0, 5), (1, 1, 11))
-    )
-    assert (
-        stage.ome_positions(pixels(planes, f'DimensionOrder="{order}"')).tolist()
-        == found
-    )
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [
