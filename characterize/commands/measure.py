@@ -7,7 +7,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,10 @@ from metalens.commands import CommonOptions, Output
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, ConfigError
-from metalens.lens import DiameterMap
+from metalens.core.report import format_summary
+
+STATES = ("oval", "collapsed", "missing")  # of pillars that are not measured
+Outcome = tuple[dict[str, object], list[str], list[str]]  # values, lines, failures
 
 
 @dataclass(frozen=True)
@@ -89,16 +92,13 @@ def run(options: Options) -> int:
         _micrograph if is_micrograph else _frames if options.edge_um is None else _edge
     )
     with options.claim_folder(options.output) as draft:
-        values, text, failures = measure(options, draft.path)
-    return options.console.judged(values, text, failures)
+        values, lines, failures = measure(options, draft.path)
+    return options.console.judged(values, "\n".join(lines), failures)
 
 
-def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
+def _frames(options: Options, folder: Path) -> Outcome:
     """Measure captures and write frames.csv, measure.json and measure.html into the
     folder.
-
-    Returns:
-        Numbers for JSON, text for the console, no failures.
     """
     capture = captures.load(options.source)
     design = lenses.load(options.design) if options.design else None
@@ -106,19 +106,22 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, lis
         capture, design=design, reference_e=options.reference_e
     )
     rows = [_frame_row(row) for row in quality.frames]
-    values: dict[str, object] = {
-        "frames": rows,
-        "best_depth": _by_field(quality.best_depth_um, "depth_um"),
-        "distortion": _by_field(quality.distortion, "distortion"),
-        "notes": list(quality.notes),
-    }
-    store.write_text(folder / "frames.csv", _table(rows))
-    store.write_text(folder / "measure.json", _json(values))
+    values = {"frames": rows}
+    for key, name, column in (
+        ("best_depth", "depth_um", quality.best_depth_um),
+        ("distortion", "distortion", quality.distortion),
+    ):
+        values[key] = [
+            {"angle_deg": x, "angle_y_deg": y, name: value}
+            for (x, y), value in column.items()
+        ]
+    _write_tables(folder, "frames.csv", rows, values | {"notes": list(quality.notes)})
     measure_page.frames_page(folder / "measure.html", quality)
     lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
-        f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, MTF50 {r.mtf50_x_per_um:.3g} / "
-        f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
+        f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, "
+        f"MTF50 {r.mtf50_x_per_um:.3g} / {r.mtf50_y_per_um:.3g} per um, "
+        f"Strehl {r.strehl:.3f}"
         for r in quality.frames
     ]
     lines += [
@@ -130,53 +133,31 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, lis
         for (x, y), d in quality.distortion.items()
     ]
     lines += [f"  note: {words}" for words in quality.notes]
-    return values, "\n".join(lines), []
+    return values | {"notes": list(quality.notes)}, lines, []
 
 
-def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, float]]:
-    """Records of both field angles in degrees and a value under ``name``."""
-    return [
-        {"angle_deg": x, "angle_y_deg": y, name: value}
-        for (x, y), value in values.items()
-    ]
-
-
-def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
+def _edge(options: Options, folder: Path) -> Outcome:
     """Measure the MTF across an edge and write edge.csv, measure.json and measure.html
     into the folder.
-
-    Returns:
-        Numbers for JSON, text for the console, no failures.
     """
     image = _cropped(picture.read_picture(options.source), options.crop)
     pixel = float(options.edge_um or 0)
     mtf = metrics.mtf_of_edge(image, pixel_um=pixel)
-    curve = np.stack([mtf.frequency_per_um, mtf.modulation], 1)
-    keep = mtf.frequency_per_um <= 1 / pixel
-    values: dict[str, object] = {
+    curve = np.stack([mtf.frequency_per_um, mtf.modulation], 1).round(6)
+    rows = [{"frequency_per_um": f, "modulation": m} for f, m in curve.tolist()]
+    values = {
         "mtf50_per_um": mtf.mtf50_per_um,
         "nyquist_per_um": 0.5 / pixel,
         "pixel_um": pixel,
     }
-    rows: list[dict[str, object]] = [
-        {"frequency_per_um": f, "modulation": m}
-        for f, m in curve[keep].round(6).tolist()
-    ]
-    store.write_text(folder / "edge.csv", _table(rows))
-    store.write_text(folder / "measure.json", _json(values))
+    _write_tables(folder, "edge.csv", rows, values)
     measure_page.edge_page(folder / "measure.html", image, mtf, pixel_um=pixel)
-    text = f"{options.output}: modulation one half at {mtf.mtf50_per_um:.4g} per um (Nyquist {0.5 / pixel:.4g})"
-    return values, text, []
+    return values, [f"{options.output}: slanted edge", *format_summary(values)], []
 
 
-def _micrograph(
-    options: Options, folder: Path
-) -> tuple[dict[str, object], str, list[str]]:
+def _micrograph(options: Options, folder: Path) -> Outcome:
     """Measure the pillars of a micrograph and write pillars.csv, measure.json,
     measure.html and, where it is certain, bias.toml into the folder.
-
-    Returns:
-        Numbers for JSON, text for the console, failures.
     """
     whole = picture.read_picture(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
@@ -186,69 +167,84 @@ def _micrograph(
     pillars = sem.measure_diameters(
         image, sem.SemMicrograph(pixel, options.pitch_nm, options.edge_bias_nm)
     )
+    values: dict[str, object] = {
+        "pillars": len(pillars.diameter_nm),
+        **{state: int(getattr(pillars, state).sum()) for state in STATES},
+        "lattice": pillars.lattice.kind,
+        "pixel_nm": pixel,
+        "pitch_nm": pillars.lattice.pitch_px * pixel,
+        "mean_nm": pillars.mean_nm,
+        "three_sigma_nm": pillars.three_sigma_nm,
+    }
     on_mask: overlay.MaskOverlay | None = None
     table: overlay.Table = []
-    scale = 1.0
+    notes = []
     if options.design is not None:
-        design = _round_design(options.design)
-        on_mask = overlay.overlay_design(pillars, design)
-        scale = overlay.lattice_scale(pillars, pixel, design)
-        is_certain = (
-            on_mask.clearly and abs(scale - 1) < overlay.SCALE
-        )  # another place or scale has other drawn diameters
-        table = overlay.bias_table(on_mask) if is_certain else []
-        pillars = overlay.register_to_mask(pillars, on_mask)
-    values = _summary(pillars, on_mask, table, pixel) | (
-        {"pitch_over_design": scale} if on_mask is not None else {}
-    )
-    store.write_text(folder / "pillars.csv", _table(_pillars(pillars, on_mask)))
-    store.write_text(folder / "measure.json", _json(values))
+        design = lenses.load(options.design)
+        if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
+            raise CaptureError(
+                f"{options.design}: {design.cell.described}; --design takes round "
+                "pillars, whose diameter is measured"
+            )
+        on_mask = overlay.overlay_design(pillars, design.diameters)
+        scale = overlay.lattice_scale(pillars, pixel, design.diameters)
+        is_true = abs(scale - 1) < overlay.SCALE
+        # another place or scale has other drawn diameters
+        table = overlay.bias_table(on_mask) if on_mask.clearly and is_true else []
+        pillars = dataclasses.replace(pillars, site=on_mask.site)
+        values |= {
+            "mask_row": on_mask.row,
+            "mask_column": on_mask.column,
+            "place_is_clear": on_mask.clearly,
+            "outliers": int(on_mask.outlier.sum()),
+            "pitch_over_design": scale,
+        }
+        if not on_mask.clearly:
+            notes.append(
+                "other places on the mask fit nearly as well: no bias table; take a "
+                "wider picture"
+            )
+        if not is_true:
+            notes.append(
+                f"the lattice is {scale - 1:+.2%} off the mask's, and so are all "
+                "diameters: no bias table; if the mask was written true to scale, "
+                f"measure again with --pixel-nm {pixel / scale:.5g}"
+            )
+    if not options.crop and len(image) < len(whole):
+        notes.append(
+            f"{len(whole) - len(image)} rows of writing below the picture left out; "
+            "--crop says otherwise"
+        )
+    if table and not options.edge_bias_nm:
+        notes.append(
+            "edges as they appear: without --edge-bias-nm the table's mean holds what "
+            "the microscope adds"
+        )
+    lines = [f"{options.output}: micrograph", *format_summary(values)]
+    lines += [
+        f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)"
+        for d, b, s, n in table
+    ]
+    if on_mask:
+        values["bias_nm"] = [list(row) for row in table]
+    _write_tables(folder, "pillars.csv", _pillars(pillars, on_mask), values)
     if table:
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(
         folder / "measure.html", image, pillars, on_mask, table, pixel_nm=pixel
     )
-    lines = [
-        _pillars_text(pillars, on_mask, table, options.output),
-        *_scale_text(scale, pixel),
-    ]
-    if not options.crop and len(image) < len(whole):
-        lines.append(
-            f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise"
-        )
-    if table and not options.edge_bias_nm:
-        lines.append(
-            "  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds"
-        )
-    return values, "\n".join(lines), _unmeasured(pillars, pixel)
-
-
-def _unmeasured(pillars: sem.MeasuredDiameters, pixel_nm: float) -> list[str]:
-    """Failures of a micrograph in words: most sites without a round pillar, or no
-    diameter; empty otherwise.
-    """
+    failures = []
     if float((pillars.collapsed | pillars.oval).mean()) > sem.MOST:
-        return [
-            f"most sites hold no round pillar: is the lattice of {pillars.lattice.pitch_px * pixel_nm:.4g} nm right? "
-            "--pitch-nm states it (tops may be dark, but rims must stand out from the ground by more than noise and "
-            "blur leave)"
-        ]
-    return (
-        []
-        if np.isfinite(pillars.diameter_nm).any()
-        else ["no pillar could be measured"]
-    )
-
-
-def _round_design(path: Path) -> DiameterMap:
-    """Diameters drawn on the mask of a lens file; refuses pillars that are not round."""
-    design = lenses.load(path)
-    if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
-        raise CaptureError(
-            f"{path}: {design.cell.described}; --design takes round pillars, whose diameter is measured"
+        failures.append(
+            "most sites hold no round pillar: is the lattice of "
+            f"{pillars.lattice.pitch_px * pixel:.4g} nm right? --pitch-nm states it "
+            "(tops may be dark, but rims must stand out from the ground by more than "
+            "noise and blur leave)"
         )
-    return design.diameters
+    elif not np.isfinite(pillars.diameter_nm).any():
+        failures.append("no pillar could be measured")
+    return values, [*lines, *(f"  {note}" for note in notes)], failures
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
@@ -259,40 +255,10 @@ def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
     part = image[top:bottom, left:right]
     if min(part.shape) < 20:
         raise ConfigError(
-            f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 pixels or more"
+            f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 "
+            "pixels or more"
         )
     return part
-
-
-def _summary(
-    pillars: sem.MeasuredDiameters,
-    on_mask: overlay.MaskOverlay | None,
-    table: overlay.Table,
-    pixel: float,
-) -> dict[str, object]:
-    """Numbers of a micrograph for measure.json: counts by state, lattice, mean and 3
-    sigma of the diameters in nm; place on the mask and bias table with a design.
-    """
-    values: dict[str, object] = {
-        "pillars": len(pillars.diameter_nm),
-        "missing": int(pillars.missing.sum()),
-        "collapsed": int(pillars.collapsed.sum()),
-        "oval": int(pillars.oval.sum()),
-        "lattice": pillars.lattice.kind,
-        "pixel_nm": pixel,
-        "pitch_nm": pillars.lattice.pitch_px * pixel,
-        "mean_nm": pillars.mean_nm,
-        "three_sigma_nm": pillars.three_sigma_nm,
-    }
-    if on_mask is not None:
-        values |= {
-            "mask_row": on_mask.row,
-            "mask_column": on_mask.column,
-            "place_is_clear": on_mask.clearly,
-            "outliers": int(on_mask.outlier.sum()),
-            "bias_nm": [list(row) for row in table],
-        }
-    return values
 
 
 def _pillars(
@@ -302,7 +268,7 @@ def _pillars(
     error in nm, state; drawn diameter and error with a design.
     """
     state = np.full(len(pillars.row), "good", dtype=object)
-    for word in ("oval", "collapsed", "missing"):
+    for word in STATES:
         state[getattr(pillars, word)] = word
     columns: dict[str, Array] = {
         "site_row": pillars.site[:, 0],
@@ -323,68 +289,27 @@ def _pillars(
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def _pillars_text(
-    pillars: sem.MeasuredDiameters,
-    on_mask: overlay.MaskOverlay | None,
-    table: overlay.Table,
-    target: Path,
-) -> str:
-    """Text for the console: counts by state, mean diameter, place on the mask, bias
-    table.
-    """
-    missing = int(pillars.missing.sum())
-    collapsed = int(pillars.collapsed.sum())
-    lines = [
-        f"{target}: {len(pillars.diameter_nm)} sites of a {pillars.lattice.kind} lattice, {missing} missing, "
-        f"{collapsed} collapsed; mean {pillars.mean_nm:.2f} nm, 3 sigma {pillars.three_sigma_nm:.2f} nm"
-    ]
-    if pillars.oval.any():
-        lines.append(
-            f"  {int(pillars.oval.sum())} are oval, longer than wide by more than 15 %: not measured"
-        )
-    if on_mask is not None:
-        unsure = " (not clear: other places fit nearly as well; no bias table; take a wider picture)"
-        lines.append(
-            f"  on the mask from row {on_mask.row}, column {on_mask.column}{'' if on_mask.clearly else unsure}"
-        )
-        lines += [
-            f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)"
-            for d, b, s, n in table
-        ]
-    return "\n".join(lines)
-
-
-def _scale_text(scale: float, pixel_nm: float) -> list[str]:
-    """Advice where the lattice constants of picture and mask differ by more than
-    :data:`overlay.SCALE`; empty otherwise.
-    """
-    if abs(scale - 1) < overlay.SCALE:
-        return []
-    return [
-        f"  the lattice is {scale - 1:+.2%} off the mask's, and so are all diameters: no bias table; if the mask was "
-        f"written true to scale, measure again with --pixel-nm {pixel_nm / scale:.5g}"
-    ]
-
-
 def _frame_row(row: frames.FrameMetrics) -> dict[str, object]:
     """Metrics of a frame as one flat record."""
-    values: dict[str, object] = dataclasses.asdict(row)
-    del values["spot"]
-    spot: dict[str, object] = dataclasses.asdict(row.spot)
-    del spot["d4sigma_um"], spot["centroid_um"]
-    (major, minor), (cx, cy) = row.spot.d4sigma_um, row.spot.centroid_um
+    values = dataclasses.asdict(row)
+    spot = values.pop("spot")
+    major, minor = spot.pop("d4sigma_um")
+    x, y = spot.pop("centroid_um")
     widths = {"d4sigma_major_um": major, "d4sigma_minor_um": minor}
-    return values | spot | widths | {"centroid_x_um": cx, "centroid_y_um": cy}
+    return values | spot | widths | {"centroid_x_um": x, "centroid_y_um": y}
 
 
-def _json(values: dict[str, object]) -> str:
-    return json.dumps(values, indent=1, default=float) + "\n"
-
-
-def _table(rows: Sequence[dict[str, object]]) -> str:
-    """CSV text of records with equal keys."""
+def _write_tables(
+    folder: Path,
+    name: str,
+    rows: Sequence[Mapping[str, object]],
+    values: Mapping[str, object],
+) -> None:
+    """Write records of equal keys as a CSV file, and the result as measure.json."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return text.getvalue()
+    store.write_text(folder / name, text.getvalue())
+    result = json.dumps(values, indent=1, default=float) + "\n"
+    store.write_text(folder / "measure.json", result)

@@ -175,52 +175,38 @@ def _pillars_figure(
     """PNG of the micrograph with a circle on every good pillar, coloured by its error
     in nm (by its diameter without a design); missing and collapsed pillars are marked.
     """
-    from matplotlib.collections import EllipseCollection
-    from matplotlib.figure import Figure
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Circle
 
-    figure = Figure(figsize=(6.5, 6.0))
-    axis = figure.add_subplot()
+    figure, axis = report.make_figure(size=(6.5, 6.0))
     axis.imshow(image, cmap="gray")
     axis.set_axis_off()
     good = np.isfinite(pillars.diameter_nm)
-    values = (pillars.diameter_nm if on_mask is None else on_mask.error_nm)[good]
-    diameter_px = pillars.diameter_nm[good] / pixel_nm
-    widths = (
-        np.where(on_mask.outlier[good], 3.0, 1.0)
-        if on_mask is not None
-        else np.ones(int(good.sum()))
+    places = zip(
+        pillars.column[good],
+        pillars.row[good],
+        pillars.diameter_nm[good] / (2 * pixel_nm),
+        strict=True,
     )
-    rings = EllipseCollection(
-        diameter_px,
-        diameter_px,
-        np.zeros(len(diameter_px)),
-        units="xy",
-        offsets=np.stack([pillars.column[good], pillars.row[good]], 1),
-        offset_transform=axis.transData,
+    rings = PatchCollection(
+        [Circle((x, y), radius) for x, y, radius in places],
         facecolors="none",
         cmap="coolwarm",
-        linewidths=widths.tolist(),
+        linewidths=1.0 if on_mask is None else np.where(on_mask.outlier[good], 3, 1),
     )
-    rings.set_array(values)
+    rings.set_array(
+        (pillars.diameter_nm if on_mask is None else on_mask.error_nm)[good]
+    )
     axis.add_collection(rings)
-    rings.set_facecolor("none")
-    axis.plot(
-        pillars.column[pillars.missing],
-        pillars.row[pillars.missing],
-        "x",
-        color="yellow",
-    )
-    axis.plot(
-        pillars.column[pillars.collapsed],
-        pillars.row[pillars.collapsed],
-        "s",
-        color="yellow",
-        fillstyle="none",
-    )
-    figure.colorbar(
-        rings,
-        ax=axis,
-        label="diameter / nm" if on_mask is None else "error / nm",
-        shrink=0.8,
-    )
+    for state, mark in (("missing", "x"), ("collapsed", "s")):
+        chosen = getattr(pillars, state)
+        axis.plot(
+            pillars.column[chosen],
+            pillars.row[chosen],
+            mark,
+            color="yellow",
+            fillstyle="none",
+        )
+    label = "diameter / nm" if on_mask is None else "error / nm"
+    figure.colorbar(rings, ax=axis, label=label, shrink=0.8)
     return report.figure_png(figure)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import ndimage, special
 
 from characterize.captures import Capture, to_electrons
 from characterize.measure import metrics
@@ -14,13 +14,13 @@ from characterize.measure.metrics import SpotMetrics
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 from metalens.lens import Lens
+from metalens.psf import find_peak
 
 _FINE = 15  # samples a pixel side under the ideal spot
 # weights of the second and first neighbours that interpolate a pixel
 _CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6
-# pixels on each side of the brightest pixel, over which the ideal spot is aligned
-_CORE = 5
-_SAME = 1e-9  # relative tolerance of equal depths, after two inversions
+# alignments of the ideal spot: its distance shrinks to a half or less in each
+_ALIGNMENTS = 6
 Field = tuple[float, float]  # angle along x and y, degrees
 
 
@@ -98,8 +98,18 @@ def measure_frames(
         )
     frames = to_electrons(capture)
     step = capture.pixel_um
-    labelled = zip(frames.electrons, frames.usable, _frame_labels(capture), strict=True)
-    light = np.stack([_above_border(*shot) for shot in labelled])
+    light = np.stack(
+        [
+            _above_border(*shot)
+            for shot in zip(
+                frames.electrons,
+                frames.usable,
+                capture.names,
+                capture.position_um.tolist(),
+                strict=True,
+            )
+        ]
+    )
     notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
         notes.append(
@@ -109,12 +119,7 @@ def measure_frames(
         _metrics_row(capture, i, image, design, reference_e)
         for i, image in enumerate(light)
     ]
-    sharpest = _sharpest_depths(rows)
-    notes += [
-        _end_note(field, depth)
-        for field, depth in sharpest.items()
-        if _is_at_end(rows, field, depth)
-    ]
+    sharpest = _sharpest_depths(rows, notes)
     return CaptureQuality(
         tuple(rows),
         sharpest,
@@ -153,11 +158,7 @@ def _metrics_row(
 
 
 def airy_pattern(
-    design: Lens,
-    capture: Capture,
-    shape: tuple[int, ...],
-    *,
-    place_px: Field = (0.0, 0.0),
+    design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Array
 ) -> Array:
     """(y, x) Airy pattern (2 J1(u) / u)² of the lens's aperture, averaged over the
     pixels of a capture.
@@ -168,7 +169,7 @@ def airy_pattern(
         design: the lens whose aperture it is.
         capture: gives the pixel, its fill factor and the wavelength.
         shape: (rows, columns).
-        place_px: (x, y) of the pattern's middle from that of the window.
+        place_px: (row, column) of the pattern's middle from that of the window.
     """
     wavelength_um = (
         capture.wavelength_um
@@ -181,7 +182,7 @@ def airy_pattern(
     offsets = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
     y, x = (
         (np.arange(size)[:, None] - (size - 1) / 2 - place + offsets).ravel()
-        for size, place in zip(shape, place_px[::-1], strict=True)
+        for size, place in zip(shape, place_px.tolist(), strict=True)
     )
     argument = (
         2
@@ -197,66 +198,33 @@ def airy_pattern(
 
 
 def _strehl(image: Array, design: Lens, capture: Capture) -> float:
-    """Strehl ratio of a spot against the Airy pattern at its place.
+    """Strehl ratio of a spot against the Airy pattern of equal peak position.
 
-    The place has the largest normalised correlation of pattern and spot core.
+    The position is that of the peaks of splines through the pixels, iterated until that
+    of the pattern is that of the spot.
     """
-    peak = [int(index) for index in np.unravel_index(int(image.argmax()), image.shape)]
-    half = min(_CORE, (min(image.shape) - 1) // 2)
-    middle = [
-        min(max(index, half), size - 1 - half)
-        for index, size in zip(peak, image.shape, strict=True)
-    ]
-    core = image[tuple(slice(index - half, index + half + 1) for index in middle)]
-
-    def negative_correlation(place: Array) -> float:
-        ideal = airy_pattern(
-            design, capture, core.shape, place_px=(float(place[0]), float(place[1]))
-        )
-        return -float((ideal * core).sum() / np.linalg.norm(ideal))
-
-    start = np.array([peak[1] - middle[1], peak[0] - middle[0]], float)
-    simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4]])
-    options = {
-        "initial_simplex": simplex,
-        "xatol": 2e-3,
-        "fatol": 1e-9 * float(np.abs(core).sum()),
-    }
-    place_px = optimize.minimize(
-        negative_correlation, start, method="Nelder-Mead", options=options
-    ).x
-    x, y = (
-        float(coordinate) + centre - (size - 1) / 2
-        for coordinate, centre, size in zip(
-            place_px, middle[::-1], image.shape[::-1], strict=True
-        )
-    )
-    ideal = airy_pattern(design, capture, image.shape, place_px=(x, y))
+    peak = np.array(find_peak(image)[:2])
+    place = peak - (np.array(image.shape) - 1) / 2
+    for _ in range(_ALIGNMENTS):
+        ideal = airy_pattern(design, capture, image.shape, place_px=place)
+        place = place + peak - find_peak(ideal)[:2]
     return metrics.strehl_ratio(image, ideal - np.median(_rim(ideal)))
 
 
-def _frame_labels(capture: Capture) -> list[str]:
-    """Name and depth of every frame."""
-    depths = (
-        f" at {depth:g} um" if math.isfinite(depth) else ""
-        for depth in capture.position_um
-    )
-    return [f"{name}{depth}" for name, depth in zip(capture.names, depths, strict=True)]
-
-
-def _above_border(electrons: Array, usable: Array, place: str) -> Array:
+def _above_border(electrons: Array, usable: Array, name: str, depth_um: float) -> Array:
     """The frame above the median of its border; masked pixels by :func:`_filled`.
 
     Raises:
-        CaptureError: none of its light stands out; the frame's place is named.
+        CaptureError: none of its light stands out; name and depth are given.
     """
     border = _rim(electrons)
     light = _filled(electrons - np.median(border), usable)
     noise = 1.4826 * float(np.median(np.abs(border - np.median(border))))
     if light.max() < 5 * max(noise, 1e-9):
         raise CaptureError(
-            f"{place}: no spot above five times the noise of the frame's border; where defocus spreads "
-            "the light so far, leave the frame out or take a wider one; else expose longer, or crop around the spot"
+            f"{name} at {depth_um:g} um: no spot above five times the noise of the "
+            "frame's border; where defocus spreads the light so far, leave the frame "
+            "out or take a wider one; else expose longer, or crop around the spot"
         )
     return np.asarray(light)
 
@@ -308,42 +276,34 @@ def _rim(image: Array) -> Array:
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
-def _sharpest_depths(rows: list[FrameMetrics]) -> dict[Field, float]:
-    """{field angles: depth in um of the sharpest spot}.
+def _sharpest_depths(rows: list[FrameMetrics], notes: list[str]) -> dict[Field, float]:
+    """{field angles: depth in um of the sharpest spot}; appends to ``notes`` where it
+    is the first or last of an angle.
 
     Sharpness is 1 / EE80²; its maximum is that of a parabola in 1/z through the three
     depths about the sharpest frame. Angles with fewer than three depths are left out.
     """
     depths = {}
     for field in sorted({row.field for row in rows}):
-        rows_of_field = sorted(
-            (row for row in rows if row.field == field), key=lambda row: row.depth_um
-        )
-        if len(rows_of_field) < 3 or not all(
-            math.isfinite(row.depth_um) for row in rows_of_field
-        ):
+        of_field = [row for row in rows if row.field == field]
+        inverse_depth = np.array([1 / row.depth_um for row in of_field])
+        order = np.argsort(-inverse_depth)
+        if len(order) < 3 or not np.isfinite(inverse_depth).all():
             continue
-        sharpness = np.array([1 / row.spot.ee80_um**2 for row in rows_of_field])
-        inverse_depth = 1 / np.array([row.depth_um for row in rows_of_field])
-        k = int(np.clip(np.argmax(sharpness), 1, len(rows_of_field) - 2))
+        inverse_depth = inverse_depth[order]
+        sharpness = np.array([row.spot.ee80_um**-2 for row in of_field])[order]
+        best = int(sharpness.argmax())
+        k = min(max(best, 1), len(order) - 2)
         a, b, _ = np.polyfit(inverse_depth[k - 1 : k + 2], sharpness[k - 1 : k + 2], 2)
-        vertex = -b / (2 * a) if a < 0 else inverse_depth[int(np.argmax(sharpness))]
-        depths[field] = float(
-            1 / np.clip(vertex, inverse_depth.min(), inverse_depth.max())
-        )
+        vertex = -b / (2 * a) if a < 0 else inverse_depth[best]
+        last, first = inverse_depth[[-1, 0]]
+        depths[field] = float(1 / np.clip(vertex, last, first))
+        if not last < vertex < first:
+            notes.append(
+                f"sharpest at {field[0]:g}, {field[1]:g} deg at an end of the captured "
+                f"depths, {depths[field]:.5g} um: focus may lie beyond it"
+            )
     return depths
-
-
-def _is_at_end(rows: list[FrameMetrics], field: Field, depth_um: float) -> bool:
-    """Whether the sharpest depth of an angle is the first or last of its frames."""
-    depths = [r.depth_um for r in rows if r.field == field]
-    return min(abs(depth_um / end - 1) for end in (min(depths), max(depths))) < _SAME
-
-
-def _end_note(field: Field, depth_um: float) -> str:
-    """Note that the sharpest depth of an angle lies at the end of the captured range."""
-    x, y = field
-    return f"sharpest at {x:g}, {y:g} deg at an end of the captured depths, {depth_um:.5g} um: focus may lie beyond it"
 
 
 def _distortion(
@@ -361,16 +321,10 @@ def _distortion(
         places.setdefault(row.field, []).append(row.spot.centroid_um)
     axis_place = np.mean(places.get((0.0, 0.0), [(0.0, 0.0)]), axis=0)
     ratio = {}
-    reference = math.inf
     for field in sorted(places, key=lambda angles: math.hypot(*angles)):
-        tangent = np.tan(np.radians(field))
-        if not tangent.any():
-            continue
-        ideal_um = design.reduced_um * tangent
-        ratio[field] = float(
-            (np.mean(places[field], axis=0) - axis_place)
-            @ ideal_um
-            / (ideal_um @ ideal_um)
-        )
-        reference = ratio[field] if math.isinf(reference) else reference
+        ideal_um = design.reduced_um * np.tan(np.radians(field))
+        if ideal_um.any():
+            image_um = np.mean(places[field], axis=0) - axis_place
+            ratio[field] = float(image_um @ ideal_um / (ideal_um @ ideal_um))
+    reference = next(iter(ratio.values()), 1.0)
     return {field: value / reference - 1 for field, value in sorted(ratio.items())}

@@ -2,7 +2,6 @@
 its error, and the bias table of the process.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -191,18 +190,6 @@ def bias_table(overlay_fit: MaskOverlay, *, knots: int = 7) -> Table:
             )
         )
     return rows
-
-
-def register_to_mask(
-    measured: MeasuredDiameters, overlay_fit: MaskOverlay
-) -> MeasuredDiameters:
-    """The same pillars with the mask's own row and column as their site.
-
-    Args:
-        measured: pillars of the micrograph.
-        overlay_fit: the micrograph's pillars on the mask.
-    """
-    return dataclasses.replace(measured, site=overlay_fit.site)
 
 
 def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
