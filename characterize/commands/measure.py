@@ -106,7 +106,7 @@ def _frames(options: Options, folder: Path) -> Outcome:
         capture, design=design, reference_e=options.reference_e
     )
     rows = [_frame_row(row) for row in quality.frames]
-    values = {"frames": rows}
+    values: dict[str, object] = {"frames": rows}
     for key, name, column in (
         ("best_depth", "depth_um", quality.best_depth_um),
         ("distortion", "distortion", quality.distortion),
@@ -115,7 +115,8 @@ def _frames(options: Options, folder: Path) -> Outcome:
             {"angle_deg": x, "angle_y_deg": y, name: value}
             for (x, y), value in column.items()
         ]
-    _write_tables(folder, "frames.csv", rows, values | {"notes": list(quality.notes)})
+    values["notes"] = list(quality.notes)
+    _write_tables(folder, "frames.csv", rows, values)
     measure_page.frames_page(folder / "measure.html", quality)
     lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
@@ -133,7 +134,7 @@ def _frames(options: Options, folder: Path) -> Outcome:
         for (x, y), d in quality.distortion.items()
     ]
     lines += [f"  note: {words}" for words in quality.notes]
-    return values | {"notes": list(quality.notes)}, lines, []
+    return values, lines, []
 
 
 def _edge(options: Options, folder: Path) -> Outcome:
