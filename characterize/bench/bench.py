@@ -44,38 +44,18 @@ class BenchCamera:
     share of hot pixels.
     """
 
-    pixel_um: float = 3.0
-    pixels: int = 48
-    bits: int = 12
-    gain_e: float = 2.0
+    pixel_um: float = field(default=3.0, metadata={"above": 0})
+    pixels: int = field(default=48, metadata={"above": 3, "most": 4096})
+    bits: int = field(default=12, metadata={"above": 0, "most": 16})
+    gain_e: float = field(default=2.0, metadata={"above": 0})
     read_noise_e: float = 2.0
-    offset: int = 64
-    hot_share: float = 0.0
+    offset: int = field(default=64, metadata={"signed": False})
+    hot_share: float = field(default=0.0, metadata={"most": 1})
 
     def __post_init__(self) -> None:
-        top = 2 ** min(max(self.bits, 1), 16) - 2
-        for name, least, largest in (
-            ("pixels", 4, 4096),
-            ("bits", 1, 16),
-            ("offset", 0, top),
-        ):
-            if not least <= getattr(self, name) <= largest:
-                raise FitError(
-                    f"camera.{name} = {getattr(self, name)}: need {least} to {largest}"
-                )
-        for name in ("pixel_um", "gain_e"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise FitError(
-                    f"camera.{name} = {getattr(self, name)}: need a number above 0"
-                )
-        if not 0 <= self.read_noise_e < math.inf:
+        if self.offset > 2**self.bits - 2:
             raise FitError(
-                f"camera.read_noise_e = {self.read_noise_e}: need 0 or more electrons"
-            )
-        if not 0 <= self.hot_share < 1:
-            raise FitError(
-                f"camera.hot_share = {self.hot_share}: need a share of the pixels, 0 "
-                "to below 1"
+                f"camera.offset = {self.offset}: need less than the {self.bits} bits"
             )
 
 
@@ -116,14 +96,9 @@ class HiddenLens:
     @property
     def stated(self) -> tuple[Array, Array]:
         """(n,) stated depths and (n, 2) field angles in rad of all frames."""
-        pairs = [
-            (depth, math.radians(angle))
-            for angle in self.angles_deg
-            for depth in self.depths_um
-        ]
-        return np.array([depth for depth, _ in pairs]), np.array(
-            [(angle, 0.0) for _, angle in pairs]
-        )
+        angle, depth = np.meshgrid(self.angles_deg, self.depths_um, indexing="ij")
+        angles = np.stack([np.radians(angle.ravel()), np.zeros(angle.size)], 1)
+        return depth.ravel(), angles
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -154,23 +129,16 @@ def simulate_frames(
     electrons = light * (truth.peak_e / light.max()) + background_plane(truth)
     camera = truth.camera
     hot = generator.random(electrons.shape[1:]) < camera.hot_share
+    half_well_e = 0.5 * (2**camera.bits - camera.offset) * camera.gain_e
+
+    def even_frames(count: int, level_e: float) -> Array:
+        """(count, y, x) counts of even light."""
+        level = np.full(hot.shape, level_e)
+        return np.stack([_read(level, camera, generator, hot) for _ in range(count)])
+
     frames = np.stack([_read(frame, camera, generator, hot) for frame in electrons])
-    no_light = np.zeros(electrons.shape[1:])
-    half_range = np.full(
-        electrons.shape[1:], 0.5 * (2**camera.bits - camera.offset) * camera.gain_e
-    )
-    dark = np.stack(
-        [
-            _read(no_light, camera, generator, hot)
-            for _ in range(max(truth.dark_frames, 1))
-        ]
-    )
-    flat = np.stack(
-        [
-            _read(half_range, camera, generator, hot)
-            for _ in range(max(truth.flat_frames, 2))
-        ]
-    )
+    dark = even_frames(max(truth.dark_frames, 1), 0.0)
+    flat = even_frames(max(truth.flat_frames, 2), half_well_e)
     return SimulatedFrames(frames, dark, flat, electrons)
 
 

@@ -3,7 +3,6 @@ information on the lens.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -51,18 +50,13 @@ class IntervalRequirement:
     """
 
     name: str
-    within: float
+    within: float = field(metadata={"above": 0})
 
     def __post_init__(self) -> None:
         if self.name not in PLACE:
             raise FitError(
                 f"wanted {self.name!r}: no such "
                 f"parameter{nearest_name_hint(self.name, NAMES)}"
-            )
-        if not (self.within > 0 and math.isfinite(self.within)):
-            raise FitError(
-                f"wanted {self.name}: within = {self.within}; need a finite number "
-                "above 0"
             )
 
 
@@ -90,10 +84,10 @@ class BenchProtocol:
     exposures: tuple[float, ...] = (1.0,)
     frames: int = 8
     criterion: Literal["D", "A"] = "A"
-    peak_e: float = 8000.0
+    peak_e: float = field(default=8000.0, metadata={"above": 0})
     full_well_e: float = field(default=10000.0, metadata={"above": 0})
     read_noise_e: float = 2.0
-    pixel_um: float = 3.0
+    pixel_um: float = field(default=3.0, metadata={"above": 0})
     pixels: int = field(default=32, metadata={"above": 0})
     free: tuple[str, ...] = ()
     known: tuple[KnownValue, ...] = ()
@@ -107,16 +101,8 @@ class BenchProtocol:
                 f"{self.frames}: need "
                 "0 < nearest < farthest, two depths or more and one frame or more"
             )
-        if not (
-            self.angles_deg
-            and self.exposures
-            and min(self.exposures) > 0
-            and min(self.peak_e, self.pixel_um) > 0
-        ):
-            raise FitError(
-                "need at least one of angles_deg and exposures; exposures, peak_e and "
-                "pixel_um above 0"
-            )
+        if not (self.angles_deg and self.exposures and min(self.exposures) > 0):
+            raise FitError("need angles_deg, and exposures above 0")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -160,34 +146,102 @@ def plan_captures(
     """
     names, prior = _parameters(lens, protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
-    place_of = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
-    chosen = choose_frames(
-        information,
-        prior,
-        protocol.frames,
-        criterion=protocol.criterion,
-        names=names,
-        place=place_of,
-    )
+    place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
+    chosen = choose_frames(information, prior, place, protocol, names)
     unstated = _unstated_shifts(lens, protocol, response, candidates[chosen])
-    count = _sufficient_count(
-        information[chosen],
-        prior,
-        names,
-        protocol.wanted,
-        unstated.sigma,
-        least=_least_count(candidates[chosen]),
+    wanted = [one for one in protocol.wanted if one.name in names]
+    within = np.array([one.within for one in wanted])
+    indices = [names.index(one.name) for one in wanted]
+    room = within**2 - (REACH * unstated.sigma[indices]) ** 2
+    # an interval that the unstated causes alone exceed is one within the model
+    limits = np.sqrt(np.where(room > 0, room, within**2)) / REACH
+    places = [len(set(place[chosen[: i + 1]].tolist())) for i in range(len(chosen))]
+    least = next(
+        (i + 1 for i, n in enumerate(places) if n >= _LEAST_PLACES), len(chosen)
     )
+    for count in range(least if wanted else len(chosen), len(chosen) + 1):
+        fisher = prior + information[chosen[:count]].sum(0)
+        sigma = np.sqrt(np.diag(invert_information(fisher)))
+        if (sigma[indices] <= limits).all():
+            break
     chosen = chosen[:count]
-    covariance = invert_information(prior + information[chosen].sum(0))
-    sigma = np.sqrt(np.diag(covariance))
+    missed = [_missed_interval(one, names, sigma, unstated, count) for one in wanted]
+    missed += [
+        f"{one.name} is fixed, not fitted: no frame changes its interval"
+        for one in protocol.wanted
+        if one.name not in names
+    ]
+    if places[count - 1] < _LEAST_PLACES:
+        few = "fewer than 2 is refused"
+        if places[count - 1] > 1:
+            few = f"fewer than {_LEAST_PLACES} cannot be tested on frames left out"
+        missed.append(
+            f"frames at {places[count - 1]} of the depths and angles: a fit of {few}; "
+            "allow more frames"
+        )
     depth, angle, exposure = candidates[chosen].T
-    warnings = (
-        *_missed_requirements(names, sigma, unstated, protocol.wanted, count),
-        *_place_warnings(candidates[chosen]),
-        *_focus_warnings(lens, protocol, depth),
-    )
+    warnings = (*filter(None, missed), *_focus_warnings(lens, protocol, depth))
     return CapturePlan(depth, angle, exposure, names, sigma, unstated.sigma, warnings)
+
+
+def _missed_interval(
+    wanted: IntervalRequirement,
+    names: tuple[str, ...],
+    sigma: Array,
+    unstated: UnmodelledShifts,
+    count: int,
+) -> str:
+    """Sentence on a required interval that is not reached: by how much more light, or
+    which causes to state; empty where it is reached.
+
+    Args:
+        wanted: interval of one of the parameters.
+        names: (p,) parameters.
+        sigma: (p,) standard errors within the model.
+        unstated: shifts by causes that nobody states.
+        count: number of chosen frames.
+    """
+    index = names.index(wanted.name)
+    within_model = REACH * float(sigma[index])
+    unstated_half = REACH * float(unstated.sigma[index])
+    total = math.hypot(within_model, unstated_half)
+    room = wanted.within**2 - unstated_half**2
+    expected = (
+        f"{wanted.name} will be known to +- {total:.2g}, wanted +- {wanted.within:.2g}"
+    )
+    if room > 0:
+        factor = within_model**2 / room
+        return (
+            f"{expected}: {factor:.1f} times the light ({math.ceil(count * factor)} "
+            "such frames), other depths or angles, or an independent measurement"
+            if factor > 1 + 1e-9
+            else ""
+        )
+    worst = np.argsort(-unstated.by_cause[:, index])[:3]
+    causes = ", ".join(unstated.causes[cause] for cause in worst)
+    return (
+        f"{expected}: within the model it is +- {within_model:.2g}, more frames do not "
+        f"help; state what else there is or is not, first of all {causes} "
+        "(capture.toml, [[known]])"
+    )
+
+
+def _bench_model(
+    lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
+) -> tuple[ForwardModel, Array]:
+    """Model of (n, 3) frames, and its parameters: the known ones, with the light of
+    ``peak_e`` in the brightest pixel at exposure 1.
+    """
+    angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
+    side = protocol.pixels
+    setting = FrameSetting(
+        frames[:, 0], angles, frames[:, 2], protocol.pixel_um, side, side
+    )
+    model = ForwardModel(lens, setting, response)
+    x = parameter_vector({k.name: k.value for k in protocol.known if k.name in PLACE})
+    brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
+    x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
+    return model, x
 
 
 def _unstated_shifts(
@@ -200,20 +254,7 @@ def _unstated_shifts(
         frames: (n, 3) depth in um, angle in degrees, relative exposure.
     """
     known = {value.name: value for value in protocol.known}
-    sizes = unfitted_sizes(known, lens)
-    angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
-    setting = FrameSetting(
-        frames[:, 0],
-        angles,
-        frames[:, 2],
-        protocol.pixel_um,
-        protocol.pixels,
-        protocol.pixels,
-    )
-    model = ForwardModel(lens, setting, response)
-    x = parameter_vector({name: value.value for name, value in known.items()})
-    brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
-    x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
+    model, x = _bench_model(lens, protocol, response, frames)
     image = model.images(x)[0]
     saturated = image >= protocol.full_well_e
     ones = np.ones_like(image)
@@ -221,120 +262,10 @@ def _unstated_shifts(
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
+    sizes = unfitted_sizes(known, lens)
     return unmodelled_effects.expected_shifts(
         SearchTask(model, data, x, known, None, free, sizes)
     )
-
-
-def _least_count(frames: Array) -> int:
-    """Number of leading frames that lie at ``_LEAST_PLACES`` pairs of depth and angle;
-    all frames where there are fewer pairs.
-    """
-    places = [
-        len({tuple(place) for place in frames[: number + 1, :2].tolist()})
-        for number in range(len(frames))
-    ]
-    return next(
-        (number + 1 for number, count in enumerate(places) if count >= _LEAST_PLACES),
-        len(frames),
-    )
-
-
-def _sufficient_count(
-    information: Array,
-    prior: Array,
-    names: tuple[str, ...],
-    requirements: Sequence[IntervalRequirement],
-    unstated_sigma: Array,
-    *,
-    least: int,
-) -> int:
-    """Number of leading frames that reach all required intervals with what nobody
-    states, at least ``least``; all frames where they do not reach them.
-
-    A requirement that the unstated causes alone exceed is one on the model's interval.
-
-    Args:
-        information: (frames, p, p) of each chosen frame.
-        prior: (p, p) information known beforehand.
-        unstated_sigma: (p,) standard deviation by unstated causes.
-    """
-    limits = {}
-    for requirement in requirements:
-        if requirement.name in names:
-            index = names.index(requirement.name)
-            variance = (requirement.within / REACH) ** 2 - unstated_sigma[index] ** 2
-            limits[index] = (
-                variance if variance > 0 else (requirement.within / REACH) ** 2
-            )
-    for count in range(least, len(information)) if limits else ():
-        covariance = invert_information(prior + information[:count].sum(0))
-        if all(covariance[index, index] <= most for index, most in limits.items()):
-            return count
-    return len(information)
-
-
-def _missed_requirements(
-    names: tuple[str, ...],
-    sigma: Array,
-    unstated: UnmodelledShifts,
-    requirements: Sequence[IntervalRequirement],
-    count: int,
-) -> list[str]:
-    """Sentences on required intervals that are not reached: by how much more light, or
-    which causes to state.
-
-    Args:
-        sigma: (p,) standard errors within the model.
-        count: number of chosen frames.
-    """
-    sentences = []
-    for requirement in requirements:
-        if requirement.name not in names:
-            sentences.append(
-                f"{requirement.name} is fixed, not fitted: no frame changes its "
-                "interval"
-            )
-            continue
-        index = names.index(requirement.name)
-        within_model = REACH * float(sigma[index])
-        unstated_half = REACH * float(unstated.sigma[index])
-        total = math.hypot(within_model, unstated_half)
-        expected = f"{requirement.name} will be known to +- {total:.2g}, wanted +- {requirement.within:.2g}"
-        if unstated_half >= requirement.within:
-            causes = [
-                unstated.causes[cause]
-                for cause in np.argsort(-unstated.by_cause[:, index])[:3]
-            ]
-            sentences.append(
-                f"{expected}: within the model it is +- {within_model:.2g}, more "
-                "frames do not help; state what else there "
-                f"is or is not, first of all {', '.join(causes)} (capture.toml, "
-                "[[known]])"
-            )
-        elif total > requirement.within * (1 + 1e-9):
-            light_factor = within_model**2 / (requirement.within**2 - unstated_half**2)
-            sentences.append(
-                f"{expected}: {light_factor:.1f} times the light "
-                f"({math.ceil(count * light_factor)} such frames), other depths or "
-                "angles, or an independent measurement"
-            )
-    return sentences
-
-
-def _place_warnings(frames: Array) -> list[str]:
-    """Warning that (n, 3) frames lie at fewer than ``_LEAST_PLACES`` pairs of depth and
-    angle; empty otherwise.
-    """
-    places = len({tuple(place) for place in frames[:, :2].tolist()})
-    if places >= _LEAST_PLACES:
-        return []
-    consequence = "is refused" if places == 1 else "cannot be tested on frames left out"
-    return [
-        f"frames at {places} of the depths and angles: a fit of fewer than "
-        f"{2 if places == 1 else 4} {consequence}; "
-        "allow more frames"
-    ]
 
 
 def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> list[str]:
@@ -345,30 +276,24 @@ def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> li
     focus = lens.source_distance_um
     if not (math.isfinite(focus) and focus > 0):
         return []
-    extremes = np.array([*protocol.depths_um, chosen_um.min(), chosen_um.max()])
-    waves = (
-        lens.diameters.radius_um**2
-        / 2
-        * np.abs(1 / extremes - 1 / focus)
-        / lens.wavelength_um
-    )
-    sentences = []
-    if waves.max() < _DEFOCUS_WAVES:
-        sentences.append(
-            f"all depths are in focus (defocus of {waves.max():.2g} waves at most): a "
-            "symmetric lens in focus fixes "
-            "its bias, height and even aberrations poorly; go on to half a wave or "
-            "more on both sides"
-        )
-    elif chosen_um.min() > focus or chosen_um.max() < focus:
-        side = "farther" if chosen_um.min() > focus else "nearer"
-        sentences.append(
-            f"all frames are {side} than the focus at {focus:.4g} um: the signs of "
-            "astigmatism, of spherical "
-            "aberration and of the bias hang on defocus alone; take some on the other "
-            "side"
-        )
-    return sentences
+    nearest, farthest = chosen_um.min(), chosen_um.max()
+    extremes = np.array([*protocol.depths_um, nearest, farthest])
+    defocus_um = lens.diameters.radius_um**2 / 2 * np.abs(1 / extremes - 1 / focus)
+    waves = defocus_um.max() / lens.wavelength_um
+    if waves < _DEFOCUS_WAVES:
+        return [
+            f"all depths are in focus (defocus of {waves:.2g} waves at most): a "
+            "symmetric lens in focus fixes its bias, height and even aberrations "
+            "poorly; go on to half a wave or more on both sides"
+        ]
+    if nearest <= focus <= farthest:
+        return []
+    side = "farther" if nearest > focus else "nearer"
+    return [
+        f"all frames are {side} than the focus at {focus:.4g} um: the signs of "
+        "astigmatism, of spherical aberration and of the bias hang on defocus alone; "
+        "take some on the other side"
+    ]
 
 
 def candidate_information(
@@ -388,23 +313,9 @@ def candidate_information(
     """
     nearest, farthest = protocol.depths_um
     depths = 1 / np.linspace(1 / nearest, 1 / farthest, protocol.depth_count)
-    pairs = np.array(
-        [(depth, angle) for angle in protocol.angles_deg for depth in depths]
-    )
-    angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
-    setting = FrameSetting(
-        pairs[:, 0],
-        angles,
-        np.ones(len(pairs)),
-        protocol.pixel_um,
-        protocol.pixels,
-        protocol.pixels,
-    )
-    model = ForwardModel(lens, setting, response)
-    x = parameter_vector(
-        {known.name: known.value for known in protocol.known if known.name in PLACE}
-    )
-    x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
+    pairs = [(depth, angle, 1.0) for angle in protocol.angles_deg for depth in depths]
+    frames = np.array(pairs)
+    model, x = _bench_model(lens, protocol, response, frames)
     images, slopes = model.images(x, names)
     if slopes is None:
         raise FitError("the model gave no derivatives")
@@ -419,21 +330,19 @@ def candidate_information(
         information.append(
             np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True)
         )
-        rows.append(np.column_stack([pairs, np.full(len(pairs), exposure)]))
+        rows.append(frames * [1, 1, exposure])
     return np.concatenate(rows), np.concatenate(information)
 
 
 def choose_frames(
     information: Array,
     prior: Array,
-    count: int,
-    *,
-    criterion: str,
+    place: Array,
+    protocol: BenchProtocol,
     names: tuple[str, ...],
-    place: Array | None = None,
 ) -> list[int]:
-    """Indices of ``count`` candidates by greedy choice, then exchanges until none
-    helps; a candidate may be chosen again.
+    """Indices of the candidates to take, by greedy choice, then exchanges until none
+    helps (Fedorov); a candidate may be chosen again.
 
     An optimum has hardly more places than its model has parameters, and none to test
     the model with. So the first choices go to new places until there are
@@ -442,41 +351,25 @@ def choose_frames(
     Args:
         information: (candidates, p, p) of each frame.
         prior: (p, p) information known beforehand.
-        count: frames to choose.
-        criterion: D or A, as :func:`design_criterion`.
+        place: (candidates,) number of the depth and angle.
+        protocol: number of frames and criterion.
         names: (p,) names of the fitted parameters.
-        place: (candidates,) number of the depth and angle; None without that rule.
     """
+    least = min(_LEAST_PLACES, protocol.frames, len(set(place.tolist())))
     chosen: list[int] = []
-    total = prior.copy()
-    places = np.arange(len(information)) if place is None else place
-    least = 0 if place is None else min(_LEAST_PLACES, count, len(set(places.tolist())))
-
-    def best_candidate(base: Array, other_frames: list[int]) -> int:
-        used = np.unique(places[other_frames])
-        allowed = (
-            ~np.isin(places, used) if len(used) < least else np.ones(len(places), bool)
-        )
-        return int(
-            np.argmax(
-                [
-                    design_criterion(base + candidate, criterion, names)
-                    if is_allowed
-                    else -np.inf
-                    for candidate, is_allowed in zip(information, allowed, strict=True)
-                ]
-            )
-        )
-
-    for _ in range(count):
-        chosen.append(best_candidate(total, chosen))
-        total = total + information[chosen[-1]]
-    for _ in range(10):
+    for _ in range(11):
         before = list(chosen)
-        for i, previous in enumerate(before):
-            base = total - information[previous]
-            chosen[i] = best_candidate(base, chosen[:i] + chosen[i + 1 :])
-            total = base + information[chosen[i]]
+        for position in range(protocol.frames):
+            others = chosen[:position] + chosen[position + 1 :]
+            base = prior + information[others].sum(0)
+            used = np.unique(place[others])
+            merits = [
+                design_criterion(base + one, protocol.criterion, names)
+                if len(used) >= least or here not in used
+                else -np.inf
+                for one, here in zip(information, place, strict=True)
+            ]
+            chosen[position : position + 1] = [int(np.argmax(merits))]
         if chosen == before:
             break
     return chosen

@@ -8,7 +8,6 @@ import numpy as np
 
 from characterize.bench import (
     BenchProtocol,
-    CapturePlan,
     HiddenLens,
     SimulatedFrames,
     bench,
@@ -25,47 +24,53 @@ _STATED = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
 
 
 def run(options: Options) -> int:
-    """Shoot and write, or plan; exit 0.
+    """Simulate captures and write them, or plan them; exit 0.
 
     Args:
         options: options of the command.
     """
-    if (options.truth is None) == (options.protocol is None):
+    if options.truth is not None and options.protocol is None:
+        return _simulate(options, options.truth)
+    if options.protocol is None or options.truth is not None:
         raise ConfigError(
-            "give either --truth truth.toml (a virtual bench) or --protocol protocol.toml (a plan)"
+            "give either --truth truth.toml (a virtual bench) or --protocol "
+            "protocol.toml (a plan)"
         )
-    if options.protocol is not None:
-        return _plan(options, options.protocol)
-    return _shoot(options, options.truth or Path())
-
-
-def _plan(options: Options, path: Path) -> int:
-    """Plan the captures of a protocol, write them as a stage table, print; exit 0."""
     if options.workers is not None:
         raise ConfigError(
             "--workers shares out the frames of --truth; a plan takes none"
         )
-    target = options.output
+    return _plan(options, options.protocol)
+
+
+def _plan(options: Options, path: Path) -> int:
+    """Plan the captures of a protocol, write them as a stage table, print; exit 0."""
     bench_protocol = config.load(path, BenchProtocol)
     design = lenses.load(options.lens)
-    with options.claim(target) as draft:
+    table = ["file,depth_um,angle_deg,relative_exposure"]
+    with options.claim(options.output) as draft:
         plan = protocol.plan_captures(
             design, bench_protocol, log_response_slopes(design)
         )
-        store.write_text(draft.path, _stage_csv(plan))
-    rows = _rows(plan)
+        frames = np.column_stack([plan.depth_um, plan.angle_deg, plan.exposure])
+        table += [
+            f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}"
+            for i, (z, angle, time) in enumerate(frames)
+        ]
+        store.write_text(draft.path, "\n".join(table) + "\n")
     values = {
-        "file": str(target),
-        "frames": rows,
+        "file": str(options.output),
+        "frames": frames.tolist(),
         "sigma": dict(zip(plan.names, plan.sigma.tolist(), strict=True)),
         "unstated_sigma": dict(
             zip(plan.names, plan.unstated_sigma.tolist(), strict=True)
         ),
         "warnings": list(plan.warnings),
     }
-    lines = [
+    lines = [f"{options.output}: {len(frames)} frames, the most telling first"]
+    lines += [
         f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
-        for z, angle, time in rows
+        for z, angle, time in frames
     ]
     lines.append("  half of a 95 % interval, with what nobody states; within the model")
     for name, sigma, unstated in zip(
@@ -74,59 +79,25 @@ def _plan(options: Options, path: Path) -> int:
         total = protocol.REACH * np.hypot(sigma, unstated)
         lines.append(f"  {name:<24} +- {total:<8.2g} {protocol.REACH * sigma:.2g}")
     lines += [f"  note: {words}" for words in plan.warnings]
-    options.console.result(
-        values,
-        "\n".join([f"{target}: {len(rows)} frames, the most telling first", *lines]),
-    )
+    options.console.result(values, "\n".join(lines))
     return 0
 
 
-def _rows(plan: CapturePlan) -> list[tuple[float, float, float]]:
-    """Depth, angle and exposure of the frames to take."""
-    return list(
-        zip(
-            plan.depth_um.tolist(),
-            plan.angle_deg.tolist(),
-            plan.exposure.tolist(),
-            strict=True,
-        )
-    )
-
-
-def _stage_csv(plan: CapturePlan) -> str:
-    """CSV text of a stage table of the planned frames: file, depth, angle, relative
-    exposure.
-    """
-    lines = ["file,depth_um,angle_deg,relative_exposure"]
-    lines += [
-        f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}"
-        for i, (z, angle, time) in enumerate(_rows(plan))
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _shoot(options: Options, path: Path) -> int:
+def _simulate(options: Options, path: Path) -> int:
     """Simulate the captures of a hidden lens, write the capture folder, print; exit 0."""
     target = options.output
     truth = config.load(path, HiddenLens)
     design = lenses.load(options.lens)
+    names = [k.name for k in truth.parameter if k.value]
     with options.claim_folder(target) as draft, options.shared():
         simulated = bench.simulate_frames(
-            design,
-            truth,
-            log_response_slopes(
-                design, names=[k.name for k in truth.parameter if k.value]
-            ),
+            design, truth, log_response_slopes(design, names=names)
         )
         write_captures(draft.path, simulated, truth, design)
-    values = {
-        "folder": str(target),
-        "frames": len(simulated.frames),
-        "peak_e": float(simulated.electrons.max()),
-    }
+    count, peak_e = len(simulated.frames), float(simulated.electrons.max())
     options.console.result(
-        values,
-        f"{target}: {len(simulated.frames)} frames, peak {simulated.electrons.max():.0f} electrons",
+        {"folder": str(target), "frames": count, "peak_e": peak_e},
+        f"{target}: {count} frames, peak {peak_e:.0f} electrons",
     )
     return 0
 

@@ -29,8 +29,8 @@ _CAPTIONS = {
     "that nobody stated were absent; grey: what was known beforehand.",
     "posterior": "What the frames and prior knowledge leave open about each parameter "
     "if all causes that nobody stated were absent. Shaded: its 95 % interval, and the "
-    "wider one with those causes. Grey bars: draws, where the posterior is bent or "
-    "double. Grey line: the design.",
+    "wider one with those causes. Grey bars: draws, with those causes too. Grey line: "
+    "the design.",
 }
 
 

@@ -125,10 +125,7 @@ def pupil_panels(path: Path) -> list[Panel]:
     """
     stored = store.load(path, "pupil")
     arrays, attributes = stored.arrays, stored.attributes
-    names = [
-        name.decode() if isinstance(name, bytes) else str(name)
-        for name in arrays["names"].tolist()
-    ]
+    names = [name.decode() for name in arrays["names"].tolist()]
     rows = list(
         zip(names, arrays["value"].tolist(), arrays["sigma"].tolist(), strict=True)
     )
