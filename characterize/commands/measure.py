@@ -141,7 +141,7 @@ def _edge(options: Options, folder: Path) -> Outcome:
     """Measure the MTF across an edge and write edge.csv, measure.json and measure.html
     into the folder.
     """
-    image = _cropped(picture.read_picture(options.source), options.crop)
+    image = picture.crop_picture(picture.read_picture(options.source), options.crop)
     pixel = float(options.edge_um or 0)
     mtf = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([mtf.frequency_per_um, mtf.modulation], 1).round(6)
@@ -163,7 +163,9 @@ def _micrograph(options: Options, folder: Path) -> Outcome:
     whole = picture.read_picture(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = (
-        _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
+        picture.crop_picture(whole, options.crop)
+        if options.crop
+        else picture.without_strip(whole)
     )
     pillars = sem.measure_diameters(
         image, sem.SemMicrograph(pixel, options.pitch_nm, options.edge_bias_nm)
@@ -246,20 +248,6 @@ def _micrograph(options: Options, folder: Path) -> Outcome:
     elif not np.isfinite(pillars.diameter_nm).any():
         failures.append("no pillar could be measured")
     return values, [*lines, *(f"  {note}" for note in notes)], failures
-
-
-def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
-    """The picture cut to (top, bottom, left, right) pixels; whole without ``crop``."""
-    if crop is None:
-        return image
-    top, bottom, left, right = crop
-    part = image[top:bottom, left:right]
-    if min(part.shape) < 20:
-        raise ConfigError(
-            f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 "
-            "pixels or more"
-        )
-    return part
 
 
 def _pillars(

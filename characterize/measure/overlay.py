@@ -65,7 +65,7 @@ def overlay_design(measured: MeasuredDiameters, design: DiameterMap) -> MaskOver
         raise CaptureError(
             f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design"
         )
-    on_mask = measured.site @ _steps(measured.lattice, design)
+    on_mask = measured.site @ site_steps(measured.lattice, design)
     first = on_mask.min(0)
     site = on_mask - first
     patch = np.zeros(site.max(0) + 1)
@@ -107,10 +107,17 @@ def overlay_design(measured: MeasuredDiameters, design: DiameterMap) -> MaskOver
     )
 
 
-def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
+def site_steps(lattice: ImageLattice, design: DiameterMap) -> Array:
     """(2, 2) steps in rows and columns of the mask: of lattice index j, then of i.
 
     The picture's vectors are scaled to the mask's cell area and rounded to whole sites.
+
+    Args:
+        lattice: of the picture.
+        design: what was drawn.
+
+    Raises:
+        CaptureError: another kind of lattice, or rows that lie across the mask's.
     """
     kind = design.lattice.kind
     if lattice.kind != kind:

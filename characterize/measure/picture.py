@@ -60,3 +60,25 @@ def without_strip(image: Array) -> Array:
     pictured = np.flatnonzero(share < _FLAT)
     last = int(pictured[-1]) + 1 if len(pictured) else len(image)
     return image[:last] if np.median(share[:last]) <= _NOISY else image
+
+
+def crop_picture(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
+    """The picture cut to a rectangle; whole without one.
+
+    Args:
+        image: (y, x) picture.
+        crop: (top, bottom, left, right) pixels, or None.
+
+    Raises:
+        CaptureError: fewer than 20 pixels along a side are left.
+    """
+    if crop is None:
+        return image
+    top, bottom, left, right = crop
+    part = image[top:bottom, left:right]
+    if min(part.shape) < 20:
+        raise CaptureError(
+            f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 "
+            "pixels or more"
+        )
+    return part
