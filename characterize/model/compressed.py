@@ -373,8 +373,7 @@ class CompressedLens:
             series: (b, r) complex.
         """
         amount = np.tensordot(series.T, weight, 1)
-        light = np.einsum("rqp,rqp->qp", amount, self.gathered)
-        return np.asarray(light.astype(np.complex64))
+        return np.asarray(np.einsum("rqp,rqp->qp", amount, self.gathered))
 
     @property
     def center_um(self) -> tuple[float, float]:

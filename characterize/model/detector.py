@@ -13,8 +13,6 @@ from metalens.core.arrays import Array
 from metalens.lens import Lens
 
 _ROOM_UM = 20.0  # for decentre
-# pixels: least disc of derivatives, as a point has no slope by its size
-_LEAST_DISC = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +44,25 @@ class DetectorGrid:
         """Width of a pixel."""
         return self.fill * self.pixel_um
 
+    @property
+    def fine_shape(self) -> tuple[int, int]:
+        """(rows, columns) of the fine samples."""
+        rows, columns = (
+            (pixels + 2 * self.margin) * self.oversample
+            for pixels in (self.rows, self.columns)
+        )
+        return rows, columns
+
     def axes_um(self) -> tuple[Array, Array]:
         """(y, x) of the fine samples from the chief ray, um.
 
         ``middle_um`` is at pixel ((rows - 1) / 2, (columns - 1) / 2).
         """
         x, y = self.middle_um
-        return self._axis(self.rows) + y, self._axis(self.columns) + x
+        rows, columns = (
+            (np.arange(n) - (n - 1) / 2) * self.fine_um for n in self.fine_shape
+        )
+        return rows + y, columns + x
 
     def across_um(self, near_um: float) -> float:
         """Side of a square about the chief ray that contains the window, um.
@@ -63,18 +73,11 @@ class DetectorGrid:
         side = (max(self.rows, self.columns) + self.margin) * self.pixel_um
         return side + _ROOM_UM + 2 * off
 
-    def _axis(self, pixels: int) -> Array:
-        fine = np.arange((pixels + 2 * self.margin) * self.oversample)
-        first = 0.5 - (pixels / 2 + self.margin) * self.oversample
-        return (fine + first) * self.fine_um
-
     def frequencies(self) -> tuple[Array, Array]:
         """Cycles/um of the fine grid: (y, 1) and (1, x / 2 + 1), as
         :func:`scipy.fft.rfft2` orders them.
         """
-        rows, columns = (
-            (p + 2 * self.margin) * self.oversample for p in (self.rows, self.columns)
-        )
+        rows, columns = self.fine_shape
         fy = fft.fftfreq(rows, self.fine_um)
         fx = fft.rfftfreq(columns, self.fine_um)
         return fy[:, None], fx[None]
@@ -95,42 +98,23 @@ class DetectorGrid:
         return np.asarray(blurred[..., y, x])
 
 
-def detector_transfers(
-    grid: DetectorGrid, crosstalk_px: float, sizes_um: Array, shrink: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Transfer functions (frames, fy, fx) of pixel, crosstalk and round source, and
-    their derivatives by name.
-
-    ``pinhole_um``: by the source's diameter. ``growth``: by a relative change of the
-    magnification, over the source's diameter. A point source has the first alone, and
-    one transfer for all frames.
+def detector_transfer(
+    grid: DetectorGrid, crosstalk_px: float, sizes_um: Array
+) -> Array:
+    """(frames, fy, fx) transfer functions of pixel, crosstalk and round source; one for
+    all frames of a point source.
 
     Args:
         grid: fine samples under the pixels.
         crosstalk_px: standard deviation of blur, pixel widths.
-        sizes_um: (frames,) diameter of the source's image.
-        shrink: (frames,) magnification of the source; empty where its size does not
-            matter.
+        sizes_um: (frames,) diameters of the source's images.
     """
-    wide_um = grid.wide_um
     fy, fx = grid.frequencies()
-    smooth, by_sigma = gaussian_transfer(fy, fx, crosstalk_px * wide_um)
-    square = pixel_transfer(fy, fx, wide_um)
-    shared, by_crosstalk = square * smooth, square * by_sigma * wide_um
-    if not len(shrink):
-        return shared, {"crosstalk_px": by_crosstalk}
-    discs = [disc_transfer(fy, fx, size) for size in sizes_um]
-    disc = np.stack([value for value, _ in discs])
-    by_size = np.stack([slope for _, slope in discs])
-    # by the source's diameter: of a disc of least size, so that 0 has a slope too
-    least = np.maximum(sizes_um, _LEAST_DISC * wide_um)
-    by_source = np.stack([disc_transfer(fy, fx, size)[1] for size in least])
-    ratio = shrink[:, None, None]
-    return shared * disc, {
-        "crosstalk_px": by_crosstalk * disc,
-        "pinhole_um": shared * by_source * ratio,
-        "growth": shared * by_size * ratio,
-    }
+    blur = gaussian_transfer(fy, fx, crosstalk_px * grid.wide_um)[0]
+    shared = pixel_transfer(fy, fx, grid.wide_um) * blur
+    if not np.any(sizes_um):
+        return shared[None]
+    return shared * np.stack([disc_transfer(fy, fx, size) for size in sizes_um])
 
 
 @functools.lru_cache(maxsize=4)
@@ -187,9 +171,8 @@ def gaussian_transfer(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Arr
     return value, -q * sigma_um * value
 
 
-def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
-    """Transfer function 2 J1(u) / u, u = pi f D, of a uniform disc, and its derivative
-    by D: -2 J2(u) / D.
+def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:
+    """Transfer function 2 J1(u) / u = J0(u) + J2(u), u = pi f D, of a uniform disc.
 
     Args:
         fy: cycles/um along y.
@@ -197,10 +180,7 @@ def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Arra
         diameter_um: diameter, um.
     """
     u = np.pi * np.hypot(fx, fy) * diameter_um
-    safe = np.maximum(u, 1e-6)
-    slope = -2 * special.jv(2, safe) / max(abs(diameter_um), 1e-12)
-    value = 2 * special.j1(safe) / safe
-    return np.where(u > 1e-6, value, 1.0), np.where(u > 1e-6, slope, 0.0)
+    return np.asarray(special.j0(u) + special.jv(2, u))
 
 
 def ball_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:

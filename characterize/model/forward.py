@@ -5,11 +5,9 @@ parameter, on coarse nodes.
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from characterize.model import detector
 from characterize.model.compressed import (
@@ -19,7 +17,7 @@ from characterize.model.compressed import (
     wrapped_phasors,
 )
 from characterize.model.glass import BenchGeometry, FilmStack, source_paths
-from characterize.model.parameters import PLACE
+from characterize.model.parameters import PARAMETERS, PLACE
 from characterize.model.pillars import (
     PillarResponse,
     incidence_rad,
@@ -33,20 +31,12 @@ from characterize.model.setting import (
     FrameSetting,
     SpectralLine,
     background_planes,
-    brightness_slopes,
     light_maps,
-    pixel_brightness,
     true_depth,
 )
 from metalens.core import threads
 from metalens.core.arrays import Array
-from metalens.fabrication import (
-    CDError,
-    ResponseError,
-    Sensitivity,
-    names_of_kind,
-    of_kind,
-)
+from metalens.fabrication import CDError, ResponseError, Sensitivity, names_of_kind
 from metalens.lens import Lens
 
 GEOMETRY = (
@@ -57,11 +47,19 @@ CD_ERRORS, RESPONSE_ERRORS = (
     {name: n for n, name in enumerate(names_of_kind(kind))}
     for kind in (CDError, ResponseError)
 )
+# parameters that act behind the intensity, by source, sensor and background
+_OF_DETECTION = (
+    "distance_um", "stage_zero_um", "stage_scale", "pinhole_um", "crosstalk_px",
+    "log_gain", "background_e", "background_x_e", "background_y_e",
+)  # fmt: skip
 Light = tuple[Array, dict[str, Array]]  # light, and its derivatives by name
 # relative error of derivatives: it slows the last steps of a fit, not its result
 _SLOPE_TOLERANCE = 8e-3
 _KERNEL_STEP = 1e-3  # relative step of distance and wavelength in the kernel
-_WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02  # of difference quotients: wavelength, bandwidth
+# of difference quotients: typical uncertainties, bandwidth, bias
+_STEP, _WIDER_NM, _BIAS_STEP_UM = 0.02, 0.02, 2e-5
+# pixels: least disc of a derivative, as a point has no slope by its size
+_LEAST_DISC_PX = 0.3
 _PITCH = PLACE["pixel_percent"]
 # offset from the chief ray up to which a window needs no further directions
 _NEAR_UM = 5.0
@@ -222,7 +220,7 @@ class ForwardModel:
     ) -> tuple[Array, Array | None]:
         """Expected frames (n, rows, columns) in electrons, and their derivatives.
 
-        Frame = brightness * |E|² / lens area + background.
+        Frame = intensity |E|² through the response of :meth:`_detection` + background.
 
         Args:
             x: all parameters, in the order of ``PARAMETERS``.
@@ -233,34 +231,71 @@ class ForwardModel:
         """
         if x[_PITCH]:
             return self._off_pitch(x, names)
-        light, slopes = self._light(x, names)
-        s = self.setting
-        films = self.films
-        stage = {"centre_um": self.stage_centre_um}
-        brightness = pixel_brightness(
-            x, s, reference_um=self.reference_um, films=films, **stage
-        )
-        scale = brightness[:, None, None] / self.area_um2
-        sampled = scale * light
+        response, background = self._detection(x, self._source_images(x))
+        light, slopes = self._light(x, names or (), response)
+        frames = self.grid.sample(light, response) + background
         if names is None:
-            return sampled + background_planes(x, s), None
-        out = np.zeros((len(names), *light.shape))
-        # derivatives that need no field
-        direct: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
-        if "pixel_percent" in names:
-            direct["pixel_percent"] = self._pitch_slope(x)
-        direct |= {
-            name: s.glow * edge
-            for name, edge in zip(
-                ("background_y_e", "background_x_e"), s.edges, strict=True
-            )
-        }
-        for j, name in enumerate(names):
-            out[j] = direct[name] if name in direct else scale * slopes[name]
-        for name, rate in brightness_slopes(x, s, films=films, **stage).items():
-            if name in names:
-                out[list(names).index(name)] += rate[:, None, None] * sampled
-        return sampled + background_planes(x, s), out
+            return frames, None
+        for name in names:
+            if name in _OF_DETECTION:
+                slopes[name] = slopes[name] + self._detection_slope(x, name, light)
+            elif name == "pixel_percent":
+                slopes[name] = self._pitch_slope(x)
+        return frames, np.stack([slopes[name] for name in names])
+
+    def _detection(self, x: Array, sizes_um: Array) -> tuple[Array, Array]:
+        """(n, fy, fx) response of the frames to the intensity behind a lens that light
+        of unit density illuminates, and (n, rows, columns) background, electrons.
+
+        Response = gain * exposure * pixel area * (reference depth / depth)² / lens area
+        times the transfer of pixel, crosstalk and source; depths in air.
+
+        Args:
+            sizes_um: (n,) diameters of the source's images.
+        """
+        s = self.setting
+        depth_um = self.films.apparent_um(true_depth(x, s, self.stage_centre_um))
+        # bounded, so that a trial step far off does not overflow
+        gain = np.exp(min(x[PLACE["log_gain"]], 100.0)) / self.area_um2
+        width = s.fill * s.pixel_um * self.films.apparent_um(self.reference_um)
+        brightness = gain * s.exposure * (width / depth_um) ** 2
+        transfer = detector.detector_transfer(
+            self.grid, x[PLACE["crosstalk_px"]], sizes_um
+        )
+        return brightness[:, None, None] * transfer, background_planes(x, s)
+
+    def _detection_slope(self, x: Array, name: str, light: Array) -> Array:
+        """(n, rows, columns) derivative of the frames by a parameter through
+        :meth:`_detection` alone: a central difference.
+
+        By the source's size it is that of a disc of least size, as a point has none.
+
+        Args:
+            light: (n, y, x) intensity on the fine samples.
+        """
+        shift = _step(x, name)
+        ends = []
+        for moved in (x + shift, x - shift):
+            sizes_um = self._source_images(moved)
+            if name == "pinhole_um":
+                least_um = _LEAST_DISC_PX * self.grid.wide_um
+                at_rest = self._source_images(x)
+                sizes_um = sizes_um - at_rest + np.maximum(at_rest, least_um)
+            ends.append(self._detection(moved, sizes_um))
+        response, background = (
+            (up - down) / (2 * shift.sum()) for up, down in zip(*ends, strict=True)
+        )
+        return np.asarray(self.grid.sample(light, response) + background)
+
+    def _source_images(self, x: Array) -> Array:
+        """(n,) diameters of the source's images: paraxial sensor over source distance.
+
+        Paraxial light bends over distances reduced to air as over the actual ones.
+        """
+        depth_um = true_depth(x, self.setting, self.stage_centre_um)
+        distance_um = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
+        image_um = self.films.reduced_um(distance_um) * x[PLACE["pinhole_um"]]
+        return np.asarray(image_um / self.films.apparent_um(depth_um))
 
     def _off_pitch(
         self, x: Array, names: Sequence[str] | None
@@ -289,171 +324,147 @@ class ForwardModel:
         return np.asarray((up - down) / (2 * step_percent))
 
     def _light(
-        self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None
+        self,
+        x: Array,
+        wanted: Sequence[str],
+        response: Array,
+        like_nm: float | None = None,
     ) -> Light:
-        """(n, rows, columns) |E|² over the pixels, and its derivatives by name.
+        """(n, y, x) intensity |E|² on the fine samples, and by name the change of the
+        frames by its derivatives.
 
         Sum over spectral samples and field angles. The derivative by the bandwidth is
         a forward difference.
 
         Args:
             wanted: parameters to differentiate by.
+            response: (n, fy, fx) of the frames to the intensity.
             like_nm: bandwidth whose spectral samples are used; default: that of ``x``.
         """
         s = self.setting
-        wanted = list(wanted or ())
         bandwidth_nm = float(x[PLACE["bandwidth_nm"]])
-        names = list(
+        acting = list(
             dict.fromkeys(
                 "stage_zero_um" if name == "stage_scale" else name for name in wanted
             )
         )
-        light = np.zeros((len(s.depth_um), s.rows, s.columns))
-        slopes = {name: np.zeros_like(light) for name in names}
+        light = np.zeros((len(s.depth_um), *self.grid.fine_shape))
+        slopes = {name: np.zeros((len(light), s.rows, s.columns)) for name in acting}
         for offset_nm, weight in self.spectrum.colours(bandwidth_nm, like_nm):
+            at = x.copy()
+            at[PLACE["wavelength_nm"]] += offset_nm
             for group in (
                 part for whole in self.groups for part in whole.illuminated_parts
             ):
-                intensity, rates = self._group_light(x, group, offset_nm, names)
+                intensity, changes = self._intensity(at, group, acting)
                 light[group.index] += weight * intensity
-                for name in names:
-                    if name in rates:
-                        slopes[name][group.index] += weight * rates[name]
-        if "bandwidth_nm" in names:
+                for name, change in changes:
+                    seen = self.grid.sample(change, response[group.index])
+                    slopes[name][group.index] += weight * seen
+        if "bandwidth_nm" in wanted:
             widened = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
-            wider = self._light(widened, None, bandwidth_nm)[0]
-            slopes["bandwidth_nm"] = (wider - light) / _WIDER_NM
+            wider = self._light(widened, (), response, bandwidth_nm)[0]
+            slopes["bandwidth_nm"] = self.grid.sample(
+                (wider - light) / _WIDER_NM, response
+            )
         if "stage_scale" in wanted:
             # d/d(scale) = (depth - mean depth) d/d(stage zero)
             off_um = s.depth_um - self.stage_centre_um
             slopes["stage_scale"] = slopes["stage_zero_um"] * off_um[:, None, None]
         return light, slopes
 
-    def _group_light(
-        self, x: Array, group: AngleGroup, offset_nm: float, names: list[str]
-    ) -> Light:
-        """Light of one field angle at one wavelength, and its derivatives by ``names``.
+    def _intensity(
+        self, x: Array, group: AngleGroup, names: Sequence[str]
+    ) -> tuple[Array, Iterator[tuple[str, Array]]]:
+        """(frames, y, x) intensity of one field angle at one wavelength, and its
+        derivatives by those of ``names`` that act on the field.
 
         Field E = K P exp(i phi): kernel K of nodes to window, pupil P, phase phi. The
-        pixels see |E|² blurred by the transfer; its derivative is 2 Re(E* dE) blurred.
+        derivative of |E|² is 2 Re(E* dE).
 
         Args:
             x: all parameters.
             group: lens and frames of the field angle.
-            offset_nm: of the wavelength from that in ``x``.
-
-        Returns:
-            (frames, rows, columns) light, and its derivative by each acting parameter.
         """
-        x = x.copy()
-        x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, pupil = threads.run_concurrently(
             lambda: self._operators(x, group),
             lambda: wrapped_phasors(self._phase(x, group)),
-            lambda: self._pupil(x, group, bool(names)),
+            lambda: self._pupil(x, group),
         )
-        lens_field = pupil[0] * phasor
+        lens_field = (pupil * phasor).astype(phasor.dtype)
         field = operators.envelope(operators.coarse(lens_field))
         intensity = field.real**2 + field.imag**2
-        transfer, blurs = self._transfer(x, group, names)
-        light = self.grid.sample(intensity, transfer)
-        conjugate = field.conj()
         power = np.vdot(lens_field, lens_field).real
-        slopes = dict[str, Array]()
-        for name in names:
-            slope = self._lens_rate(x, group, name, pupil, phasor)
-            if slope is None:
-                continue
-            # the part of the derivative along the field itself: exact without a sum
-            along = np.vdot(lens_field, slope) / power
-            slope = slope - along * lens_field
-            in_kernel = name in ("distance_um", "wavelength_nm")
-            # the slope of the kernel nearly cancels that of the lens
-            cut = 0.0 if in_kernel else _SLOPE_TOLERANCE
-            field_slope = operators.coarse(slope, cut)
-            if in_kernel:
-                terms = operators.terms
-                field_slope += self._kernel_slope(x, group, name, lens_field, terms)
-            field_slope = operators.envelope(field_slope)
-            change = 2 * (conjugate * field_slope).real
-            slopes[name] = self.grid.sample(change, transfer) + 2 * along.real * light
-        growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
-        for name in growth.keys() & slopes.keys():  # the source's image grows too
-            widening_um = x[PLACE["pinhole_um"]] * growth[name]
-            disc_slope = np.asarray(blurs["growth"]) * widening_um[:, None, None]
-            slopes[name] = slopes[name] + self.grid.sample(intensity, disc_slope)
-        for name in blurs.keys() & set(names):
-            slopes[name] = self.grid.sample(intensity, blurs[name])
-        return light, slopes
 
-    def _lens_rate(
+        def changes() -> Iterator[tuple[str, Array]]:
+            for name, slope in self._lens_slopes(x, group, names, pupil, phasor):
+                # the part of the derivative along the field itself: exact without a sum
+                along = np.vdot(lens_field, slope) / power
+                slope = slope - along * lens_field
+                in_kernel = name in ("distance_um", "wavelength_nm")
+                # the slope of the kernel nearly cancels that of the lens
+                cut = 0.0 if in_kernel else _SLOPE_TOLERANCE
+                field_slope = operators.coarse(slope, cut)
+                if in_kernel:
+                    terms = operators.terms
+                    field_slope += self._kernel_slope(x, group, name, lens_field, terms)
+                field_slope = operators.envelope(field_slope)
+                change = 2 * (field.conj() * field_slope).real
+                yield name, change + 2 * along.real * intensity
+
+        return intensity, changes()
+
+    def _lens_slopes(
         self,
         x: Array,
         group: AngleGroup,
-        name: str,
-        pupil: tuple[Array, Array, Array, Array],
+        names: Sequence[str],
+        pupil: Array,
         phasor: Array,
-    ) -> Array | None:
-        """(frames, q, p) derivative of the field on the nodes by parameter ``name``.
-
-        The derivative of the kernel is left out. None where the parameter does not act
-        on the lens field.
+    ) -> Iterator[tuple[str, Array]]:
+        """(frames, q, p) derivatives of the field on the nodes by the ``names`` that act
+        on it; the derivative of the kernel is left out.
 
         Args:
-            pupil: the pupil and its derivatives, of :meth:`_pupil`.
+            pupil: (q, p) of :meth:`_pupil`.
             phasor: (frames, q, p) exp(i phase).
         """
-        if name in CD_ERRORS:
-            slope = pupil[1] * group.cd_maps[CD_ERRORS[name]] * phasor
-        elif name in RESPONSE_ERRORS:
-            slope = pupil[2][RESPONSE_ERRORS[name]] * phasor
-        elif (phase_map := group.phase_map(name)) is not None:
-            slope = 1j * phase_map * pupil[0] * phasor
-        elif name in GEOMETRY:
-            slope = self._phase_slope(x, group, name) * (pupil[0] * phasor)
-            if name == "wavelength_nm":
-                slope = slope + pupil[3] * phasor
-        else:
-            return None
-        return np.asarray(slope.astype(phasor.dtype))
+        by_bias = None
+        for name in names:
+            if name in CD_ERRORS:
+                if by_bias is None:
+                    wider, narrower = (
+                        self._pupil(x, group, sign * _BIAS_STEP_UM) for sign in (1, -1)
+                    )
+                    by_bias = (wider - narrower) / (2 * _BIAS_STEP_UM)
+                slope = by_bias * group.cd_maps[CD_ERRORS[name]] * phasor
+            elif (phase_map := group.phase_map(name)) is not None:
+                slope = 1j * phase_map * pupil * phasor
+            elif name in GEOMETRY or name in RESPONSE_ERRORS:
+                shift = _step(x, name)
+                slope = 0.0
+                if name in GEOMETRY:
+                    up, down = (self._phase(at, group) for at in (x + shift, x - shift))
+                    slope = 1j * (up - down) * pupil
+                if name not in GEOMETRY or name == "wavelength_nm":
+                    up, down = (self._pupil(at, group) for at in (x + shift, x - shift))
+                    slope = slope + (up - down)
+                slope = slope * (phasor / (2 * shift.sum()))
+            else:
+                continue
+            yield name, np.asarray(slope.astype(phasor.dtype))
 
-    def _pupil(
-        self, x: Array, group: AngleGroup, slopes: bool
-    ) -> tuple[Array, Array, Array, Array]:
-        """(q, p) complex pupil on the lens nodes, with its derivatives.
+    def _pupil(self, x: Array, group: AngleGroup, more_um: float = 0.0) -> Array:
+        """(q, p) complex transmission of the pillars on the lens nodes.
 
-        In order: the pupil; its derivative by the bias per um; by the pillar-response errors
-        (causes, q, p) per unit of the parameter; by the wavelength per nm. Without
-        ``slopes`` the derivatives are the pupil itself and mean nothing.
+        Args:
+            more_um: added to the bias, which is clipped to the range of the pillars.
         """
         bias = np.tensordot([x[PLACE[name]] for name in CD_ERRORS], group.cd_maps, 1)
         reach = group.pillars.span.bias_um
-        inside = np.abs(bias) < reach
-        bias = np.clip(bias, -reach, reach).astype(np.float32)
-        weight = group.pillars.weights(bias)
+        bias = np.clip(bias + more_um, -reach, reach)
         values = group.pillars.coefficients(pillar_change_of(x), self._lean_um)
-        pupil = group.reduced.combined(weight, values)
-        if not slopes:
-            return pupil, pupil, pupil, pupil
-        rows = (row for _, row in of_kind(ResponseError))
-        rows_of_slopes = zip(
-            group.pillars.slopes(pillar_change_of(x)), rows, strict=True
-        )
-        by_answer = [
-            group.reduced.combined(weight, coefficients * row.unit)
-            for coefficients, row in rows_of_slopes
-        ]
-        longer = x.copy()
-        longer[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
-        shifted = group.pillars.coefficients(pillar_change_of(longer), self._lean_um)
-        by_wave = (shifted - values) / _WAVE_STEP_NM
-        return (
-            pupil,
-            group.reduced.combined(weight[:-1], chebyshev.chebder(values) / reach)
-            * inside,
-            np.stack(by_answer),
-            group.reduced.combined(weight, by_wave),
-        )
+        return group.reduced.combined(group.pillars.weights(bias), values)
 
     def _phase(self, x: Array, group: AngleGroup) -> Array:
         """(frames, q, p) smooth phase on the lens nodes, rad.
@@ -497,19 +508,6 @@ class ForwardModel:
         )
         return phase + light
 
-    def _phase_slope(self, x: Array, group: AngleGroup, name: str) -> Array:
-        """(frames, q, p) derivative of i times :meth:`_phase` by a geometric parameter.
-
-        Central difference i (phi(x + h) - phi(x - h)) / (2 h) of a smooth function.
-        """
-        step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
-        shift = step * (np.arange(len(x)) == PLACE[name])
-        return (
-            0.5j
-            / step
-            * (self._phase(x + shift, group) - self._phase(x - shift, group))
-        )
-
     def _operators(
         self, x: Array, group: AngleGroup, terms: CouplingTerms | None = None
     ) -> WindowOperators:
@@ -547,42 +545,8 @@ class ForwardModel:
         )
         return np.asarray((up - down) * np.float32(0.5 / step))
 
-    def _growth(self, x: Array, group: AngleGroup) -> dict[str, Array]:
-        """(frames,) d ln(magnification) by distance and stage zero, 1/um, by parameter.
 
-        The source's image is as wide as the source times sensor over source distance.
-        """
-        sensor_um, source_um = self._reduced(x, group)
-        return {
-            "distance_um": 1 / (self.films.filling * sensor_um),
-            "stage_zero_um": -1 / source_um,
-        }
-
-    def _reduced(self, x: Array, group: AngleGroup) -> tuple[Array, Array]:
-        """(frames,) distances to sensor and source, um, reduced to air.
-
-        Paraxial light bends over these in air as over the actual ones through films.
-        """
-        depth_um = true_depth(x, self.setting, self.stage_centre_um)[group.index]
-        source_um = self.films.apparent_um(depth_um)
-        distance_um = group.reduced.bench.distance_um + x[PLACE["distance_um"]]
-        return np.full(len(source_um), self.films.reduced_um(distance_um)), source_um
-
-    def _transfer(
-        self, x: Array, group: AngleGroup, names: list[str]
-    ) -> tuple[Array, dict[str, Array]]:
-        """Transfer function of pixel, crosstalk and source disc, and its derivatives.
-
-        See :func:`detector.detector_transfers`. The disc is the source's diameter times
-        the magnification of its frame.
-        """
-        sensor_um, source_um = self._reduced(x, group)
-        magnification = sensor_um / source_um
-        if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
-            magnification = np.empty(0)
-        return detector.detector_transfers(
-            self.grid,
-            x[PLACE["crosstalk_px"]],
-            x[PLACE["pinhole_um"]] * magnification,
-            magnification,
-        )
+def _step(x: Array, name: str) -> Array:
+    """(parameters,) step of a difference quotient by one parameter."""
+    size = _STEP * PARAMETERS[PLACE[name]].scale
+    return np.asarray(size * (np.arange(len(x)) == PLACE[name]))

@@ -189,15 +189,6 @@ class PillarResponse:
             t = t * np.sqrt(low * high / middle**2)
         return np.asarray(self._to_series @ (t @ self.basis.T))
 
-    def slopes(self, change: PillarChange) -> Array:
-        """(pillar-response errors, b, r) derivatives of :meth:`coefficients` by the answering
-        causes, in base units.
-        """
-        rates = self._relative.rates(
-            np.array(change.response_amounts)
-        ) * self._at_nodes(change)
-        return np.asarray(self._to_series @ (rates @ self.basis.T))
-
     def _at_nodes(self, change: PillarChange) -> Array:
         """(b, grid) :meth:`exact` at the bias nodes: t as designed, times the factors of
         the pillar-response errors and of the bias.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.model.compressed import CompressedLens
-from characterize.model.glass import AIR, FilmStack
+from characterize.model.glass import FilmStack
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import PillarResponse
 from metalens.core.arrays import Array
@@ -91,49 +91,6 @@ def true_depth(x: Array, setting: FrameSetting, centre_um: float) -> Array:
         + x[PLACE["stage_scale"]] * (stated - centre_um)
     )
     return np.asarray(np.maximum(depth, 0.2 * stated))
-
-
-def pixel_brightness(
-    x: Array,
-    setting: FrameSetting,
-    *,
-    centre_um: float,
-    reference_um: float,
-    films: FilmStack = AIR,
-) -> Array:
-    """(n,) electrons in a pixel for light of unit density from ``reference_um``.
-
-    gain * exposure * pixel area * (reference depth / depth)², depths in air.
-
-    Args:
-        x: all parameters, in the order of ``PARAMETERS``.
-        setting: depths, angles and window of the frames.
-        centre_um: middle of the stage, um.
-        reference_um: depth of the reference source, um.
-        films: media before and behind the lens.
-    """
-    depth = films.apparent_um(true_depth(x, setting, centre_um))
-    # bounded, so that a trial step far off does not overflow
-    gain = np.exp(min(x[PLACE["log_gain"]], 100.0))
-    width = setting.fill * setting.pixel_um * films.apparent_um(reference_um) / depth
-    return np.asarray(gain * setting.exposure * width**2)
-
-
-def brightness_slopes(
-    x: Array, setting: FrameSetting, centre_um: float, films: FilmStack = AIR
-) -> dict[str, Array]:
-    """(n,) relative changes of :func:`pixel_brightness` by the stage: light falls as
-    the
-    square of the depth.
-
-    Args:
-        x: all parameters, in the order of ``PARAMETERS``.
-        setting: depths, angles and window of the frames.
-        centre_um: middle of the stage, um.
-        films: media before and behind the lens.
-    """
-    rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))
-    return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
 
 
 def background_planes(x: Array, setting: FrameSetting) -> Array:
