@@ -10,7 +10,6 @@ import numpy as np
 from characterize.inference.leastsquares import gaussian_draws
 from characterize.model import (
     PLACE,
-    FrameSetting,
     as_built,
     parameter_vector,
     required_oversampling,
@@ -223,15 +222,8 @@ class AsBuilt:
         Computed anew by each call: seconds for a lens of a millimetre.
         """
         side = max(self.measured.shape[1:])
-        setting = FrameSetting(
-            self.depth_um,
-            self.angle_rad,
-            np.ones(len(self.depth_um)),
-            self.pixel_um,
-            side,
-            side,
-        )
-        depth_um = true_depth(self.parameters(), setting, float(self.depth_um.mean()))
+        centre_um = float(self.depth_um.mean())
+        depth_um = true_depth(self.parameters(), self.depth_um, centre_um)
         depths = np.unique(np.round(depth_um, 3))
         angles = tuple(
             (float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0)

@@ -118,7 +118,6 @@ class GaussianPrior:
 class SolverSettings:
     """When a fit stops, how it treats outliers, and when it renews the Jacobian.
 
-    huber: sigma beyond which a residual counts linearly.
     near: length of steps, sigma, over which an exact Jacobian is trusted: it is updated
     by the images of each step (Broyden 1965), and steps that look final, and those that
     fail, are checked with an exact one beyond.
@@ -127,7 +126,6 @@ class SolverSettings:
 
     iterations: int = 40
     step_tolerance: float = 0.02
-    huber: float = HUBER
     near: float = 0.3
     finish: bool = True
 
@@ -140,8 +138,7 @@ class FitSolution:
     information: (p, p) Fisher information of the data alone.
     image, residual_sigma: (n, y, x) model, and (data - model) / sigma, 0 where masked
     or silent.
-    chi2_per_dof: reduced chi-square of the pixels within ``huber``, over its
-    expectation.
+    chi2_per_dof: reduced chi-square of the pixels within ``HUBER`` sigma.
     merit: -2 ln posterior, but for a constant (:meth:`FitProblem.merit`).
     converged, reason: why it stopped.
     beyond: (p,) sigma from each value to where the parabola has its least: 0 but for
@@ -192,7 +189,7 @@ class FitProblem:
 
     def merit(self, x: Array) -> float:
         """-2 ln posterior at (p,) parameters ``x``, but for a constant."""
-        return self._merit(self.model(x, False)[0], x, HUBER)
+        return self._merit(self.model(x, False)[0], x)
 
     def with_fixed(self, i: int, value: float) -> "FitProblem":
         """The same with parameter number ``i`` fixed at ``value``."""
@@ -223,18 +220,18 @@ class FitProblem:
             FitError: the model is not finite at the start, or no pixel is usable.
         """
         settings = settings or SolverSettings()
-        huber, near = settings.huber, settings.near
+        near = settings.near
         if not self.data.usable.any():
             raise FitError("no usable pixel in the fit window; check masks and crop")
         x = np.clip(np.asarray(start, float), self.prior.low, self.prior.high)
-        state = self._linearise(x, huber, slopes)
+        state = self._linearise(x, slopes)
         damping = 1e-3
         converged = False
         reason = f"stopped after {settings.iterations} iterations"
         iteration = 0
         while iteration < settings.iterations:
             iteration += 1
-            step, image, damping, accepted = self._step(state, damping, huber)
+            step, image, damping, accepted = self._step(state, damping)
             x = state.x + step if accepted else state.x
             moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
             done = not accepted or moved < settings.step_tolerance * (1 + damping)
@@ -242,11 +239,11 @@ class FitProblem:
             fresh = state.travel <= near if accepted else state.travel == 0
             if not fresh and (done or moved < near):
                 # what looks final is checked with an exact Jacobian
-                state = self._linearise(x, huber)
+                state = self._linearise(x)
                 damping = 1e-3
                 continue
             if accepted:
-                state = self._advance(state, step, image, huber, final=done)
+                state = self._advance(state, step, image, final=done)
             if done:
                 converged = moved < 10 * settings.step_tolerance
                 reason = (
@@ -256,10 +253,10 @@ class FitProblem:
                 )
                 break
         if settings.finish and state.travel > near:
-            state = self._linearise(state.x, huber)
-        return self._solution(state, huber, (converged, reason, iteration))
+            state = self._linearise(state.x)
+        return self._solution(state, (converged, reason, iteration))
 
-    def _linearise(self, x: Array, huber: float, slopes: Array | None = None) -> _State:
+    def _linearise(self, x: Array, slopes: Array | None = None) -> _State:
         """The problem at (p,) ``x``, with an exact Jacobian or with ``slopes``.
 
         Raises:
@@ -272,10 +269,10 @@ class FitProblem:
                 "the model is not finite at these parameters; bound them or correct the start"
             )
         travel = 0.0 if slopes is None else math.inf
-        return self._state(x, image, jacobian, huber, travel)
+        return self._state(x, image, jacobian, travel)
 
     def _advance(
-        self, state: _State, step: Array, image: Array, huber: float, *, final: bool
+        self, state: _State, step: Array, image: Array, *, final: bool
     ) -> _State:
         """The problem after a step, with the Jacobian updated by the images (Broyden),
         or computed anew where it missed ``_MISSED`` of their change.
@@ -292,24 +289,22 @@ class FitProblem:
         root = np.sqrt(state.weight) / state.noise
         size = max(float(np.linalg.norm(change * root)), 1e-300)
         if not final and float(np.linalg.norm(missed * root)) > _MISSED * size:
-            return self._linearise(x, huber)
+            return self._linearise(x)
         measure = state.curvature @ step
         square = max(float(step @ measure), 1e-300)
         moved = math.sqrt(square)
         if moved >= _TELLING:
             jacobian = jacobian + np.multiply.outer(measure / square, missed)
-        return self._state(x, image, jacobian, huber, state.travel + moved)
+        return self._state(x, image, jacobian, state.travel + moved)
 
-    def _state(
-        self, x: Array, image: Array, jacobian: Array, huber: float, travel: float
-    ) -> _State:
+    def _state(self, x: Array, image: Array, jacobian: Array, travel: float) -> _State:
         """Gradient, curvature and weights of the problem at a point.
 
         Args:
             travel: sigma from the point where the Jacobian was computed.
         """
         prior = self.prior
-        noise, residual, weight = pixel_weights(self.data, image, huber)
+        noise, residual, weight = pixel_weights(self.data, image)
         root = np.sqrt(weight)
         scaled = jacobian.reshape(len(x), -1) * (root / noise).ravel()
         information = scaled @ scaled.T
@@ -329,16 +324,14 @@ class FitProblem:
             noise,
         )
 
-    def _step(
-        self, state: _State, damping: float, huber: float
-    ) -> tuple[Array, Array, float, bool]:
+    def _step(self, state: _State, damping: float) -> tuple[Array, Array, float, bool]:
         """A step that lowers the misfit: (step, image there, next damping, accepted).
 
         Damping grows by 6 until -2 ln posterior does not rise; parameters blocked by a
         bound stay. Two attempts with an approximate Jacobian, ten with an exact one.
         """
         x, low, high = state.x, self.prior.low, self.prior.high
-        limit = self._merit(state.image, x, huber) * (1 + 1e-12)
+        limit = self._merit(state.image, x) * (1 + 1e-12)
         size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
         scaled = state.curvature / np.outer(size, size)
         # at a bound, with the gradient beyond it
@@ -355,30 +348,28 @@ class FitProblem:
             step = np.clip(x + step, low, high) - x
             image, _ = self.model(x + step, False)
             finite = bool(np.isfinite(image).all())
-            if finite and self._merit(image, x + step, huber) <= limit:
+            if finite and self._merit(image, x + step) <= limit:
                 return step, image, max(damping / 5, 1e-10), True
             damping *= 6
         return step, image, damping, False
 
-    def _merit(self, image: Array, x: Array, huber: float) -> float:
-        """Deviance, linear beyond ``huber`` sigma, and the squared pull of the prior."""
+    def _merit(self, image: Array, x: Array) -> float:
+        """Deviance, linear beyond ``HUBER`` sigma, and the squared pull of the prior."""
         prior = self.prior
         size = np.sqrt(self.data.deviance(image))
-        loss = np.where(size <= huber, size**2, huber * (2 * size - huber))
+        loss = np.where(size <= HUBER, size**2, HUBER * (2 * size - HUBER))
         pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma, 0.0)
         return float(loss.sum() + (pull**2).sum())
 
-    def _solution(
-        self, state: _State, huber: float, ended: tuple[bool, str, int]
-    ) -> FitSolution:
+    def _solution(self, state: _State, ended: tuple[bool, str, int]) -> FitSolution:
         """The solution at the end of a fit: covariance, reduced chi-square.
 
         Args:
             ended: (converged, reason, iterations).
         """
         counted = self.data.usable & ~self.data.saturated
-        inlier = counted & (np.abs(state.residual) <= huber)
-        dof = max(int(inlier.sum()) * _inlier_variance(huber) - len(state.x), 1.0)
+        inlier = counted & (np.abs(state.residual) <= HUBER)
+        dof = max(int(inlier.sum()) - len(state.x), 1)
         covariance = invert_information(state.curvature)
         return FitSolution(
             state.x,
@@ -387,22 +378,19 @@ class FitProblem:
             state.image,
             state.residual * self.data.usable,
             float((state.residual[inlier] ** 2).sum()) / dof,
-            self._merit(state.image, state.x, huber),
+            self._merit(state.image, state.x),
             *ended,
             beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
             slopes=state.jacobian,
         )
 
 
-def pixel_weights(
-    data: FitImages, image: Array, huber: float = HUBER
-) -> tuple[Array, Array, Array]:
+def pixel_weights(data: FitImages, image: Array) -> tuple[Array, Array, Array]:
     """Noise, residual over the noise, and robust weight of every pixel, (n, y, x) each.
 
     Args:
         data: what is fitted.
         image: (n, y, x) model.
-        huber: sigma of an outlier.
 
     Returns:
         (noise in electrons, (data - model) / noise with saturated pixels only as far as
@@ -412,21 +400,9 @@ def pixel_weights(
     residual = (data.electrons - image) / noise
     residual = np.where(data.saturated, np.maximum(residual, 0), residual)
     size = np.sqrt(data.deviance(image))
-    weight = np.minimum(1.0, huber / np.maximum(size, huber))
+    weight = np.minimum(1.0, HUBER / np.maximum(size, HUBER))
     silent = ~data.usable | (data.saturated & (residual == 0))
     return noise, residual, np.where(silent, 0.0, weight)
-
-
-def _inlier_variance(huber: float) -> float:
-    """Variance of a standard normal variable that is known to lie within +-huber.
-
-    1 - 2 h phi(h) / (2 Phi(h) - 1): what a pixel adds to chi-square on average where
-    residuals beyond ``huber`` are left out.
-    """
-    if not math.isfinite(huber):
-        return 1.0
-    density = math.exp(-(huber**2) / 2) / math.sqrt(2 * math.pi)
-    return 1 - 2 * huber * density / math.erf(huber / math.sqrt(2))
 
 
 def invert_information(matrix: Array) -> Array:

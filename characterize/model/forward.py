@@ -254,7 +254,9 @@ class ForwardModel:
             sizes_um: (n,) diameters of the source's images.
         """
         s = self.setting
-        depth_um = self.films.apparent_um(true_depth(x, s, self.stage_centre_um))
+        depth_um = self.films.apparent_um(
+            true_depth(x, s.depth_um, self.stage_centre_um)
+        )
         # bounded, so that a trial step far off does not overflow
         gain = np.exp(min(x[PLACE["log_gain"]], 100.0)) / self.area_um2
         width = s.fill * s.pixel_um * self.films.apparent_um(self.reference_um)
@@ -292,7 +294,7 @@ class ForwardModel:
 
         Paraxial light bends over distances reduced to air as over the actual ones.
         """
-        depth_um = true_depth(x, self.setting, self.stage_centre_um)
+        depth_um = true_depth(x, self.setting.depth_um, self.stage_centre_um)
         distance_um = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
         image_um = self.films.reduced_um(distance_um) * x[PLACE["pinhole_um"]]
         return np.asarray(image_um / self.films.apparent_um(depth_um))
@@ -490,7 +492,7 @@ class ForwardModel:
         )
         films = FilmStack.of(self.lens.layers, wavelength_um)
         exit_path = films.sensor_path(*places, centre, distance_um)
-        depth = true_depth(x, self.setting, self.stage_centre_um)[index]
+        depth = true_depth(x, self.setting.depth_um, self.stage_centre_um)[index]
         phase = source_paths(
             *places, depth_um=depth, tangents=(tx, ty), values=x, films=films
         )

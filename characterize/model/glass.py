@@ -199,13 +199,9 @@ def extra_path(
 ) -> Array:
     """(*shape) path added by the plate of glass for (x, y) on the lens, um.
 
-    Less that added at the lens centre. Along the plate's normal the source lies L
-    away, across it rho. The path is the stationary value over the invariant sine s
-    (Hamilton's characteristic function; Snell's law)
-
-        W = rho s + (L - t) sqrt(1 - s²) + t sqrt(n² - s²)
-
-    and three Newton steps from the straight ray are accurate to 1e-9 um.
+    Less that added at the lens centre. The ray crosses the plate and the air beside it
+    as plane-parallel media along the plate's normal, along which the source lies
+    ``along`` away.
 
     Args:
         x_um: places on the lens along x.
@@ -229,15 +225,9 @@ def extra_path(
             raise FitError(
                 f"{t:.4g} um of glass between lens and source, which leave {along.min():.4g} um for it"
             )
-        across = np.sqrt(np.maximum(r2 - along**2, 0.0))
-        s = across / np.sqrt(r2)  # sine of the straight ray
-        for _ in range(3):  # Newton on dW/ds = 0
-            outside = np.sqrt(1 - s * s)
-            inside = np.sqrt(INDEX**2 - s * s)
-            missed = across - (along - t) * s / outside - t * s / inside
-            s = s + missed / ((along - t) / outside**3 + t * INDEX**2 / inside**3)
-        outside, inside = np.sqrt(1 - s * s), np.sqrt(INDEX**2 - s * s)
-        return np.asarray(across * s + (along - t) * outside + t * inside - np.sqrt(r2))
+        pairs = (1.0, along - t), (INDEX, t)
+        w = media.solve_direction_square(pairs, np.maximum(r2 - along**2, 0.0))
+        return np.asarray(media.whole_path(pairs, w) - np.sqrt(r2))
 
     return np.asarray(
         added_path(np.asarray(x_um), np.asarray(y_um))

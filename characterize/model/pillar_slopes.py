@@ -3,10 +3,8 @@ they are quick, else slopes.
 """
 
 import functools
-import hashlib
 import os
-from collections.abc import Callable, Container, Sequence
-from importlib import import_module
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 import joblib
@@ -14,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
 
+import metalens
 from characterize.model import solving
 from metalens.cell import Cell, index
 from metalens.core.arrays import Array
@@ -30,15 +29,6 @@ from metalens.fabrication import (
 from metalens.lens import Lens
 
 _NODES, _MOST, _TOLERANCE = 25, 14, 0.02
-_SOURCES = (
-    "metalens.cell",
-    "metalens.modal",
-    "metalens.rcwa",
-    "metalens.fabrication",
-    "metalens.library",
-    "characterize.model.solving",
-    "characterize.model.pillar_slopes",
-)
 _KEPT = 64  # lenses whose slopes are kept on disk
 
 
@@ -74,84 +64,68 @@ def log_response_slopes(lens: Lens, *, names: Container[str] = ()) -> Sensitivit
     for name in inapplicable_names(lens.cell):
         if name in names:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
-    if lens.pairs is not None:
-        return _of_pairs(lens)
-    extra = [
+    extra = tuple(
         row.name
         for row, acts in response_errors()
-        if row.name in names and not acts.exact
-    ]
-    description = _about(lens, extra)
-    try:
-        return _cached(description, lambda: _solve(lens, extra))
-    except (CellError, MaterialError):
-        if not lens.cell.round:
-            raise
-        return proxy_sensitivity(lens)
-
-
-def _of_pairs(lens: Lens) -> Sensitivity:
-    """Of pillars of two sizes, for the light of the lens."""
-    kinds = PillarKinds.of(lens.diameters)
-    sizes = repr(kinds.width_um.tolist()), repr(kinds.length_um.tolist())
-    description = _about(lens, ["two sizes", lens.light, *sizes])
-    return _cached(
-        description, lambda: Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
+        if row.name in names and not acts.exact and lens.pairs is None
     )
-
-
-def _cached(description: str, make: Callable[[], Sensitivity]) -> Sensitivity:
-    """Result of ``make``, cached on disk by ``description``, sources and libraries.
-
-    Where the folder cannot be written nothing is cached.
-    """
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     try:
         memory = joblib.Memory(Path(base) / "metalens", verbose=0)
-    except OSError:
-        return make()
-    call = memory.cache(_call, ignore=["make"])
-    key = f"{description} {_source_digest()} {np.__version__} {scipy.__version__}"
-    stored = call.check_call_in_cache(key, make)
-    slopes: Sensitivity = call(key, make)
+    except OSError:  # a folder that cannot be written
+        return _solve(lens, extra, "")
+    kept = memory.cache(_solve, ignore=["lens", "extra"])
+    key = _key(lens, extra)
+    stored = kept.check_call_in_cache(lens, extra, key)
+    slopes: Sensitivity = kept(lens, extra, key)
     if not stored:
         memory.reduce_size(items_limit=_KEPT)
     return slopes
 
 
-def _call(key: str, make: Callable[[], Sensitivity]) -> Sensitivity:
-    return make()
+def _key(lens: Lens, extra: Sequence[str]) -> str:
+    """Hash of everything that the slopes of a lens depend on, sources and libraries
+    included.
+    """
+    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    about: list[object] = [lens.cell, lens.wavelength_um, lens.proxy, extra]
+    about += [index(medium, lens.wavelength_um) for medium in lens.cell.materials]
+    about += [float(d.min()), float(d.max()), np.__version__, scipy.__version__]
+    if lens.pairs is not None:
+        kinds = PillarKinds.of(lens.diameters)
+        about += [lens.light, kinds.width_um, kinds.length_um]
+    return str(joblib.hash([_source_digest(), *about]))
 
 
 @functools.cache
 def _source_digest() -> str:
-    """SHA-256 of every source file that the slopes come from."""
-    digest = hashlib.sha256()
-    for name in _SOURCES:
-        home = Path(str(import_module(name).__file__))
-        package = home.name == "__init__.py"
-        for file in sorted(home.parent.rglob("*.py")) if package else [home]:
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
+    """Hash of the sources that the slopes come from: solvers, and this folder."""
+    folders = Path(str(metalens.__file__)).parent, Path(__file__).parent
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    return str(joblib.hash([file.read_bytes() for file in files]))
 
 
-def _about(lens: Lens, extra: Sequence[str]) -> str:
-    """Hash of everything that the slopes of a lens depend on: the key of the cache."""
-    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-    cell = lens.cell
-    indices = [index(medium, lens.wavelength_um) for medium in cell.materials]
-    ends = float(d.min()), float(d.max())
-    key = cell, indices, lens.wavelength_um, ends, lens.proxy, tuple(extra)
-    return str(joblib.hash(key))
-
-
-def _solve(lens: Lens, extra: Sequence[str]) -> Sensitivity:
-    """:func:`log_response_slopes` by the solvers, without the cache.
+def _solve(lens: Lens, extra: tuple[str, ...], key: str) -> Sensitivity:
+    """:func:`log_response_slopes` by the solvers, kept on disk by ``key``.
 
     Slopes are sampled at Chebyshev nodes of the diameters and fitted by polynomials.
     """
+    if lens.pairs is not None:
+        return Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
     if not lens.cell.round:
         return proxy_sensitivity(lens)
+    try:
+        return _solve_round(lens, extra)
+    except (CellError, MaterialError):
+        return proxy_sensitivity(lens)
+
+
+def _solve_round(lens: Lens, extra: tuple[str, ...]) -> Sensitivity:
+    """Slopes of round pillars of one size.
+
+    Raises:
+        CellError, MaterialError: pillars that no solver takes.
+    """
     table = solving.solved_transmission(lens) if _upright(lens.cell) else None
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())

@@ -74,17 +74,16 @@ class FrameSetting:
         return np.where(self.dark_known, self.exposure, 1.0)[:, None, None]
 
 
-def true_depth(x: Array, setting: FrameSetting, centre_um: float) -> Array:
+def true_depth(x: Array, stated: Array, centre_um: float) -> Array:
     """(n,) source depths after stage zero and scale, um.
 
     stated + zero + scale (stated - centre), at least 0.2 of the stated depth.
 
     Args:
         x: all parameters.
-        setting: depths, angles and window of the frames.
+        stated: (n,) depths, um.
         centre_um: middle of the stage, um.
     """
-    stated = setting.depth_um
     depth = (
         stated
         + x[PLACE["stage_zero_um"]]
