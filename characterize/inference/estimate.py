@@ -188,18 +188,19 @@ def _with_likely_causes(
         if not ends[0].converged:
             break
         falls = _falls(task, ends[0], tests)
-        cause = next((test for _, test in falls if not test.stated), None)
+        cause = next((test for _, test in falls if not test.effect.stated), None)
         if cause is None:
             break
-        extended = dataclasses.replace(task, free=(*task.free, *cause.frees))
+        frees = cause.effect.frees
+        extended = dataclasses.replace(task, free=(*task.free, *frees))
         wider = multistart.widen_search(extended, task.all_of(ends[0].value))
         if not wider or wider[0].merit > ends[0].merit:
             break
-        extended, wider = multistart.widen_priors(extended, wider, cause.frees)
+        extended, wider = multistart.widen_priors(extended, wider, frees)
         fall = ends[0].merit - wider[0].merit
         cautions.append(
-            f"{cause.cause} explains the frames better (chi-square falls by "
-            f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
+            f"{cause.effect.cause} explains the frames better (chi-square falls by "
+            f"{fall:.0f}): {', '.join(frees)} fitted too"
         )
         doubts += _contradicted(cause, falls)
         task, ends = extended, wider
@@ -218,7 +219,7 @@ def _falls(
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
     for cause in unmodelled_effects.to_fit(score_tests, stuck=stuck):
-        fall = best.merit - multistart.merit_with(task, best, cause.frees)
+        fall = best.merit - multistart.merit_with(task, best, cause.effect.frees)
         if fall > (10.0 if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
     return sorted(falls, key=lambda pair: -pair[0])
@@ -235,14 +236,15 @@ def _contradicted(
     largest = next(fall for fall, cause in falls if cause is fitted)
     return [
         ResidualFinding(
-            f"{test.cause} would explain the frames about as well as {fitted.cause} "
+            f"{test.effect.cause} would explain the frames about as well as "
+            f"{fitted.effect.cause} "
             f"({math.sqrt(fall):.1f} sigma: chi-square falls by {fall:.0f}), but "
-            f"{', '.join(test.frees)} is fixed as stated: state it with its error, or "
+            f"{', '.join(test.effect.frees)} is fixed as stated: state it with its error, or "
             "mend the bench",
             math.sqrt(fall),
         )
         for fall, test in falls
-        if test.stated and fall > largest - multistart.MODES_WITHIN
+        if test.effect.stated and fall > largest - multistart.MODES_WITHIN
     ]
 
 
