@@ -114,7 +114,8 @@ def detector_transfer(
     shared = pixel_transfer(fy, fx, grid.wide_um) * blur
     if not np.any(sizes_um):
         return shared[None]
-    return shared * np.stack([disc_transfer(fy, fx, size) for size in sizes_um])
+    discs = np.stack([disc_transfer(fy, fx, size) for size in sizes_um])
+    return np.asarray(shared * discs)
 
 
 @functools.lru_cache(maxsize=4)
