@@ -61,11 +61,11 @@ class SystematicEffect:
     cure: str = "state it, free it, or mend the bench"
 
     @property
-    def assumed(self) -> bool:
+    def has_size(self) -> bool:
         """Whether it is taken to have some size."""
         return bool(np.any(self.sigma))
 
-    def standardized(self, changes: Array) -> Array:
+    def standardize_changes(self, changes: Array) -> Array:
         """(k, pixels) ``changes`` by it, of one standard deviation each."""
         return np.reshape(self.sigma, (-1, 1)) * changes
 
@@ -171,8 +171,8 @@ class FitAtMode:
         scatter = vectors.T @ (unit @ left.T + self.shared_scatter(left)) @ vectors
         chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
         chance = float(stats.chi2.sf(chi2, degrees))
-        likely = effect.assumed and effect.frees and not effect.stated
-        odds = self.odds(effect.standardized(changes)) if likely else 0.0
+        likely = effect.has_size and effect.frees and not effect.stated
+        odds = self.odds(effect.standardize_changes(changes)) if likely else 0.0
         return ScoreTest(effect, chi2, degrees, chance, odds)
 
     def joint_amounts(self, changes: Array) -> tuple[Array, Array, Array]:
@@ -281,9 +281,9 @@ def run_score_tests(
     for effect in systematic_effects(task, x, by_name):
         change = (effect.images * root).reshape(len(effect.images), -1)
         tests.append(fit.score_test(effect, change))
-        if effect.assumed:
+        if effect.has_size:
             assumed.append(effect)
-            changes.append(effect.standardized(change))
+            changes.append(effect.standardize_changes(change))
     tests.append(_ghost(task, x, mode.image, root, fit))
     tests = [test for test in tests if test.degrees]
     tests.sort(key=lambda test: (test.chance, -test.chi2))
