@@ -391,7 +391,7 @@ def systematic_effects(
         yield SystematicEffect(
             "a side wall that leans about half height",
             leaning[None],
-            (_size(task, "sidewall_deg") / _WALL_DEG) ** 2,
+            (assumed_size(task, "sidewall_deg") / _WALL_DEG) ** 2,
             of_mask=True,
             positive=True,
         )
@@ -413,11 +413,11 @@ def systematic_effects(
     yield from _of_stop(task, x, image)
     fixed = tuple(name for name in LIGHT if name not in task.names)
     if fixed:
-        frees = tuple(name for name in fixed if not _exactly(task, name))
+        frees = tuple(name for name in fixed if not is_stated_exactly(task, name))
         yield SystematicEffect(
             "uneven illumination",
             np.asarray(model.images(x, fixed)[1]),
-            np.array([_size(task, name) for name in fixed]),
+            np.array([assumed_size(task, name) for name in fixed]),
             frees or fixed,
             not frees,
         )
@@ -426,7 +426,7 @@ def systematic_effects(
     yield SystematicEffect(
         "write fields out of place, or another smooth phase error",
         np.asarray(model.with_residual(phases).images(x, names)[1]),
-        _size(task, "stitching_nm") * 1e-3,
+        assumed_size(task, "stitching_nm") * 1e-3,
         of_mask=True,
     )
 
@@ -456,9 +456,9 @@ def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[SystematicEf
             yield SystematicEffect(
                 row.effect.format(before[PLACE["glass_um"]]),
                 change[None],
-                (_size(task, name) / amount) ** (2 if name in _SQUARE else 1),
+                (assumed_size(task, name) / amount) ** (2 if name in _SQUARE else 1),
                 ("glass_um", name) if base else (name,),
-                _exactly(task, name),
+                is_stated_exactly(task, name),
                 of_mask=name in _OF_MASK,
                 positive=before[PLACE[name]] <= row.low,
             )
@@ -512,7 +512,7 @@ def _of_pixels(task: SearchTask, across: Array) -> Iterator[SystematicEffect]:
     y, x = (edge * n / 2 for edge, n in zip(setting.edges, by_x.shape[1:], strict=True))
     turned = np.radians(x * by_y - y * by_x)  # by one degree from +x to +y
     if np.abs(turned).max() > _ROUND * np.radians(np.abs(x * by_y)).max():
-        size_deg = _size(task, "camera_turn_deg")
+        size_deg = assumed_size(task, "camera_turn_deg")
         yield SystematicEffect("a camera that is turned", turned[None], size_deg)
     yield SystematicEffect("pixels that are not as high as wide", (y * by_y)[None])
     groups = task.model.groups[1:]
@@ -524,7 +524,7 @@ def _of_pixels(task: SearchTask, across: Array) -> Iterator[SystematicEffect]:
         yield SystematicEffect(
             "a window off the chief ray at a field angle",
             changes,
-            _size(task, "window_px"),
+            assumed_size(task, "window_px"),
             cure="cut the frames of every angle about its chief ray, distance times "
             "tan(angle) off that on the axis",
         )
@@ -551,21 +551,29 @@ def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[SystematicEff
         yield SystematicEffect(
             f"an aperture stop off along {'xy'[along]}",
             (model.images(x)[0] - image)[None],
-            _size(task, "stop_um") / _STOP_UM,
+            assumed_size(task, "stop_um") / _STOP_UM,
         )
 
 
-def _exactly(task: SearchTask, name: str) -> bool:
+def is_stated_exactly(task: SearchTask, name: str) -> bool:
     """Whether a parameter is stated without an error: it stays as stated, whatever the
     residuals lean to.
+
+    Args:
+        task: with what is known.
+        name: of the parameter.
     """
     return name in task.known and task.known[name].sigma == 0
 
 
-def _size(task: SearchTask, name: str) -> float:
+def assumed_size(task: SearchTask, name: str) -> float:
     """Standard deviation of a cause: as stated, else a Type B estimate.
 
     0 where it is fixed as stated.
+
+    Args:
+        task: with what is known, and the sizes that are stated.
+        name: of a parameter, or of an unfitted effect.
     """
     if name in task.unfitted:
         return task.unfitted[name]

@@ -275,7 +275,7 @@ class ForwardModel:
         Args:
             light: (n, y, x) intensity on the fine samples.
         """
-        shift = _step(x, name)
+        shift = difference_step(x, name)
         ends = []
         for moved in (x + shift, x - shift):
             sizes_um = self._source_images(moved)
@@ -443,7 +443,7 @@ class ForwardModel:
             elif (phase_map := group.phase_map(name)) is not None:
                 slope = 1j * phase_map * pupil * phasor
             elif name in GEOMETRY or name in RESPONSE_ERRORS:
-                shift = _step(x, name)
+                shift = difference_step(x, name)
                 slope = 0.0
                 if name in GEOMETRY:
                     up, down = (self._phase(at, group) for at in (x + shift, x - shift))
@@ -548,7 +548,12 @@ class ForwardModel:
         return np.asarray((up - down) * np.float32(0.5 / step))
 
 
-def _step(x: Array, name: str) -> Array:
-    """(parameters,) step of a difference quotient by one parameter."""
+def difference_step(x: Array, name: str) -> Array:
+    """(parameters,) step of a difference quotient by one parameter.
+
+    Args:
+        x: all parameters.
+        name: of the one that moves.
+    """
     size = _STEP * PARAMETERS[PLACE[name]].scale
     return np.asarray(size * (np.arange(len(x)) == PLACE[name]))
