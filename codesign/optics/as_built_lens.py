@@ -2,9 +2,8 @@
 averaged over cells of the pupil.
 """
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,24 +12,14 @@ from torch import Tensor
 
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, as_built, parameter_vector, process_state_of
-from codesign.optics.stack import OpticsConfig, PixelPsfStack, sampled_light
+from codesign.optics.stack import OpticsConfig, PixelPsfStack, psfs_over_depth
 from metalens.core.arrays import Array
 from metalens.design import Focus, profiles
 from metalens.fabrication import PERTURBATIONS, Sensitivity, State, proxy_sensitivity
-from metalens.image import (
-    Field,
-    Optics,
-    Pupil,
-    SmoothWave,
-    cell_um,
-    interpolate_cells,
-    view_pupil,
-)
+from metalens.image import Optics, SmoothWave, cell_um, interpolate_cells
 from metalens.lens import Lens
-from metalens.optics.paths import sensor_path, source_path
 
 OF_PROCESS = [PLACE[row.name] for row in PERTURBATIONS]
-SPARE = 4  # samples around the window, so that what wraps around does not reach it
 
 
 def at_rest(x: Array) -> Array:
@@ -157,9 +146,6 @@ class MadeLens:
     def stack(self, x: Array | None = None) -> PixelPsfStack:
         """PSFs at the run's field angle of the lens of these parameters.
 
-        The wave on the pupil is t exp(i (focus + wave front + k (sensor path + source
-        path))), one source path a depth.
-
         Args:
             x: all parameters; None for the design. Those of the bench (stage, light,
                 camera) are ignored.
@@ -170,30 +156,12 @@ class MadeLens:
             parameters[PLACE["distance_um"]]
         )
         plane = self.plane(process_state_of(parameters))
-        rough = Pupil(plane.radius_um, distance_um, design.wavelength_um)
-        width_um = (settings.window_samples + SPARE) * settings.sample_um
-        nodes = max(64, math.ceil(width_um * rough.edge / design.wavelength_um) * 2)
-        pupil = Pupil(plane.radius_um, distance_um, design.wavelength_um, nodes)
-        field = Field(math.radians(settings.angle_deg))
-        view = view_pupil(pupil, field, design.source_distance_um)
-        place_um = view.x_um, view.y_um
-        t = plane.factor(*place_um, design.wavelength_um, field.angle_rad) * view.weight
-        x_centre, y_centre = field.tangents
-        centre_um = x_centre * distance_um, y_centre * distance_um
-        k = 2 * math.pi / pupil.wavelength_um
-        lens_phase = plane.carrier_rad(*place_um) + k * sensor_path(
-            *place_um, centre_um, distance_um
+        pupil = replace(
+            settings.pupil, radius_um=plane.radius_um, sensor_distance_um=distance_um
         )
-        light = []
-        for depth_um in settings.depths_um.tolist():
-            source = source_path(*place_um, field.tangents, 1 / depth_um)
-            angle = torch.remainder(lens_phase + k * source, 2 * math.pi)
-            wave = (t * torch.polar(torch.ones_like(angle), angle)).to(torch.complex64)
-            light.append(
-                sampled_light(wave, pupil, settings.sample_um, settings.window_samples)
-            )
+        rows = torch.arange(settings.depth_count)
         return PixelPsfStack(
-            torch.stack(light),
+            psfs_over_depth(settings, plane, pupil, rows),
             settings.depths_um,
             Optics(plane, design.layers, distance_um),
         )

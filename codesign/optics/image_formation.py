@@ -17,8 +17,6 @@ from metalens.core.errors import PropagationError, SceneError, TrainingError
 from metalens.image import (
     Imager,
     Optics,
-    PillarWave,
-    SmoothWave,
     normalise_psfs,
     surrogate_loss,
     textured_frames,
@@ -29,30 +27,6 @@ from metalens.optics import Layers
 
 # samples along a side of the frames, margin included; margin; their device
 FrameGrid = tuple[int, int, torch.device]
-
-
-def lens_wave(
-    settings: OpticsConfig,
-    coefficients_rad: Tensor,
-    error: DrawnLensErrors | None = None,
-) -> SmoothWave | PillarWave:
-    """Lens plane of these coefficients for :func:`metalens.image.imager`.
-
-    Differentiable in the coefficients: a smooth phase, or pillars by their diameters.
-
-    Args:
-        settings: of the lens and its image.
-        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
-        error: assembly and process error of one lens; None for none.
-    """
-    if settings.parameters == "diameters":
-        return lens.pillar_wave(settings, coefficients_rad)
-    added = None
-    if settings.polynomials or settings.zones or error is not None:
-        added = functools.partial(
-            lens.phase_at, settings, coefficients_rad, error=error
-        )
-    return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
 
 
 def make_imager(
@@ -232,7 +206,7 @@ def optics_of(
     """
     plain = replace(settings, polynomials=0, parameters="polynomials")
     moving = settings if coefficients_rad.numel() else plain
-    wave = lens_wave(moving, coefficients_rad, error)
+    wave = lens.lens_wave(moving, coefficients_rad, error)
     return Optics(wave, settings.layers or Layers(), settings.sensor_distance_mm * 1e3)
 
 

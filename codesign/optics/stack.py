@@ -38,6 +38,8 @@ from metalens.image import (
     PillarWave,
     Pupil,
     PupilView,
+    SmoothWave,
+    Wave,
     aperture_light,
     cell_um,
     coordinates,
@@ -48,7 +50,7 @@ from metalens.image import (
 from metalens.lens import DiameterMap, Lens
 from metalens.library import DEFAULT_CELL, Proxy
 from metalens.optics import Layers
-from metalens.optics.paths import source_path
+from metalens.optics.paths import sensor_path, source_path
 from metalens.psf import Source
 
 Family = Literal["free", "radial"]
@@ -263,15 +265,10 @@ def lens_psf_stack(
         raise TrainingError(
             "the optics left the finite numbers: lower the learning rate of the optics"
         )
-    waves = _carriers(settings)
-    count = len(waves)
+    count = settings.depth_count
     rows = parallel.shared_rows(count) if shared else torch.arange(count)
-    if len(rows) < count:
-        waves = waves[rows]
-    pupil_wave = waves * _node_factor(settings, coefficients_rad, error)
-    grid = settings.pupil, settings.sample_um, settings.window_samples
-    # one by one, so that a depth's bits do not depend on who computes the others
-    light = torch.stack([sampled_light(wave, *grid) for wave in pupil_wave])
+    wave = lens_wave(settings, coefficients_rad, error)
+    light = psfs_over_depth(settings, wave, settings.pupil, rows)
     if shared:
         light = parallel.gather_rows(light, rows, count)
     if error is not None:
@@ -280,24 +277,49 @@ def lens_psf_stack(
     return PixelPsfStack(light, settings.depths_um)
 
 
-def _node_factor(
-    settings: OpticsConfig, coefficients_rad: Tensor, error: DrawnLensErrors | None
+def psfs_over_depth(
+    settings: OpticsConfig, wave: Wave, pupil: Pupil, rows: Tensor
 ) -> Tensor:
-    """(nodes, nodes) complex transmission relative to the hyperbolic focus.
+    """(rows, h, w) PSFs of any lens plane with the focus of the settings.
 
-    exp(i phase) of polynomials and error, or the response of the pillars.
+    The wave on the pupil is t exp(i (focus + k (sensor path + source path))).
+
+    Args:
+        settings: of the lens and its image.
+        wave: lens plane, of which the transmission t relative to the focus is taken.
+        pupil: sampled aperture; its sensor distance may differ from the design's.
+        rows: numbers of the depths.
     """
-    view = _pupil_view(settings)
+    view, waves = _carriers(settings, pupil)
+    angle_rad = math.radians(settings.angle_deg)
+    factor = wave.factor(view.x_um, view.y_um, pupil.wavelength_um, angle_rad)
+    if factor is not None:
+        waves = waves * factor.to(waves)
+    grid = pupil, settings.sample_um, settings.window_samples
+    # one by one, so that a depth's bits do not depend on who computes the others
+    return torch.stack([sampled_light(waves[row], *grid) for row in rows])
+
+
+def lens_wave(
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    error: DrawnLensErrors | None = None,
+) -> SmoothWave | PillarWave:
+    """Lens plane of these coefficients for :func:`metalens.image.imager`.
+
+    Differentiable in the coefficients: a smooth phase, or pillars by their diameters.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        error: assembly and process error of one lens; None for none.
+    """
     if settings.parameters == "diameters":
-        wave = pillar_wave(settings, coefficients_rad)
-        angle = math.radians(settings.angle_deg)
-        factor = wave.factor(view.x_um, view.y_um, settings.focus.wavelength_um, angle)
-        return torch.as_tensor(factor)
-    phase = phase_at(settings, coefficients_rad, view.x_um, view.y_um, error=error)
-    return torch.polar(
-        torch.ones_like(phase, dtype=torch.float32),
-        torch.remainder(phase, 2 * math.pi).float(),
-    )
+        return pillar_wave(settings, coefficients_rad)
+    added = None
+    if settings.polynomials or settings.zones or error is not None:
+        added = functools.partial(phase_at, settings, coefficients_rad, error=error)
+    return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
 
 
 def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
@@ -486,44 +508,30 @@ def _orthonormal_mix(pupil: Pupil, count: int, family: Family) -> Tensor:
 
 
 @functools.lru_cache(maxsize=8)
-def _pupil_view(settings: OpticsConfig) -> PupilView:
-    """The pupil as seen from the point where the chief ray meets the sensor.
-
-    Its nodes are those of the lens on axis.
+def _carriers(settings: OpticsConfig, pupil: Pupil) -> tuple[PupilView, Tensor]:
+    """The pupil as seen from where the chief ray meets the sensor, and (depths, nodes,
+    nodes) complex64 wave of every source behind the hyperbolic lens and its stop.
     """
-    return view_pupil(
-        settings.pupil, Field(math.radians(settings.angle_deg)), settings.focus_mm * 1e3
+    field = Field(math.radians(settings.angle_deg))
+    tangents, distance_um = field.tangents, pupil.sensor_distance_um
+    view = view_pupil(pupil, field, settings.focus_mm * 1e3)
+    place_um = view.x_um, view.y_um
+    focus = SmoothWave(replace(settings.focus, layers=Layers()), pupil.radius_um)
+    centre_um = tangents[0] * distance_um, tangents[1] * distance_um
+    path_um = sensor_path(*place_um, centre_um, distance_um)
+    depths_um = settings.depths_um.tolist()
+    paths_um = path_um + torch.stack(
+        [source_path(*place_um, tangents, 1 / z) for z in depths_um]
     )
-
-
-@functools.lru_cache(maxsize=8)
-def _carriers(settings: OpticsConfig) -> Tensor:
-    """(depths, nodes, nodes) wave of every source behind the hyperbolic lens,
-    complex64.
-
-    Phase of lens and path, remainder of a turn; amplitude of the view's weight and the
-    shadow of the aperture stop.
-    """
-    view = _pupil_view(settings)
-    k = 2 * math.pi / settings.pupil.wavelength_um
-    tangents = Field(math.radians(settings.angle_deg)).tangents
-    paths = [
-        source_path(view.x_um, view.y_um, tangents, 1 / float(z))
-        for z in settings.depths_um
-    ]
-    phase = torch.remainder(view.lens_rad + k * torch.stack(paths), 2 * math.pi)
+    k = 2 * math.pi / pupil.wavelength_um
+    phase = torch.remainder(focus.carrier_rad(*place_um) + k * paths_um, 2 * math.pi)
     light = torch.polar(view.weight, phase)
     if settings.layers is not None and settings.layers.stop is not None:
         nodes_um = view.x_um.numpy(), view.y_um.numpy()
-        pupil = settings.pupil
-        shadows = [
-            settings.layers.shadow(
-                tangents, float(z), pupil.wavelength_um, nodes_um, pupil.step_um
-            )
-            for z in settings.depths_um
-        ]
+        grid = pupil.wavelength_um, nodes_um, pupil.step_um
+        shadows = [settings.layers.shadow(tangents, z, *grid) for z in depths_um]
         light = light * torch.from_numpy(np.stack(shadows))
-    return light.to(torch.complex64)
+    return view, light.to(torch.complex64)
 
 
 def sampled_light(wave: Tensor, pupil: Pupil, sample_um: float, samples: int) -> Tensor:
