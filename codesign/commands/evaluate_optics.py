@@ -122,13 +122,11 @@ def _measure(
             "field": field_page.field_values(result),
         }
     if options.reader:
-        judged = judge_lenses(compared, settings.reader)
-        results = dict(console.track(judged, total=len(compared), label="reader"))
-        values["reader"] = {
-            "settings": dataclasses.asdict(settings.reader),
-            "lenses": {name: result.values() for name, result in results.items()},
-        }
-        tables.append(reader.reader_table(results, settings.reader))
+        steps = judge_lenses(compared, settings.reader)
+        judged = dict(console.track(steps, total=len(compared), label="reader"))
+        about = dataclasses.asdict(settings.reader)
+        values["reader"] = {"settings": about, "lenses": judged}
+        tables.append(reader.reader_table(judged, settings.reader))
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")

@@ -16,6 +16,7 @@ from codesign.evaluate import gaze_experiment as experiment
 from codesign.eye import RenderedFrames
 from codesign.gaze import NetworkReadings, PersonCalibrator, angle_deg
 from codesign.optics import MadeLens, OpticsConfig, image_formation
+from codesign.optics.stack import lens_settings
 from codesign.settings import ExperimentConfig
 from metalens.cell import Incidence
 from metalens.core.arrays import Array
@@ -285,7 +286,7 @@ class ErrorBudget:
         self.reading: NetworkReading | None = None
         frame, margin = 80, 8
         if given.run is None:
-            self.settings = settings_of(lens, given.fwhm_nm)
+            self.settings = lens_settings(lens, given.fwhm_nm)
         else:
             trainer = given.run.run.trainer
             scenes = given.run.settings.scenes
@@ -523,29 +524,6 @@ class ErrorBudget:
             value / root for value in (total.phase_rad, total.psf, total.gaze_rad)
         )
         return BudgetEntry(link, phase_rad, psf, gaze_rad, method)
-
-
-def settings_of(lens: Lens, fwhm_nm: float) -> OpticsConfig:
-    """Image settings of a lens file without a run: pixels of 18 um, the lens's own
-    films.
-
-    Args:
-        lens: lens to image through.
-        fwhm_nm: spectral width of the light.
-    """
-    return OpticsConfig(
-        aperture_mm=2e-3 * lens.diameters.radius_um,
-        sensor_distance_mm=1e-3 * lens.sensor_distance_um,
-        wavelength_nm=1e3 * lens.wavelength_um,
-        focus_mm=1e-3 * lens.source_distance_um,
-        polynomials=0,
-        sample_um=18.0,
-        window_samples=17,
-        layers=lens.layers,
-        fwhm_nm=fwhm_nm,
-        image_tolerance=0.03,
-        cell=lens.cell,
-    )
 
 
 def refuse_other_lens(lens: Lens, optics: OpticsConfig) -> None:

@@ -2,38 +2,42 @@
 slippage errors rate the lens.
 """
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
 
 from codesign.batches import (
+    CALIBRATION,
     EXPERIMENT,
     TEST,
-    VALIDATION,
     EyeScenes,
     PoolScenes,
     SceneConfig,
-    SceneSource,
-    depth_um,
     render_pool,
-    sensor_irradiance,
 )
-from codesign.evaluate.scene_image import lens_imager, margin_of
-from codesign.eye import PinholeCamera
-from codesign.network import blur, losses
-from codesign.network.blur import BlurBranch
+from codesign.evaluate.scene_image import margin_of
+from codesign.network import SearchSpace, blur, smallest_architecture
+from codesign.optics import PixelPsfStack, image_formation
+from codesign.optics.stack import lens_settings
 from codesign.settings import LARGEST, LEAST, check_ranges
-from codesign.train import bootstrap_interval, read_out
+from codesign.train import (
+    InnerConfig,
+    Trainer,
+    assess,
+    bootstrap_interval,
+    make_model,
+    results,
+)
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table
-from metalens.image import Imager, Sensor
+from metalens.image import Optics, PillarWave, Sensor, cell_um
 from metalens.lens import Lens
 
-SHARE = 0.9  # coverage of the intervals
+BATCH = 32
+SPACE = SearchSpace(
+    widths=(0.25,), depths=(2,), kernels=(3,), expansions=(3,), resolution=(1.0, 1.0)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +88,11 @@ class ReaderConfig:
         return margin_of(self.pitch_um)
 
     @property
+    def scenes(self) -> SceneConfig:
+        """Frames of this size with their margin."""
+        return SceneConfig(pixels=self.pixels, margin=self.margin)
+
+    @property
     def sensor(self) -> Sensor:
         """Pixels of this pitch: 5 electrons of read noise, full well at twice the white
         object's light, 10 bits.
@@ -93,262 +102,88 @@ class ReaderConfig:
         )
 
 
-BATCH = 32
-SLIP_SCALE_MM = torch.tensor([1.4, 1.2, 2.3])
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ReaderResult:
-    """Absolute errors of the reader on the test frames of one lens.
-
-    axial_mm, lateral_mm: (frames,) error of the slippage.
-    window_mm: (frames,) error of the windows' depths, mean over a frame.
-    guess_mm: mean error of the best constant depth.
-    covered: share of frames within the calibrated 90 % interval of axial slippage.
-    interval_mm: half width of that interval.
-    image_error: relative L2 error of the images.
-    """
-
-    axial_mm: Tensor
-    lateral_mm: Tensor
-    window_mm: Tensor
-    guess_mm: float
-    covered: float
-    interval_mm: float
-    image_error: float
-
-    def values(self) -> dict[str, float]:
-        """Mean errors by name, the axial one with its 95 % bootstrap interval over the
-        frames.
-        """
-        low, high = bootstrap_interval(self.axial_mm.numpy())
-        values = {name: getattr(self, name) for name in ReaderResult.__slots__}
-        means = {name: float(torch.as_tensor(v).mean()) for name, v in values.items()}
-        return means | {"axial_low_mm": low, "axial_high_mm": high}
-
-
-class ReferenceReader(nn.Module):
-    """The blur branch, and a small network from its features to the slippage (x, y, z)
-    in units of ``SLIP_SCALE_MM``.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.branch = BlurBranch(nn.BatchNorm2d(blur.FEATURES))
-        self.slip = nn.Sequential(
-            nn.BatchNorm1d(blur.SLIP_FEATURES),
-            nn.Dropout(0.1),
-            nn.Linear(blur.SLIP_FEATURES, 128),
-            nn.GELU(),
-            nn.Dropout(0.2),
-            nn.Linear(128, 64),
-            nn.GELU(),
-            nn.Linear(64, 3),
-        )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LensFrames:
-    """Sensor frames of one lens with their true values.
-
-    pixels: (n, 1, y, x). vergence: (n, windows, windows). slip_mm: (n, 3).
-    """
-
-    pixels: Tensor
-    vergence: Tensor
-    slip_mm: Tensor
-
-
-def render_scenes(
-    config: ReaderConfig, *, sensor_distance_um: float
-) -> list[SceneSource]:
-    """Render the training, calibration and test scenes for lenses of one sensor
-    distance.
-
-    Frames are drawn at random scales, so that the size of an eye does not give away its
-    depth.
+def train_reader(lens: Lens, config: ReaderConfig) -> dict[str, float]:
+    """Train the smallest network of the supernet on images of a lens and test it.
 
     Args:
+        lens: content of a lens file; it stays as it is.
         config: frames, sensor and light of the reader.
-        sensor_distance_um: distance from lens to sensor.
 
-    Raises:
-        ConfigError: eyes out of the depths of the PSFs.
+    Returns:
+        mean absolute errors of the test frames by name, the axial one with its 95 %
+            bootstrap interval; guess_mm is the error of one depth for all windows.
+            interval_mm is the mean half width of the 90 % intervals, and covered the
+            share of the frames that they hold.
     """
-    scenes = SceneConfig(pixels=config.pixels, margin=config.margin)
-    nearest, farthest = (1e-3 * depth for depth in scenes.pupil_depths_um)
-    if not config.depths_mm[0] <= nearest <= farthest <= config.depths_mm[1]:
-        raise ConfigError(
-            f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
-        )
-    sources: list[SceneSource] = []
-    for stream in (EXPERIMENT, VALIDATION, TEST):
-        eyes = EyeScenes(
-            scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream
-        )
-        count = config.pool if stream == EXPERIMENT else config.test
-        pool = render_pool(eyes, count)
-        sources.append(
-            PoolScenes(pool, config.margin, scenes.scale, config.seed + stream)
-        )
-    return sources
-
-
-def train_reader(
-    optics: Imager, scenes: Sequence[SceneSource], config: ReaderConfig
-) -> ReaderResult:
-    """Train the reference reader on images of a lens and test it.
-
-    The result is reproducible: torch's random state is seeded and restored.
-
-    Args:
-        optics: imager of the lens.
-        scenes: of :func:`render_scenes`, the same for every lens.
-        config: frames, sensor and light of the reader.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        reader = ReferenceReader()
-        training, calibration, test = (
-            lens_frames(optics, source, config, count)
-            for source, count in zip(
-                scenes, (config.frames, config.test, config.test), strict=True
-            )
-        )
-        _train_depth(reader, training)
-        _train_slip(reader, training)
-        reader.eval()
-        return _evaluate(reader, calibration, test, optics.error)
-
-
-@torch.no_grad()
-def lens_frames(
-    optics: Imager, scenes: SceneSource, config: ReaderConfig, count: int
-) -> LensFrames:
-    """Noisy sensor frames of a stream of scenes through a lens.
-
-    Args:
-        optics: imager of the lens.
-        scenes: source of the frames.
-        config: frames, sensor and light of the reader; seed of the noise.
-        count: frames, a multiple of 32.
-    """
-    parts = []
-    pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
-    for number in range(count // BATCH):
-        batch = scenes.batch(number, BATCH)
-        light = sensor_irradiance(batch.frames, optics)
-        noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
-        pixels = read_out(
-            light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False
-        )
-        depths = depth_um(batch.frames, margin=config.margin)
-        parts.append((pixels, blur.window_vergence(depths), batch.slip_mm))
-    return LensFrames(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def _train_depth(
-    reader: ReferenceReader, training: LensFrames, *, passes: int = 4, batch: int = 64
-) -> None:
-    """Train the blur branch on the vergence of the windows."""
-    for rows in _training_batches(
-        reader.branch, len(training.pixels), passes, batch, rate=3e-3, decay=0.01
-    ):
-        predicted, _ = reader.branch(training.pixels[rows])
-        losses.depth_loss(predicted, training.vergence[rows]).backward()  # type: ignore[no-untyped-call]
-
-
-def _train_slip(
-    reader: ReferenceReader, training: LensFrames, *, passes: int = 12, batch: int = 128
-) -> None:
-    """Train the slippage network on the features of the trained blur branch, by the
-    smooth L1 loss.
-    """
-    features = _features(reader, training)
-    truth = training.slip_mm / SLIP_SCALE_MM
-    for rows in _training_batches(
-        reader.slip, len(features), passes, batch, rate=2e-3, decay=0.03
-    ):
-        loss = F.smooth_l1_loss(reader.slip(features[rows]), truth[rows], beta=0.3)
-        loss.backward()  # type: ignore[no-untyped-call]
-
-
-def _training_batches(
-    module: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float
-) -> Iterator[Tensor]:
-    """Row numbers of each training batch; after each, one step of AdamW.
-
-    The caller computes the gradients between two batches. The learning rate follows one
-    cycle (OneCycleLR).
-
-    Args:
-        module: network to train.
-        count: number of training frames.
-        passes: passes over all frames.
-        batch: frames of a batch.
-        rate: highest learning rate.
-        decay: weight decay.
-    """
-    module.train()
-    optimiser = torch.optim.AdamW(module.parameters(), lr=rate, weight_decay=decay)
-    total = passes * max(count // batch, 1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total)
-    for _ in range(passes):
-        order = torch.randperm(count)
-        for step in range(max(count // batch, 1)):
-            optimiser.zero_grad(set_to_none=True)
-            yield order[step * batch : (step + 1) * batch]
-            optimiser.step()
-            schedule.step()
-    module.eval()
-
-
-@torch.no_grad()
-def _features(reader: ReferenceReader, frames: LensFrames) -> Tensor:
-    """(n, features) of the blur branch, 256 frames at a time."""
-    return torch.cat(
-        [reader.branch(part)[1] for part in torch.split(frames.pixels, 256)]
+    optics = replace(
+        lens_settings(lens, config.fwhm_nm),
+        sample_um=config.pitch_um,
+        window_samples=2 * config.margin + 1,
+        depths_mm=config.depths_mm,
+        image_tolerance=config.tolerance,
     )
+    none, window_um = torch.zeros(0), optics.window_samples * optics.sample_um
+    device = lens.wavelength_um, window_um, lens.sensor_distance_um
+    wave = PillarWave(lens, cell_um=cell_um(lens.layers, *device))
+    plane = Optics(wave, lens.layers, lens.sensor_distance_um)
+    stack = PixelPsfStack(none, none, plane)
 
+    def scenes_of(stream: int) -> EyeScenes:
+        seed = config.seed + 101
+        return EyeScenes(config.scenes, config.pitch_um, lens.reduced_um, seed, stream)
 
-@torch.no_grad()
-def _evaluate(
-    reader: ReferenceReader,
-    calibration: LensFrames,
-    test: LensFrames,
-    image_error: float,
-) -> ReaderResult:
-    """Errors on the test frames, with intervals from the calibration frames.
-
-    The half width of the 90 % interval is the split-conformal quantile of the errors of
-    the calibration frames.
-    """
-    held_out, error = (
-        (reader.slip(_features(reader, frames)) * SLIP_SCALE_MM - frames.slip_mm).abs()
+    pool = render_pool(scenes_of(EXPERIMENT), config.pool)
+    learned = PoolScenes(pool, config.margin, config.scenes.scale, config.seed)
+    inner = InnerConfig(steps=config.frames // BATCH, batch=BATCH, seed=config.seed)
+    architecture = smallest_architecture(SPACE)
+    with torch.random.fork_rng(devices=[]):
+        model = make_model(
+            optics, pitch_um=config.pitch_um, seed=config.seed, space=SPACE
+        )
+    trainer = Trainer(
+        inner, optics, config.sensor, learned, model,
+        architecture=architecture, stacks=[stack],
+    )  # fmt: skip
+    for _ in trainer.run():
+        pass
+    assess.recalibrate_network(trainer, architecture)
+    calibration, test = (
+        assess.sensor_frames(
+            trainer, scenes_of(stream), config.test // BATCH, stack=stack
+        )
+        for stream in (CALIBRATION, TEST)
+    )
+    judged, tested = (
+        assess.predict_frames(model.net, architecture, frames, inner)
         for frames in (calibration, test)
     )
-    ordered = held_out[:, 2].sort().values
-    rank = min(math.ceil(SHARE * (len(ordered) + 1)), len(ordered))
-    half_width = ordered[rank - 1]
-    depths = [reader.branch(part)[0] for part in torch.split(test.pixels, 256)]
-    truth = blur.depth_mm(test.vergence)
-    window_error = (blur.depth_mm(torch.cat(depths)[:, 0]) - truth).abs()
-    return ReaderResult(
-        axial_mm=error[:, 2],
-        lateral_mm=error[:, :2].mean(1),
-        window_mm=window_error.mean((1, 2)),
-        guess_mm=float((truth - truth.median()).abs().mean()),
-        covered=float((error[:, 2] <= half_width).float().mean()),
-        interval_mm=float(half_width),
-        image_error=image_error,
+    half_mm = results.conformal_quantiles(judged, calibration) * tested.slip_sd_mm[:, 2]
+    summary = results.uncertainty_summary(tested, test, half_mm)
+    error_mm = (tested.slip_mm - test.slip_mm).abs()
+    low, high = bootstrap_interval(error_mm[:, 2].numpy())
+    depth_mm = blur.depth_mm(test.vergence)
+    frame = config.pixels + 2 * config.margin
+    imager = image_formation.make_imager(
+        optics, none, frame, margin=config.margin, made=stack
     )
+    return {
+        "axial_mm": float(error_mm[:, 2].mean()),
+        "axial_low_mm": low,
+        "axial_high_mm": high,
+        "lateral_mm": float(error_mm[:, :2].mean()),
+        "window_mm": summary["window_depth_mm"],
+        "guess_mm": float((depth_mm - depth_mm.median()).abs().mean()),
+        "covered": summary["axial_coverage_90"],
+        "interval_mm": summary["axial_interval_mm"],
+        "image_error": imager.error,
+    }
 
 
-def reader_table(results: dict[str, ReaderResult], config: ReaderConfig) -> Table:
+def reader_table(judged: dict[str, dict[str, float]], config: ReaderConfig) -> Table:
     """Table with a row of errors for each lens.
 
     Args:
-        results: result by name of the lens.
+        judged: errors by name of the lens.
         config: frames, sensor and light of the reader.
     """
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
@@ -365,16 +200,16 @@ def reader_table(results: dict[str, ReaderResult], config: ReaderConfig) -> Tabl
         "image error": "{image_error:.3f}",
     }
     rows = [
-        (name, *(column.format(**result.values()) for column in columns.values()))
-        for name, result in results.items()
+        (name, *(column.format(**errors) for column in columns.values()))
+        for name, errors in judged.items()
     ]
     return Table(("lens", *columns), rows, caption)
 
 
 def judge_lenses(
     lenses: dict[str, Lens], config: ReaderConfig
-) -> Iterator[tuple[str, ReaderResult]]:
-    """Name and result of every lens, trained and tested on the same scenes.
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Name and errors of every lens, trained and tested on the same scenes.
 
     Args:
         lenses: lenses by name.
@@ -389,14 +224,10 @@ def judge_lenses(
         raise ConfigError(
             f"lenses of different sensor distances {distances} um: compare lenses of one distance"
         )
-    scenes = render_scenes(config, sensor_distance_um=next(iter(distances.values())))
-    nearest, farthest = config.depths_mm
-    for name, lens in lenses.items():
-        optics = lens_imager(
-            lens,
-            PinholeCamera(config.pixels, config.pitch_um),
-            (nearest * 1e3, farthest * 1e3),
-            fwhm_nm=config.fwhm_nm,
-            tolerance=config.tolerance,
+    nearest, farthest = (1e-3 * depth for depth in config.scenes.pupil_depths_um)
+    if not config.depths_mm[0] <= nearest <= farthest <= config.depths_mm[1]:
+        raise ConfigError(
+            f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
         )
-        yield name, train_reader(optics, scenes, config)
+    for name, lens in lenses.items():
+        yield name, train_reader(lens, config)

@@ -462,6 +462,28 @@ def pillar_wave(settings: OpticsConfig, coefficients_rad: Tensor) -> PillarWave:
     return PillarWave(lens, diameter_um=diameter_um, cell_um=spacing_um)
 
 
+def lens_settings(lens: Lens, fwhm_nm: float) -> OpticsConfig:
+    """Image settings of a lens file without a run: pixels of 18 um, an error of 3 %.
+
+    Args:
+        lens: whose cell, films, distances and aperture they are.
+        fwhm_nm: spectral width of the light.
+    """
+    return OpticsConfig(
+        aperture_mm=2e-3 * lens.diameters.radius_um,
+        sensor_distance_mm=1e-3 * lens.sensor_distance_um,
+        wavelength_nm=1e3 * lens.wavelength_um,
+        focus_mm=min(1e-3 * lens.source_distance_um, LARGEST),
+        polynomials=0,
+        sample_um=18.0,
+        window_samples=17,
+        layers=lens.layers,
+        fwhm_nm=fwhm_nm,
+        image_tolerance=0.03,
+        cell=lens.cell,
+    )
+
+
 def stack_imager(
     settings: OpticsConfig, stack: PixelPsfStack, frame: int, *, margin: int
 ) -> Imager:
