@@ -99,7 +99,7 @@ def iris_to_camera(
     """(n, m, 2) tangents of the rays that reach points of the iris plane after
     refraction.
 
-    Damped Newton iteration on :func:`trace_to_iris` with central differences, from the
+    Damped Newton iteration on :func:`trace_to_iris` with forward differences, from the
     straight projection of the entrance pupil.
 
     Args:
@@ -123,31 +123,15 @@ def iris_to_camera(
         + 1.13 * (iris_um[..., :1] * across + iris_um[..., 1:] * below)
     )
     tangents = straight
-    step = 1e-6
-    offsets = step * torch.tensor(
-        [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]],
-        dtype=tangents.dtype,
-    )
+    offsets = 1e-6 * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]).to(tangents)
     for _ in range(steps):
-        here, right, left, down, up = trace_to_iris(
-            p, tangents + offsets[:, None, None]
-        )
+        here, right, down = trace_to_iris(p, tangents + offsets[:, None, None])
         error = here - iris_um
         if not tangents.requires_grad and float(error.abs().max()) < CONVERGED_UM:
             break
-        along_x = (right - left) / (2 * step)
-        along_y = (down - up) / (2 * step)
-        determinant = (
-            along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
-        )
-        determinant = torch.where(determinant.abs() < 1e3, 1e3, determinant)
-        dx = (
-            along_y[..., 1] * error[..., 0] - along_y[..., 0] * error[..., 1]
-        ) / determinant
-        dy = (
-            along_x[..., 0] * error[..., 1] - along_x[..., 1] * error[..., 0]
-        ) / determinant
-        tangents = tangents - torch.stack([dx, dy], -1).clamp(-0.05, 0.05)
+        slope = torch.stack([right - here, down - here], -1) / 1e-6
+        step = torch.linalg.solve_ex(slope, error[..., None])[0][..., 0]
+        tangents = tangents - step.nan_to_num().clamp(-0.05, 0.05)
     converged = (
         (trace_to_iris(p, tangents[None])[0] - iris_um).norm(dim=-1, keepdim=True) < 1.0
     ) & ((tangents - straight).norm(dim=-1, keepdim=True) < 0.3)
