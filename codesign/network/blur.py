@@ -45,8 +45,10 @@ VERGENCE_UNIT_PER_M = 8.0
 def blur_branch_macs(size: int) -> int:
     """Multiply-accumulates of the branch for a square frame: spectra, steps, layers.
 
+    Without those of the content (:func:`content_macs`).
+
     Args:
-        size: side of the frame in pixels.
+        size: pixels along a side of the frame.
     """
     block = HIDDEN[0] * REACH**2 + HIDDEN[0] ** 2
     layers = (
@@ -61,7 +63,7 @@ def blur_branch_macs(size: int) -> int:
 
 
 def content_macs(channels: int) -> int:
-    """Multiply-accumulates that :class:`InformedBranch` adds, for frames of any size.
+    """Multiply-accumulates of the branch for the content, whatever the frame's size.
 
     Args:
         channels: number of channels.
@@ -144,12 +146,19 @@ class GlobalContext(nn.Module):
 
 
 class BlurBranch(nn.Module):
-    """Depth of every window from its blur, with its spread: ``forward(frames) ->
-    (depth, features)``.
+    """Depth of every window from its blur, given the content of the frame:
+    ``forward(frames, content) -> (depth, features, axial)``.
 
+    content: (batch, channels, y, x) of the whole frame, from which the pupil's mask is
+    decoded. A power spectrum is that of texture times blur; content tells a pupil's
+    edge from a lash, so the blur is learned from fewer frames.
     depth: (batch, 2, GRID, GRID) vergence in units of :data:`VERGENCE_UNIT_PER_M` about
-    :data:`VERGENCE_PER_M`, and the logarithm of its standard deviation.
-    features: (batch, SLIP_FEATURES) for the slippage.
+    :data:`VERGENCE_PER_M`, and the logarithm of its standard deviation in [-3, 2].
+    features: (batch, SLIP_FEATURES) for the slippage: depths, means and EXTRA features
+    of every window, the precision-weighted mean vergence and the mean log standard
+    deviation. axial: (batch,) axial slippage, in units of its scale: the mean of every
+    window's estimate, weighted by the softmax of their claims. The calibration head's
+    estimate from the depths is added to it.
 
     PSFs differ between windows of the field, so every window weights the spectra of the
     first layer by gains and offsets of its own. Its depth is then computed with those
@@ -160,8 +169,8 @@ class BlurBranch(nn.Module):
 
     place: Tensor
 
-    def __init__(self, norm: nn.Module) -> None:
-        """``norm``: normalises the FEATURES channels."""
+    def __init__(self, norm: nn.Module, channels: int) -> None:
+        """``norm``: normalises the FEATURES channels. ``channels``: of the content."""
         super().__init__()
         self.norm = norm
         self.first = nn.Conv2d(FEATURES + PLACES, HIDDEN[0], 1)
@@ -175,80 +184,30 @@ class BlurBranch(nn.Module):
         self.depth = nn.Conv2d(HIDDEN[1], 2 + EXTRA, 1)
         line = torch.linspace(-1, 1, GRID)
         x, y = line.expand(GRID, GRID), line[:, None].expand(GRID, GRID)
-        self.register_buffer(
-            "place",
-            torch.stack([x, y, x**2, y**2, x * y])[None].clone(),
-            persistent=False,
-        )
-
-    def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Depth and features of frames (batch, 1, y, x); see the class."""
-        spectra, mean = self._weighted_spectra(frames)
-        return self._read_windows(self.depth(self._read(spectra)), mean)
-
-    def _weighted_spectra(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Spectra after the first layer with each window's gain and offset, and window
-        means.
-
-        (batch, HIDDEN[0], GRID, GRID) and (batch, 1, GRID, GRID).
-        """
-        power, mean = window_spectra(frames)
-        features = self.norm(
-            torch.cat([torch.log(power + FLOOR), mean, gradient_statistics(frames)], 1)
-        )
-        # broadcast over the frames by a sum, which export can trace
-        position = self.place + torch.zeros_like(mean)
-        features = torch.cat([features, position], 1)
-        return self.first(features) * self.gain + self.offset, mean
-
-    def _read(self, spectra: Tensor) -> Tensor:
-        """(batch, HIDDEN[1], GRID, GRID) features of every window mixed with its
-        neighbours.
-        """
-        mixed: Tensor = F.hardswish(self.second(self.together(F.hardswish(spectra))))
-        return mixed
-
-    def _read_windows(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Depth (batch, 2, GRID, GRID) and features (batch, SLIP_FEATURES) from the
-        last layer.
-
-        The log standard deviation is clipped to [-3, 2]. The features are depths, means
-        and EXTRA features of every window, the precision-weighted mean vergence and
-        the mean log standard deviation.
-        """
-        log_sd = out[:, 1].clamp(-3, 2)
-        depth = torch.stack([out[:, 0], log_sd], 1)
-        precision = torch.exp(-2 * log_sd)
-        total = precision.sum((1, 2))
-        vergence = (precision * depth[:, 0]).sum((1, 2)) / total
-        means = torch.stack([vergence, log_sd.mean((1, 2))], 1)
-        return depth, torch.cat(
-            [depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1)], 1
-        )
-
-
-class InformedBranch(BlurBranch):
-    """Blur branch conditioned on content: ``forward(frames, content) -> (depth,
-    features, axial)``.
-
-    content: (batch, channels, y, x) of the whole frame, from which the pupil's mask is
-    decoded. A power spectrum is that of texture times blur; content tells a pupil's
-    edge from a lash, so the blur is learned from fewer frames. axial: (batch,) axial
-    slippage, in units of its scale: the mean of every window's estimate, weighted by
-    the softmax of their claims. The calibration head's estimate from the depths is
-    added to it.
-    """
-
-    def __init__(self, norm: nn.Module, channels: int) -> None:
-        """``norm``: normalises the FEATURES channels. ``channels``: of the content."""
-        super().__init__(norm)
+        place = torch.stack([x, y, x**2, y**2, x * y])[None].clone()
+        self.register_buffer("place", place, persistent=False)
         self.content = nn.Conv2d(channels, HIDDEN[0], 1)
         self.vote = nn.Conv2d(HIDDEN[1], 2, 1)
 
-    def forward(self, frames: Tensor, content: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+    def forward(self, frames: Tensor, content: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depth, features and axial slippage of frames and content; see the class."""
-        spectra, mean = self._weighted_spectra(frames)
-        mixed = self._read(spectra + self.content(window_content(content)))
+        power, mean = window_spectra(frames)
+        waves = torch.cat(
+            [torch.log(power + FLOOR), mean, gradient_statistics(frames)], 1
+        )
+        # broadcast over the frames by a sum, which export can trace
+        position = self.place + torch.zeros_like(mean)
+        features = torch.cat([self.norm(waves), position], 1)
+        spectra = self.first(features) * self.gain + self.offset
+        informed = F.hardswish(spectra + self.content(window_content(content)))
+        mixed = F.hardswish(self.second(self.together(informed)))
         estimate, claim = self.vote(mixed).flatten(2).unbind(1)
-        depth, features = self._read_windows(self.depth(mixed), mean)
-        return depth, features, (torch.softmax(claim, 1) * estimate).sum(1)
+        axial = (torch.softmax(claim, 1) * estimate).sum(1)
+        out = self.depth(mixed)
+        log_sd = out[:, 1].clamp(-3, 2)
+        depth = torch.stack([out[:, 0], log_sd], 1)
+        precision = torch.exp(-2 * log_sd)
+        vergence = (precision * depth[:, 0]).sum((1, 2)) / precision.sum((1, 2))
+        means = torch.stack([vergence, log_sd.mean((1, 2))], 1)
+        windows = (depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1))
+        return depth, torch.cat(windows, 1), axial

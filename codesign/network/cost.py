@@ -4,7 +4,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,8 +99,7 @@ def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomia
     finest = laterals[0][1]
     # depthwise 3x3, then the mask itself and the landmarks
     per_pixel[finest] += MASK_CHANNELS * (9 + 1 + POINTS)
-    deepest = total_stride(space)
-    per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
+    per_pixel[laterals[-1][1]] += rows[-1][-1].outputs * SLIP_CHANNELS
     features = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
     heads = features * SLIP_HIDDEN + SLIP_HIDDEN * ((3 + 2) * SLIP_HIDDEN + 3 * 3)
     heads += blur.content_macs(MASK_CHANNELS)
@@ -120,15 +119,6 @@ def lateral_strides(space: SearchSpace) -> list[tuple[int, int]]:
         stride *= stage.stride
         last[stride] = i
     return [(stage, stride) for stride, stage in last.items()]
-
-
-def total_stride(space: SearchSpace) -> int:
-    """Stride of the last feature map.
-
-    Args:
-        space: architectures to choose from.
-    """
-    return lateral_strides(space)[-1][1]
 
 
 def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
@@ -166,14 +156,21 @@ def coarsest_um(window_um: float, resolution: float) -> float:
 def macs_of_size(
     space: SearchSpace, architecture: Architecture, size: Tensor | float
 ) -> Tensor:
-    """Multiply-accumulates at a continuous input size, differentiable; exact where
-    ``size`` is an integer.
+    """Multiply-accumulates at a continuous input size, differentiable.
+
+    Monotone cubic interpolation of the counts at integers (Fritsch and Carlson 1980)
+    with its derivative: exact at integers, never decreasing, and of zero gradient
+    between equal counts.
 
     Args:
         size: pixels along the edge of the input, 16 or more, scalar.
         space: architectures to choose from. architecture: member of the search space.
     """
-    return interpolate_counts(network_cost(space, architecture).at, size)
+    size = torch.as_tensor(size, dtype=torch.float64)
+    value = float(size.detach())
+    integers = math.floor(value) + np.arange(-1, 3)
+    count = PchipInterpolator(integers, network_cost(space, architecture).at(integers))
+    return float(count(value)) + float(count(value, 1)) * (size - value)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -185,22 +182,6 @@ def count_macs(space: SearchSpace, architecture: Architecture, size: float) -> f
         size: pixels along the edge of the input.
     """
     return float(macs_of_size(space, architecture, size))
-
-
-def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
-    """Monotone cubic interpolation of integer-size counts at a continuous size.
-
-    Fritsch and Carlson 1980, with its derivative: exact at integers, never decreasing,
-    and of zero gradient between equal counts.
-
-    Args:
-        at: exact counts at integer sizes. size: scalar.
-    """
-    size = torch.as_tensor(size, dtype=torch.float64)
-    value = float(size.detach())
-    integers = math.floor(value) + np.arange(-1, 3)
-    count = PchipInterpolator(integers, at(integers))
-    return float(count(value)) + float(count(value, 1)) * (size - value)
 
 
 def macs(

@@ -1,8 +1,7 @@
 """Elastic MobileNetV3 with a branch for blur, and heads for mask, slip and depth."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -360,7 +359,7 @@ class Supernet(nn.Module):
             [rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)]
         )
         self.calibration = CalibrationHead(rows[-1][-1].outputs)
-        self.blur = blur.InformedBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
+        self.blur = blur.BlurBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
         """Predictions of one member for standardised frames.
@@ -368,7 +367,11 @@ class Supernet(nn.Module):
         Args:
             frames: (batch, 1, y, x). architecture: member of the search space.
         """
-        resized = resize_frames(frames, architecture.resolution)
+        height, width = (
+            max(1, round(int(side) * architecture.resolution))
+            for side in frames.shape[-2:]
+        )
+        resized = resample_image(frames, (height, width))
         channels = stem_channels(self.space, architecture)
         x = self.stem(resized, channels, kernel=3, stride=2, act="hardswish")
         lateral_stages = {stage for stage, _ in lateral_strides(self.space)}
@@ -376,7 +379,7 @@ class Supernet(nn.Module):
         for i, (stage, row) in enumerate(
             zip(self.stages, active_blocks(self.space, architecture), strict=True)
         ):
-            for module, block in zip(modules_of(stage), row, strict=False):
+            for module, block in zip(stage.children(), row, strict=False):
                 x = module(x, block)
             if i in lateral_stages:
                 features.append(x)
@@ -392,16 +395,6 @@ class Supernet(nn.Module):
         )
 
 
-def resize_frames(frames: Tensor, resolution: float) -> Tensor:
-    """Frames resized to ``resolution`` of their size (to the nearest pixel).
-
-    Args:
-        frames: (batch, 1, y, x) standardised frames of the sensor.
-    """
-    height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
-    return resample_image(frames, (height, width))
-
-
 def soft_argmax(logits: Tensor) -> Tensor:
     """(batch, 2) centre of mass x, y of the mask probability, fraction of the image.
 
@@ -414,12 +407,17 @@ def soft_argmax(logits: Tensor) -> Tensor:
     probability = torch.sigmoid(logits)
     weight = F.relu(probability - 0.05)
     total = weight.sum((1, 2)) + 1e-6
-    height, width = logits.shape[-2:]
-    x = (torch.arange(width, device=logits.device) + 0.5) / width - 0.5
-    y = (torch.arange(height, device=logits.device) + 0.5) / height - 0.5
-    centre_x = (weight.sum(1) * x).sum(1) / total
-    centre_y = (weight.sum(2) * y).sum(1) / total
-    return torch.stack([centre_x, centre_y], -1)
+    x, y = _pixel_centres(logits)
+    sums = [(weight.sum(1) * x).sum(1), (weight.sum(2) * y).sum(1)]
+    return torch.stack(sums, -1) / total[:, None]
+
+
+def _pixel_centres(maps: Tensor) -> list[Tensor]:
+    """x (columns,) and y (rows,) of the pixels of maps (..., y, x), from the image's
+    centre in fractions of the image.
+    """
+    height, width = maps.shape[-2:]
+    return [(torch.arange(n).to(maps) + 0.5) / n - 0.5 for n in (width, height)]
 
 
 def soft_argmax_maps(maps: Tensor) -> tuple[Tensor, Tensor]:
@@ -431,13 +429,9 @@ def soft_argmax_maps(maps: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         maps: (batch, points, y, x).
     """
-    height, width = maps.shape[-2:]
     share = torch.softmax(maps.flatten(2), 2).view(maps.shape)
     columns, rows = share.sum(2), share.sum(3)
-    x = (torch.arange(width, dtype=maps.dtype, device=maps.device) + 0.5) / width - 0.5
-    y = (
-        torch.arange(height, dtype=maps.dtype, device=maps.device) + 0.5
-    ) / height - 0.5
+    x, y = _pixel_centres(maps)
     centre = torch.stack([columns @ x, rows @ y], -1)
     variance_x = (columns * (x - centre[..., :1]) ** 2).sum(-1)
     variance_y = (rows * (y - centre[..., 1:]) ** 2).sum(-1)
@@ -479,8 +473,3 @@ def recalibrate_batch_norm(
         raise TrainingError(
             "recalibration needs at least one batch of frames, found none"
         )
-
-
-def modules_of(stage: nn.Module) -> Iterator[Any]:
-    """The blocks of a stage, in order."""
-    return iter(stage.children())

@@ -13,7 +13,7 @@ from metalens.core import config
 from metalens.core.errors import TrainingError
 from metalens.core.store import replace_atomically, write_text
 
-VERSION = 11
+VERSION = 12
 ABOUT = "about"
 _TENSOR = "\0tensor"
 

@@ -3,7 +3,6 @@ al. 2019), and Pareto sets.
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -77,14 +76,6 @@ class EvolutionState:
 
     history: tuple[EvaluatedCandidate, ...] = ()
     generator: dict[str, Any] = field(default_factory=dict)
-
-    def alive(self, plan: EvolutionSettings) -> tuple[EvaluatedCandidate, ...]:
-        """The members that may become parents.
-
-        Args:
-            plan: of the search.
-        """
-        return self.history[-plan.population :]
 
 
 Evaluate = Callable[[Architecture], float]
@@ -202,7 +193,7 @@ def _next_candidate(
             lambda: sample_architecture(space, generator), count, budget
         )
         return drawn or smallest_architecture(space)
-    alive = state.alive(plan)
+    alive = state.history[-plan.population :]
     rivals = generator.choice(len(alive), plan.tournament, replace=False)
     parent = best_candidate([alive[i] for i in rivals]).architecture
     child = _draw_within_budget(
@@ -362,14 +353,14 @@ def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
         )
 
 
-def state_to_json(search: EvolutionState) -> str:
-    """The state as JSON text.
+def state_to_json(search: EvolutionState) -> dict[str, Any]:
+    """The state as a table for JSON.
 
     Args:
         search: with its history.
     """
     history = [candidate_to_json(c) for c in search.history]
-    return json.dumps({"history": history, "generator": search.generator})
+    return {"history": history, "generator": search.generator}
 
 
 def candidate_to_json(candidate: EvaluatedCandidate) -> dict[str, Any]:
@@ -378,20 +369,14 @@ def candidate_to_json(candidate: EvaluatedCandidate) -> dict[str, Any]:
     return {**sizes, "error": candidate.error, "macs": candidate.macs}
 
 
-def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
-    """State from JSON text.
+def state_from_json(table: dict[str, Any], space: SearchSpace) -> EvolutionState:
+    """State from its table.
 
-    Raises:
-        TrainingError: not the state of a search, or of another space.
+    Args:
+        table: of :func:`state_to_json`. space: that its architectures belong to.
     """
-    try:
-        raw = json.loads(text)
-        history = tuple(candidate_from_json(entry, space) for entry in raw["history"])
-        return EvolutionState(history, raw["generator"])
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise TrainingError(
-            f"not the state of an architecture search: {error!r}"
-        ) from error
+    history = tuple(candidate_from_json(entry, space) for entry in table["history"])
+    return EvolutionState(history, table["generator"])
 
 
 def candidate_from_json(

@@ -371,7 +371,7 @@ def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
     run = start_run(settings)
     run.trainer.restore(state["trainer"])
     run.searches = [
-        evolution.state_from_json(text, settings.space) for text in state["searches"]
+        evolution.state_from_json(table, settings.space) for table in state["searches"]
     ]
     return run
 

@@ -121,9 +121,7 @@ def finished_run(folder, text=TINY):
     ]
     run.save_run(folder / "checkpoint.safetensors", going)
     row = {"budget_mmacs": 2.0, "mmacs": 1.0}
-    row["architecture"] = json.loads(evolution.state_to_json(going.searches[0]))[
-        "history"
-    ][0]
+    row["architecture"] = evolution.state_to_json(going.searches[0])["history"][0]
     (folder / "result.json").write_text(json.dumps({"rows": [row]}))
     lens.save(folder / "lens.h5", small())
     return settings

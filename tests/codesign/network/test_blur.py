@@ -71,13 +71,14 @@ def test_waves_beyond_nyquist_are_left_out_on_few_pixels():
 
 @pytest.mark.parametrize("size", [16, 63, 100])
 def test_the_count_is_that_of_a_counted_pass(size):
-    branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
+    branch = blur.BlurBranch(SlicedNorm(blur.FEATURES), 24).eval()
+    content = torch.zeros(1, 24, 16, 16)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
-        depth, features = branch(_frames(1, size))
-    assert (
-        counter.get_total_flops() // 2
-        == blur.blur_branch_macs(size) - windows.STEP_MACS
-    )  # sums of slices: it counts them not
+        depth, features, axial = branch(_frames(1, size), content)
+    layers = blur.blur_branch_macs(size) + blur.content_macs(24)
+    # sums of slices: it counts them not
+    assert counter.get_total_flops() // 2 == layers - windows.STEP_MACS
+    assert axial.shape == (1,)
     assert depth.shape == (1, 2, blur.GRID, blur.GRID)
     assert features.shape == (1, blur.SLIP_FEATURES)
 
