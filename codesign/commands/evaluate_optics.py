@@ -28,8 +28,6 @@ from metalens import lens as lenses
 from metalens.core import config, store
 from metalens.core.errors import ConfigError, PropagationError
 from metalens.core.report import Figure, Section, write_report
-from metalens.design import DoubleHelix
-from metalens.design.free_form import FisherSettings, design_pupil, tune_baselines
 from metalens.lens import Lens
 
 SPREAD = "brings no light together in one bright spot of the sensor: its beams are shown by psf --far-field"
@@ -90,8 +88,6 @@ def _measure(
     Writes tables, numbers, pictures and page into the folder.
     """
     console, first = options.console, next(iter(compared.values()))
-    if options.baselines:
-        compared |= tuned_like(first, settings.axial)
     setting = settings.axial.about(first)
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     axial, over_field, remarks = {}, {}, {}
@@ -142,32 +138,3 @@ def _measure(
     sections = [Section("Pictures", items=figures), Section("Tables", items=tables)]
     write_report(folder / "report.html", "Comparison of lenses", sections)
     return values, text
-
-
-def tuned_like(lens: Lens, setting: MeasurementSettings) -> dict[str, Lens]:
-    """{name: lens} of the tuned hyperbolic lens and double helix with the pillars and
-    aperture of a lens.
-
-    Args:
-        lens: whose cell, aperture and focus are used. setting: how lenses are measured.
-    """
-    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
-    measured = setting.about(lens)
-    focus = design.lens_focus(lens)
-    fisher = FisherSettings(
-        depths_mm=measured.depths_mm,
-        pixel_um=measured.pixel_um * min(setting.binnings),
-        radius_um=measured.radius_um,
-        normalisation="sum" if setting.normalisation == "sum" else "l2",
-    ).about(focus, radius)
-    tuned = {}
-    for baseline in tune_baselines(design_pupil(focus, radius, fisher), fisher):
-        refocused = dataclasses.replace(focus, source_distance_um=baseline.focus_um)
-        helix = DoubleHelix(zones=baseline.zones) if baseline.zones else None
-        phase = design.phase_of(helix, refocused, radius_um=radius)
-        made = design.make(
-            phase, refocused, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy,
-            profile="double-helix" if helix else "hyperbolic",
-        )  # fmt: skip
-        tuned[baseline.name] = made[0]
-    return tuned

@@ -23,9 +23,6 @@ class Options(CommonOptions):
         config: OPTICS.toml with the tables [axial], [over_field], [scenes] and
             [reader]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.
-        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones
-            and focus), made of the pillars
-            and at the aperture of the first lens; tuned on axis for the finest binning.
         reader: train the reference reader behind every lens and print what it reads:
             depth of windows, slippage, with
             calibrated intervals; some minutes a lens, the same numbers every time.
@@ -35,5 +32,4 @@ class Options(CommonOptions):
     output: Output = Path("optics")
     config: Path | None = None
     scenes: int | None = None
-    baselines: bool = False
     reader: bool = False

@@ -1,4 +1,3 @@
-from .baselines import tune_baselines as tune_baselines
 from .search import DesignScore as DesignScore
 from .search import design_pupil as design_pupil
 from .search import fisher_profile as fisher_profile
