@@ -84,7 +84,7 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         )
     entry: dict[str, Any] = selected[0].get("architecture") or {}
     try:
-        best = evolution.candidate_from_json(entry, settings.space)
+        best = evolution.candidate_from_json(entry)
     except (KeyError, TypeError) as error:
         raise TrainingError(
             f"{folder}/result.json: its network is of another version ({error})"

@@ -17,7 +17,6 @@ from codesign.batches.surface_frames import (
     flatten_layers,
 )
 from metalens.core.arrays import Array
-from metalens.core.errors import TrainingError
 
 MASK = 64  # pixels along a side of the kept masks, where the frame allows it
 CHUNK = 64  # frames rendered at a time
@@ -114,17 +113,9 @@ class PoolScenes:
         return self.pool if isinstance(self.pool, FramePool) else self.pool()
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """``size`` frames of a step, without repetition within a pass over the pool.
-
-        Raises:
-            TrainingError: the pool is smaller than a batch.
-        """
+        """``size`` frames of a step, without repetition within a pass over the pool."""
         count = len(self.frame_pool)
         batches_per_pass = count // size
-        if batches_per_pass == 0:
-            raise TrainingError(
-                f"a pool of {count} frames is smaller than a batch of {size}: raise the pool"
-            )
         order = np.random.default_rng(
             [self.seed, step // batches_per_pass, 5]
         ).permutation(count)

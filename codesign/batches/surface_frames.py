@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from metalens.core.arrays import Array
-from metalens.core.errors import SceneError
 from metalens.image import Frames, Imager
 
 
@@ -26,17 +25,6 @@ class SingleSurfaceFrames:
     light: Array
     depth_um: Array
     scale: Array
-
-    def __post_init__(self) -> None:
-        if (
-            self.light.shape != self.depth_um.shape
-            or self.light.ndim != 3
-            or len(self.scale) != len(self.light)
-        ):
-            found = self.light.shape, self.depth_um.shape, self.scale.shape
-            raise SceneError(
-                f"light, depth, scale have shapes {found}, need (n, y, x) twice and (n,)"
-            )
 
 
 def flatten_layers(frames: Frames, scale: Tensor) -> SingleSurfaceFrames:

@@ -54,7 +54,7 @@ class ReaderConfig:
     tolerance: of the true image.
     """
 
-    frames: int = 6400
+    frames: int = 12800
     pool: int = 1024
     test: int = 256
     seed: int = 0

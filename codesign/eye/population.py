@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from codesign.eye.textures import KINDS, VARIANTS
-from metalens.core.errors import SceneError
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,18 +65,6 @@ class CameraRig:
     azimuth_rad: float = 0.0
     right_eye: bool = False
 
-    def __post_init__(self) -> None:
-        if not (
-            0 < self.distance_um < math.inf
-            and max(abs(self.elevation_rad), abs(self.azimuth_rad)) < 1.4
-        ):
-            raise SceneError(
-                f"rig at {self.distance_um} um, {self.elevation_rad} rad up, {self.azimuth_rad} rad aside: need a "
-                "distance above 0 and |angle| < 1.4"
-            )
-        if len(self.lamps_um) != 3:
-            raise SceneError(f"{len(self.lamps_um)} lamps, need 3")
-
     @property
     def temple(self) -> float:
         """Direction of the temple along x: 1 for a left eye, -1 for a right eye."""
@@ -124,19 +111,6 @@ class EyeStates:
     mount_rad: Tensor
     aperture: Tensor
     scale: Tensor
-
-    def __post_init__(self) -> None:
-        n = len(self.traits)
-        tails = {"traits": (len(POPULATION),), "textures": (len(TEXTURES),)}
-        tails |= {"gaze_rad": (2,), "slip_um": (3,), "mount_rad": (2,)}
-        for name in self.__slots__:
-            shape = (n, *tails.get(name, ()))
-            value = getattr(self, name)
-            if tuple(value.shape) != shape:
-                raise SceneError(f"{name} has shape {tuple(value.shape)}, need {shape}")
-            bad = torch.nonzero(~torch.isfinite(value))
-            if len(bad):
-                raise SceneError(f"{name} of state {int(bad[0, 0])} is not finite")
 
     def __len__(self) -> int:
         return len(self.traits)

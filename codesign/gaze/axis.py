@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.core.errors import SceneError
-
 
 @dataclass(frozen=True, slots=True)
 class EyeGeometry:
@@ -27,12 +25,6 @@ class EyeGeometry:
     centre_mm: tuple[float, float, float]
     radius_mm: float = 10.05
     sensor_distance_mm: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not (self.radius_mm > 0 and self.sensor_distance_mm > 0):
-            raise SceneError(
-                f"radius_mm = {self.radius_mm}, sensor_distance_mm = {self.sensor_distance_mm}: need both above 0"
-            )
 
 
 def optical_axis(pupil_mm: Any, slip_mm: Any, geometry: EyeGeometry) -> Any:

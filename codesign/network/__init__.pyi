@@ -6,7 +6,6 @@ from . import windows as windows
 from .architecture import Architecture as Architecture
 from .architecture import SearchSpace as SearchSpace
 from .architecture import canonical_architecture as canonical_architecture
-from .architecture import check_architecture as check_architecture
 from .architecture import largest_architecture as largest_architecture
 from .architecture import mutate_architecture as mutate_architecture
 from .architecture import sample_architecture as sample_architecture

@@ -121,38 +121,6 @@ def round_channels(channels: float, divisor: int = 8) -> int:
     return rounded + divisor if rounded < 0.9 * channels else rounded
 
 
-def check_architecture(space: SearchSpace, architecture: Architecture) -> Architecture:
-    """``architecture`` itself if it belongs to ``space``.
-
-    Raises:
-        ConfigError: naming the entry that does not.
-    """
-    lengths = {
-        "depths": len(space.stages),
-        "kernels": space.slots,
-        "expansions": space.slots,
-    }
-    for name, count in lengths.items():
-        values = getattr(architecture, name)
-        if len(values) != count:
-            raise ConfigError(f"architecture has {len(values)} {name}, need {count}")
-        for i, value in enumerate(values):
-            if value not in getattr(space, name):
-                raise ConfigError(
-                    f"architecture: {name}[{i}] is {value}, need one of {getattr(space, name)}"
-                )
-    if architecture.width not in space.widths:
-        raise ConfigError(
-            f"architecture: width is {architecture.width}, need one of {space.widths}"
-        )
-    low, high = space.resolution
-    if not low <= architecture.resolution <= high:
-        raise ConfigError(
-            f"architecture: resolution is {architecture.resolution}, need {low} to {high}"
-        )
-    return architecture
-
-
 def stem_channels(space: SearchSpace, architecture: Architecture) -> int:
     """Channels after the first convolution.
 

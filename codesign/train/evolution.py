@@ -14,7 +14,6 @@ from codesign.network import (
     Architecture,
     SearchSpace,
     canonical_architecture,
-    check_architecture,
     largest_architecture,
     mutate_architecture,
     sample_architecture,
@@ -369,31 +368,27 @@ def candidate_to_json(candidate: EvaluatedCandidate) -> dict[str, Any]:
     return {**sizes, "error": candidate.error, "macs": candidate.macs}
 
 
-def state_from_json(table: dict[str, Any], space: SearchSpace) -> EvolutionState:
+def state_from_json(table: dict[str, Any]) -> EvolutionState:
     """State from its table.
 
     Args:
-        table: of :func:`state_to_json`. space: that its architectures belong to.
+        table: of :func:`state_to_json`.
     """
-    history = tuple(candidate_from_json(entry, space) for entry in table["history"])
+    history = tuple(candidate_from_json(entry) for entry in table["history"])
     return EvolutionState(history, table["generator"])
 
 
-def candidate_from_json(
-    entry: dict[str, Any], space: SearchSpace
-) -> EvaluatedCandidate:
-    """Evaluated candidate from its entry in the state's JSON or in result.json.
+def candidate_from_json(entry: dict[str, Any]) -> EvaluatedCandidate:
+    """Evaluated candidate from its entry in the state or in result.json.
 
     Args:
-        entry: sizes of the architecture, error and cost. space: that it belongs to.
+        entry: sizes of the architecture, error and cost.
 
     Raises:
-        KeyError, TypeError: a missing or an unknown entry. ConfigError: not of this
-            space.
+        KeyError, TypeError: a missing or an unknown entry.
     """
     values: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()
     }
     error, macs = float(values.pop("error")), float(values.pop("macs"))
-    architecture = check_architecture(space, Architecture(**values))
-    return EvaluatedCandidate(architecture, error, macs)
+    return EvaluatedCandidate(Architecture(**values), error, macs)

@@ -370,9 +370,7 @@ def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
     state = checkpoint.load(path, settings=settings)
     run = start_run(settings)
     run.trainer.restore(state["trainer"])
-    run.searches = [
-        evolution.state_from_json(table, settings.space) for table in state["searches"]
-    ]
+    run.searches = [evolution.state_from_json(table) for table in state["searches"]]
     return run
 
 

@@ -2,11 +2,10 @@
 (paper Eqs. 8 and 10), on a processor or a GPU.
 """
 
-import collections
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
@@ -38,7 +37,6 @@ from codesign.train.separability import (
     triplet_frames,
 )
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.core.executor import usable_cores
 from metalens.image import Frames, Imager, Sensor, encircled_energy
 
 Made = TypeVar("Made")
@@ -407,13 +405,13 @@ class Trainer:
         """
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        # with a GPU frames are rendered ahead; on a processor training uses its cores
-        workers = 0 if self.light.device.type == "cpu" else max(1, usable_cores() // 4)
 
         def batch_of(step: int) -> FrameBatch:
             return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
 
-        for batch in compute_ahead(batch_of, range(self.step, end), workers=workers):
+        # on a processor training uses all cores, behind a GPU they render ahead
+        ahead = map if self.light.device.type == "cpu" else compute_ahead
+        for batch in ahead(batch_of, range(self.step, end)):
             yield self._advance(batch)
 
     def state(self) -> dict[str, Any]:
@@ -673,29 +671,22 @@ class Trainer:
             self.model.clamp_pitch(finest, max(self._coarsest_um, self._begins_um))
 
 
-def compute_ahead(
-    work: Callable[[int], Made], steps: range, *, workers: int
-) -> Iterator[Made]:
-    """Results of ``work`` for every step in order, computed ahead by ``workers``
-    threads.
-
-    At most ``workers`` + 1 results are pending. The values are those of one thread.
+def compute_ahead(work: Callable[[int], Made], steps: range) -> Iterator[Made]:
+    """Results of ``work`` for every step in order, each computed while the one before
+    it is used.
 
     Args:
         work: depends on the step alone. steps: their numbers.
-        workers: threads; 0 computes a result when it is requested.
     """
-    if not workers:
-        yield from map(work, steps)
-        return
-    with ThreadPoolExecutor(workers, "prefetch") as pool:
-        pending: collections.deque[Future[Made]] = collections.deque()
+    with ThreadPoolExecutor(1, "prefetch") as pool:
+        pending = None
         for step in steps:
-            pending.append(pool.submit(work, step))
-            if len(pending) > workers:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
+            following = pool.submit(work, step)
+            if pending is not None:
+                yield pending.result()
+            pending = following
+        if pending is not None:
+            yield pending.result()
 
 
 def device_of(place: Place) -> torch.device:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches import pool, surface_frames
+from codesign.batches import pool
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import EyeScenes, SceneConfig, draw_depth_scales
 from codesign.batches.surface_frames import (
@@ -18,7 +18,6 @@ from codesign.batches.surface_frames import (
 )
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
-from metalens.core.errors import SceneError, TrainingError
 from metalens.image import Frames, image_direct
 from tests.elsewhere import AWAY, elsewhere
 
@@ -148,15 +147,6 @@ def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
         draw_depth_scales(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
         torch.ones(4000).double(),
     )
-
-
-def test_pools_too_small_and_uneven_frames_are_refused():
-    with pytest.raises(TrainingError, match="smaller than a batch"):
-        PoolScenes(pool.render_pool(SCENES, 2), 8, 0.2, seed=1).batch(0, 4)
-    frames = flatten_layers(SCENES.rendered(0, 1).frames, torch.ones(1))
-    with pytest.raises(SceneError, match=r"need \(n, y, x\) twice"):
-        SingleSurfaceFrames(frames.light, frames.depth_um[:, :4], frames.scale)
-    assert surface_frames.frame_samples(frames) == 80
 
 
 def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():

@@ -13,7 +13,6 @@ from codesign.eye import landmarks
 from codesign.eye import population as eye
 from codesign.eye.population import POPULATION, CameraRig, EyeStates, MotionRanges
 from codesign.eye.renderer import PinholeCamera
-from metalens.core.errors import SceneError
 from tests.codesign.eye import model, plain_eye
 
 FRONTAL = CameraRig(elevation_rad=0.0, aim_um=(0.0, 0.0))
@@ -168,15 +167,6 @@ def test_gradient_of_the_parameters_is_exact():
         states.slip_um.clone().requires_grad_(True),
     )
     assert torch.autograd.gradcheck(packed, held, atol=1e-4, rtol=1e-5)
-
-
-def test_unusable_states_are_refused_by_name():
-    with pytest.raises(SceneError, match=r"slip_um of state 0"):
-        mean_states(slip_um=torch.tensor([[math.nan, 0, 0]], dtype=torch.float64))
-    with pytest.raises(SceneError, match="gaze_rad has shape"):
-        mean_states(gaze_rad=torch.zeros(1, 3, dtype=torch.float64))
-    with pytest.raises(SceneError, match="lamps"):
-        CameraRig(lamps_um=())
 
 
 def test_motion_ranges_hold():

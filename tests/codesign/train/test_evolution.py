@@ -70,7 +70,7 @@ def test_no_candidate_is_beyond_the_budget():
 def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
     states = _run(plan=EvolutionSettings(8, 3, 30))
     middle = evolution.state_from_json(
-        json.loads(json.dumps(evolution.state_to_json(states[12]))), SPACE
+        json.loads(json.dumps(evolution.state_to_json(states[12])))
     )
     assert _run(plan=EvolutionSettings(8, 3, 30), start=middle)[-1] == states[-1]
 
@@ -84,7 +84,7 @@ def test_candidates_born_together_do_not_know_of_each_other():
     assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
     # the first population is drawn, whoever is judged when
     assert four[1].history == one[7].history
-    middle = evolution.state_from_json(evolution.state_to_json(four[3]), SPACE)
+    middle = evolution.state_from_json(evolution.state_to_json(four[3]))
     assert (
         _run(plan=EvolutionSettings(8, 3, 30, together=4), start=middle)[-1] == four[-1]
     )

@@ -7,7 +7,6 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
@@ -43,11 +42,10 @@ def test_a_lens_is_trained_behind_a_network_and_a_loss_of_ones_own():
     assert int((phase_rad.abs() > 1e-3).sum()) == len(phase_rad)
 
 
-@pytest.mark.parametrize("workers", [0, 1, 3])
-def test_frames_rendered_ahead_are_those_of_their_steps(workers):
+def test_frames_rendered_ahead_are_those_of_their_steps():
     scenes = EyeScenes(SceneConfig(pixels=32, margin=0), 36.0, 2000.0, seed=2)
     steps = range(3, 8)
-    made = list(compute_ahead(lambda n: scenes.batch(n, 2), steps, workers=workers))
+    made = list(compute_ahead(lambda n: scenes.batch(n, 2), steps))
     assert len(made) == len(steps)
     for step, batch in zip(steps, made, strict=True):
         assert torch.equal(batch.slip_mm, scenes.batch(step, 2).slip_mm)
