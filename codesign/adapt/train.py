@@ -212,18 +212,6 @@ def training_stacks(psfs: LensPsfs) -> dict[str, tuple[PixelPsfStack, ...]]:
     return stacks | ({"known": psfs.judges} if psfs.known else {})
 
 
-def make_job(
-    source: FinishedRun, config: RetrainConfig, psfs: LensPsfs, name: str
-) -> Trainer:
-    """Trainer of one job of :func:`training_stacks`.
-
-    Args:
-        source: finished run: its network, lens and sensor. config: of the retraining.
-        psfs: of the lenses in question. name: of the job.
-    """
-    return make_trainer(source, config, training_stacks(psfs)[name])
-
-
 def run_job(
     trainer: Trainer, path: Path, settings: object, *, every: int = 50
 ) -> Iterator[LogRecord]:

@@ -159,7 +159,8 @@ def _train(
     A resume drops the log lines after its checkpoint.
     """
     recipe, source, psfs = inputs
-    trainer = retraining.make_job(source, options.settings, psfs, name)
+    stacks = retraining.training_stacks(psfs)[name]
+    trainer = retraining.make_trainer(source, options.settings, stacks)
     path = folder / f"{name}.safetensors"
     if path.is_file():
         trainer.restore(checkpoint.load(path, settings=recipe)["trainer"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from codesign.settings import LEAST, check_ranges
 from metalens.aberrations import OverField, frequencies_per_mm, over_field
-from metalens.core.arrays import Array
+from metalens.core import report
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table, figure_png, make_figure
 from metalens.lens import Lens
@@ -69,25 +69,17 @@ class FieldSetting:
         )
 
 
-def field_values(aberrations: OverField) -> dict[str, Any]:
+def field_values(aberrations: OverField) -> Any:
     """Every number of one lens, ready for JSON: None in place of nan and inf.
 
     Args:
-        aberrations: aberrations over the field.
+        aberrations: over the field.
     """
-    arrays = {
-        name: _json_value(np.asarray(getattr(aberrations, name)))
+    return report.finite_or_none({
+        name: value.tolist() if isinstance(value, np.ndarray) else value
         for name in aberrations.__slots__
-        if name != "left_out"
-    }
-    return arrays | {"left_out": list(aberrations.left_out)}
-
-
-def _json_value(array: Array) -> Any:
-    """Nested lists of floats, None in place of nan and inf."""
-    if array.ndim:
-        return [_json_value(part) for part in array]
-    return float(array) if math.isfinite(array) else None
+        for value in [getattr(aberrations, name)]
+    })  # fmt: skip
 
 
 def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:

@@ -192,18 +192,21 @@ def reader_table(judged: dict[str, dict[str, float]], config: ReaderConfig) -> T
         f"{config.electrons:g} e, {light}, whole field; 95 % interval over {config.test} test frames."
     )
     columns = {
-        "axial / mm": "{axial_mm:.2f} [{axial_low_mm:.2f}, {axial_high_mm:.2f}]",
-        "90 % interval": "±{interval_mm:.2f} mm",
-        "covers": "{covered:.0%}",
-        "lateral / mm": "{lateral_mm:.2f}",
-        "windows / mm (guess)": "{window_mm:.2f} ({guess_mm:.2f})",
-        "image error": "{image_error:.3f}",
+        "axial / mm": "axial_mm",
+        "from": "axial_low_mm",
+        "to (95 %)": "axial_high_mm",
+        "90 % interval / mm": "interval_mm",
+        "covers": "covered",
+        "lateral / mm": "lateral_mm",
+        "windows / mm": "window_mm",
+        "guess / mm": "guess_mm",
+        "image error": "image_error",
     }
     rows = [
-        (name, *(column.format(**errors) for column in columns.values()))
+        (name, *(errors[key] for key in columns.values()))
         for name, errors in judged.items()
     ]
-    return Table(("lens", *columns), rows, caption)
+    return Table(("lens", *columns), rows, caption, digits=3)
 
 
 def judge_lenses(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from codesign.eye import kernel, textures
 from codesign.eye.landmarks import iris_to_camera, landmark_points
@@ -138,24 +139,14 @@ def render(
     )
     rays = camera.tangents(rig).astype(np.float32)
     bank = textures.packed_bank(texture_seed)
-    planes = torch.from_numpy(kernel.render_frames(parameter_rows(p), bank, rays))
+    columns = [p[name] for name in kernel.VECTORS + kernel.NUMBERS]
+    rows = torch.cat([c.reshape(len(c), -1) for c in columns], 1).float().numpy()
+    planes = torch.from_numpy(kernel.render_frames(rows, bank, rays))
     light, cover, depth = planes[:, :2], planes[:, 2:4], planes[:, 4:6]
     depth *= states.scale.float()[:, None, None, None]
     mask = planes[:, 6]
     labels = _labels(states, p, mask, rig=rig, camera=camera)
     return RenderedFrames(Frames(light, cover, depth), mask, labels)
-
-
-def parameter_rows(p: Mapping[str, Tensor]) -> Array:
-    """(n, kernel.COUNT) float32 parameters of frames, as the compiled kernel reads
-    them.
-
-    Args:
-        p: of :func:`codesign.eye.model_parameters`.
-    """
-    columns = [p[name] for name in kernel.VECTORS + kernel.NUMBERS]
-    rows = torch.cat([c.reshape(len(c), -1) for c in columns], 1)
-    return np.asarray(rows.detach().numpy(), np.float32)
 
 
 def _labels(
@@ -182,7 +173,11 @@ def _labels(
     depth[:, 2] = states.trait("depth_um")
     # of an eye that looks straight ahead, before a camera turned by its mounting
     unslipped = _turn(nominal + depth, states.mount_rad)
-    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
+    # centre and rim of the pupil in the plane of the iris
+    turn = torch.arange(24, dtype=torch.float64) * (2 * torch.pi / 24)
+    circle = F.pad(torch.stack([torch.cos(turn), torch.sin(turn)], 1), (0, 0, 1, 0))
+    points_um = p["pupil_r"][:, None, None] * circle
+    middle_and_rim = camera.position_px(iris_to_camera(p, points_um), rig)
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
@@ -199,14 +194,6 @@ def _labels(
         visible=(visible_area / area.clamp_min(1e-6)).clamp(0, 1),
         landmarks_px=camera.position_px(landmark_points(p), rig),
     )
-
-
-def _pupil_points(p: Mapping[str, Tensor], rim: int = 24) -> Tensor:
-    """(n, 1 + rim, 2) centre and rim of the pupil in the plane of the iris."""
-    turn = torch.arange(rim, dtype=torch.float64) * (2 * torch.pi / rim)
-    circle = torch.stack([torch.cos(turn), torch.sin(turn)], 1)
-    points = torch.cat([torch.zeros(1, 2, dtype=torch.float64), circle])
-    return p["pupil_r"][:, None, None] * points
 
 
 def mask_centroid(mask: Tensor, default: Tensor) -> tuple[Tensor, Tensor]:

@@ -73,36 +73,6 @@ class PersonalGaze:
         return np.asarray(first + self.rest(np.concatenate([first, read.slip_mm], 1)))
 
 
-@dataclass(frozen=True, slots=True)
-class SphereCalibrator:
-    """Calibrates by pupil and slippage alone (:func:`calibrate_person`).
-
-    hidden: neurons of the regressor; 0 for none. seed: of its first weights.
-    """
-
-    rig: CameraRig
-    hidden: int = 10
-    seed: int = 0
-
-    def person(self, read: NetworkReadings, gaze_deg: Array) -> PersonalGaze:
-        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
-
-        Args:
-            read: pupil, slippage and axis as a network reads them.
-
-        Raises:
-            TrainingError: fewer than 3 points.
-        """
-        return calibrate_person(
-            read.pupil_mm,
-            read.slip_mm,
-            gaze_deg,
-            rig=self.rig,
-            hidden=self.hidden,
-            seed=self.seed,
-        )
-
-
 def mean_geometry(rig: CameraRig) -> EyeGeometry:
     """The population's mean eye before this camera.
 
@@ -114,64 +84,67 @@ def mean_geometry(rig: CameraRig) -> EyeGeometry:
     return EyeGeometry((x, y, z), 1e-3 * radius, 1e-3 * rig.sensor_distance_um)
 
 
-def calibrate_person(
-    pupil_mm: Array,
-    slip_mm: Array,
-    gaze_deg: Array,
-    *,
-    rig: CameraRig,
-    hidden: int = 10,
-    seed: int = 0,
-) -> PersonalGaze:
-    """Calibrate a person: spherical eye by regularised least squares, then a regressor.
+@dataclass(frozen=True, slots=True)
+class SphereCalibrator:
+    """Calibrates by pupil and slippage alone: spherical eye by regularised least
+    squares, then a regressor.
 
-    Minimises |gaze error / reading|² + |parameters / SPREAD|² twice, the second time
-    with the residual of the first as reading error. The regressor learns the remaining
-    errors; its penalty is 1 where there are no more points than parameters of the
-    sphere, else cross-validated.
-
-    Args:
-        pupil_mm: (n, 2) pupil on the sensor, from the lens axis.
-        slip_mm: (n, 3) displacement of the head.
-        gaze_deg: (n, 2) true gaze, across and down. rig: pose of camera and lamps.
-        hidden: neurons of the regressor; 0 for none. seed: of the random generator.
-
-    Raises:
-        TrainingError: fewer than 3 points.
+    hidden: neurons of the regressor; 0 for none. seed: of its first weights.
     """
-    if len(pupil_mm) < 3:
-        raise TrainingError(
-            f"a personal calibration from {len(pupil_mm)} points, need 3 or more"
+
+    rig: CameraRig
+    hidden: int = 10
+    seed: int = 0
+
+    def person(self, read: NetworkReadings, gaze_deg: Array) -> PersonalGaze:
+        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
+
+        Minimises |gaze error / reading|² + |parameters / SPREAD|² twice, the second
+        time with the residual of the first as reading error. The regressor learns the
+        remaining errors; its penalty is 1 where there are no more points than
+        parameters of the sphere, else cross-validated.
+
+        Args:
+            read: pupil and slippage as a network reads them.
+
+        Raises:
+            TrainingError: fewer than 3 points.
+        """
+        if len(read) < 3:
+            raise TrainingError(
+                f"a personal calibration from {len(read)} points, need 3 or more"
+            )
+        mean = mean_geometry(self.rig)
+        pupil, slip = (
+            np.ascontiguousarray(a, dtype=float) for a in (read.pupil_mm, read.slip_mm)
         )
-    mean = mean_geometry(rig)
-    pupil, slip = (np.ascontiguousarray(a, dtype=float) for a in (pupil_mm, slip_mm))
 
-    def sphere_of(own: Array) -> PersonalGaze:
-        return PersonalGaze(mean, rig, own, None)
+        def sphere_of(own: Array) -> PersonalGaze:
+            return PersonalGaze(mean, self.rig, own, None)
 
-    def residual(unit: Array, reading_deg: float) -> Array:
-        error = sphere_of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
-        return np.concatenate([error.ravel() / reading_deg, unit])
+        def residual(unit: Array, reading_deg: float) -> Array:
+            error = sphere_of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
+            return np.concatenate([error.ravel() / reading_deg, unit])
 
-    own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
-    degrees_of_freedom = max(1, 2 * len(pupil) - len(own))
-    square = (residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum()
-    reading_deg = max(0.3, float(np.sqrt(square / degrees_of_freedom)))
-    person = sphere_of(least_squares(residual, own, args=(reading_deg,)).x * SPREAD)
-    if not hidden:
-        return person
-    sphere_deg = person.sphere(pupil, slip)
-    features = np.concatenate([sphere_deg, slip], 1)
-    errors = gaze_deg - sphere_deg
-    penalty = 1.0
-    if len(pupil) > len(SPREAD):
-        penalty = _cross_validated_penalty(
-            features, errors, gaze_deg, hidden=hidden, seed=seed
+        own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
+        degrees_of_freedom = max(1, 2 * len(pupil) - len(own))
+        square = (residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum()
+        reading_deg = max(0.3, float(np.sqrt(square / degrees_of_freedom)))
+        person = sphere_of(least_squares(residual, own, args=(reading_deg,)).x * SPREAD)
+        if not self.hidden:
+            return person
+        sphere_deg = person.sphere(pupil, slip)
+        features = np.concatenate([sphere_deg, slip], 1)
+        errors = gaze_deg - sphere_deg
+        penalty = 1.0
+        if len(pupil) > len(SPREAD):
+            penalty = _cross_validated_penalty(
+                features, errors, gaze_deg, hidden=self.hidden, seed=self.seed
+            )
+        rest = regressor.fit_regressor(
+            features, errors, hidden=self.hidden, penalty=penalty, seed=self.seed
         )
-    rest = regressor.fit_regressor(
-        features, errors, hidden=hidden, penalty=penalty, seed=seed
-    )
-    return replace(person, rest=rest)
+        return replace(person, rest=rest)
 
 
 def _cross_validated_penalty(

@@ -226,18 +226,14 @@ def mutate_architecture(
     for least in np.linspace(0, 1, 200):
         other = sample_architecture(space, generator)
         chance = max(rate, float(least))
-        rows: dict[str, Any] = {
-            name: _recombine(
-                getattr(architecture, name), getattr(other, name), generator, chance
+        child = Architecture(
+            *(
+                _recombine(
+                    getattr(architecture, name), getattr(other, name), generator, chance
+                )
+                for name in Architecture.__slots__
             )
-            for name in ("depths", "kernels", "expansions")
-        }
-        scales = ("width", "resolution")
-        own_scales, others = (
-            tuple(getattr(a, name) for name in scales) for a in (architecture, other)
         )
-        mixed = _recombine(own_scales, others, generator, chance)
-        child = Architecture(**rows | dict(zip(scales, mixed, strict=True)))
         if canonical_architecture(space, child) != own:
             return child
     return architecture
@@ -292,12 +288,10 @@ def _uniform(space: SearchSpace, pick: Callable[[Any], Any]) -> Architecture:
 
 
 def _recombine(
-    mine: tuple[Any, ...],
-    others: tuple[Any, ...],
-    generator: np.random.Generator,
-    rate: float,
-) -> tuple[Any, ...]:
-    """Entries of ``others`` with probability ``rate`` each, else of ``mine``."""
-    return tuple(
-        b if generator.random() < rate else a for a, b in zip(mine, others, strict=True)
-    )
+    mine: Any, others: Any, generator: np.random.Generator, rate: float
+) -> Any:
+    """The other value with probability ``rate``, entry by entry of a tuple."""
+    if isinstance(mine, tuple):
+        pairs = zip(mine, others, strict=True)
+        return tuple(_recombine(a, b, generator, rate) for a, b in pairs)
+    return others if generator.random() < rate else mine

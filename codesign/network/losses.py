@@ -162,8 +162,6 @@ def resize_mask(mask: Tensor, like: Tensor) -> Tensor:
     Args:
         mask: (batch, y, x) coverage. like: (batch, y, x) on the wanted grid.
     """
-    if mask.shape[-2:] == like.shape[-2:]:
-        return mask
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
 
 

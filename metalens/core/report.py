@@ -346,12 +346,12 @@ def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _finite_or_none(value: Any) -> Any:
+def finite_or_none(value: Any) -> Any:
     """A value for JSON: None in place of numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {name: _finite_or_none(part) for name, part in value.items()}
+        return {name: finite_or_none(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite_or_none(part) for part in value]
+        return [finite_or_none(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -450,7 +450,7 @@ class CommandConsole:
         """
         if self.json:
             flush_output(
-                json.dumps(_finite_or_none(values), indent=1, default=float) + "\n"
+                json.dumps(finite_or_none(values), indent=1, default=float) + "\n"
             )
         else:
             self.say(text)

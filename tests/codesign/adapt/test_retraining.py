@@ -156,16 +156,22 @@ def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(fo
 
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
     source = finished.load_finished_run(folder)
-    whole = retraining.make_job(source, SHORT, found, "retrained")
+    whole = retraining.make_trainer(
+        source, SHORT, retraining.training_stacks(found)["retrained"]
+    )
     list(retraining.run_job(whole, tmp_path / "whole", SHORT))
     first = retraining.run_job(
-        retraining.make_job(source, SHORT, found, "retrained"),
+        retraining.make_trainer(
+            source, SHORT, retraining.training_stacks(found)["retrained"]
+        ),
         tmp_path / "part",
         SHORT,
         every=1,
     )
     next(first), next(first)  # the checkpoint of step 1 is written
-    second = retraining.make_job(source, SHORT, found, "retrained")
+    second = retraining.make_trainer(
+        source, SHORT, retraining.training_stacks(found)["retrained"]
+    )
     list(retraining.run_job(second, tmp_path / "part", SHORT))
     for a, b in zip(
         whole.model.net.state_dict().values(),
@@ -181,7 +187,9 @@ def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_
 
 def test_only_weights_move(folder, found):
     source = finished.load_finished_run(folder)
-    going = retraining.make_job(source, SHORT, found, "known")
+    going = retraining.make_trainer(
+        source, SHORT, retraining.training_stacks(found)["known"]
+    )
     list(going.run())
     assert torch.equal(
         going.model.coefficients_rad, source.run.trainer.model.coefficients_rad

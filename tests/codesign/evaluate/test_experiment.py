@@ -81,8 +81,8 @@ def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_muc
     """
     config, rig = ExperimentConfig(subjects=2), CameraRig()
     trial = _trial(config, 2)
-    person = personal.calibrate_person(
-        np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0
+    person = personal.SphereCalibrator(rig, hidden=0).person(
+        NetworkReadings(np.zeros((3, 2)), np.zeros((3, 3))), np.zeros((3, 2))
     )
     s, c = np.sin(rig.elevation_rad), np.cos(rig.elevation_rad)
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])

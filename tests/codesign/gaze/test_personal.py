@@ -76,12 +76,14 @@ def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
     """
     pupil, slip, gaze = _person(SLIPS)
     known = _known(gaze, 4)
-    person = personal.calibrate_person(pupil[known], slip[known], gaze[known], rig=RIG)
+    person = personal.SphereCalibrator(RIG).person(
+        NetworkReadings(pupil[known], slip[known]), gaze[known]
+    )
     error = personal.angle_deg(
         person(NetworkReadings(pupil[~known], slip[~known])), gaze[~known]
     )
-    alone = personal.calibrate_person(
-        pupil[known], slip[known], gaze[known], rig=RIG, hidden=0
+    alone = personal.SphereCalibrator(RIG, hidden=0).person(
+        NetworkReadings(pupil[known], slip[known]), gaze[known]
     )
     assert known.sum() == 49
     assert error.mean() < 0.15
@@ -98,7 +100,9 @@ def test_noisy_slippage_makes_the_regressor_careful():
     pupil, slip, gaze = _person(SLIPS[:1])
     read = slip + 0.3 * rng.standard_normal(slip.shape)
     known = _known(gaze, 3)
-    person = personal.calibrate_person(pupil[known], read[known], gaze[known], rig=RIG)
+    person = personal.SphereCalibrator(RIG).person(
+        NetworkReadings(pupil[known], read[known]), gaze[known]
+    )
     assert (
         personal.angle_deg(
             person(NetworkReadings(pupil[~known], read[~known])), gaze[~known]
@@ -115,7 +119,9 @@ def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
     pupil, slip, gaze = _person(SLIPS[:1], beside=(0.9, -0.7, 0.8), larger=-0.5)
     some = np.random.default_rng(2).permutation(len(gaze))[:5]
     gaze = gaze[some] + np.random.default_rng(3).normal(0, 1.5, (5, 2))
-    person = personal.calibrate_person(pupil[some], slip[some], gaze, rig=RIG, hidden=0)
+    person = personal.SphereCalibrator(RIG, hidden=0).person(
+        NetworkReadings(pupil[some], slip[some]), gaze
+    )
     differ = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
 
     def missed(unit):
