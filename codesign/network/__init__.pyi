@@ -10,6 +10,6 @@ from .architecture import largest_architecture as largest_architecture
 from .architecture import mutate_architecture as mutate_architecture
 from .architecture import sample_architecture as sample_architecture
 from .architecture import smallest_architecture as smallest_architecture
-from .supernet import Prediction as Prediction
+from .supernet import NetworkPrediction as NetworkPrediction
 from .supernet import Supernet as Supernet
 from .supernet import recalibrate_batch_norm as recalibrate_batch_norm

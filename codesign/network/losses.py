@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from codesign.network.supernet import Prediction
+from codesign.network.supernet import NetworkPrediction
 
 SPREAD_WEIGHT = 0.1  # of the uncertainty's own loss: it moves its own layer alone
 POINT_UNIT, AXIS_UNIT = 0.05, 0.1  # of the image's width; of a unit vector: 6 degrees
@@ -73,7 +73,7 @@ def depth_loss(predicted: Tensor, vergence: Tensor) -> Tensor:
 
 
 def task_loss(
-    prediction: Prediction,
+    prediction: NetworkPrediction,
     mask: Tensor,
     slip_mm: Tensor,
     scale_mm: Tensor,
@@ -92,7 +92,7 @@ def task_loss(
 
 
 def depth_reading_loss(
-    prediction: Prediction,
+    prediction: NetworkPrediction,
     vergence: Tensor,
     slip_mm: Tensor,
     scale_mm: Tensor,
@@ -119,7 +119,7 @@ def depth_reading_loss(
 
 
 def pose_loss(
-    prediction: Prediction,
+    prediction: NetworkPrediction,
     axis: Tensor,
     points: Tensor,
     *,

@@ -36,7 +36,7 @@ EPSILON = 1e-2
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Prediction:
+class NetworkPrediction:
     """Predictions of the network for a batch of frames.
 
     mask_logits: (batch, y, x) at a quarter of the input resolution.
@@ -343,7 +343,7 @@ class Supernet(nn.Module):
     """All architectures of ``space`` in one set of weights.
 
     ``forward(frames, architecture)``: frames (batch, 1, y, x), standardised; returns a
-    :class:`Prediction`.
+    :class:`NetworkPrediction`.
     """
 
     def __init__(self, space: SearchSpace | None = None) -> None:
@@ -361,7 +361,7 @@ class Supernet(nn.Module):
         self.calibration = CalibrationHead(rows[-1][-1].outputs)
         self.blur = blur.BlurBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
-    def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
+    def forward(self, frames: Tensor, architecture: Architecture) -> NetworkPrediction:
         """Predictions of one member for standardised frames.
 
         Args:
@@ -390,7 +390,7 @@ class Supernet(nn.Module):
             x, blur_features, torch.cat([points.flatten(1), widths], 1)
         )
         slip = slip + F.pad(axial[:, None], (2, 0))
-        return Prediction(
+        return NetworkPrediction(
             logits, soft_argmax(logits), slip, depth, slip_log_sd, points, axis
         )
 

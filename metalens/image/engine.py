@@ -15,7 +15,7 @@ from metalens.image import model_error
 from metalens.image.forming import Imager, build_imager
 from metalens.image.low_rank import frame_maps, plane_images
 from metalens.image.plan import Grid, ImagingPlan, plan_nodes, sum_over_spectrum
-from metalens.image.points import Optics, sampling
+from metalens.image.points import Optics, pupil_sampling
 from metalens.image.scene import Frames
 from metalens.image.stray import stray_of
 from metalens.image.texture import CONTRAST, scene_error
@@ -284,7 +284,7 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
         "folded": model_error.folding_error(judged) * share,
         "polarisation": model_error.polarisation_error(judged) * share,
         "pillars": model_error.gathering_error(*pillars) * dimmer,
-        "edge": sampling(optics, plan.window, wave).beyond / 2,
+        "edge": pupil_sampling(optics, plan.window, wave).beyond / 2,
     }
     if optics.layers.stop is not None:
         judged_psfs = true[:FEW, 1:-1], light[:FEW, 1:-1], light.amax(0)[1:-1]

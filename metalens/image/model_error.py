@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.image.points import Optics, Window, psfs, sampling
+from metalens.image.points import Optics, Window, psfs, pupil_sampling
 from metalens.image.texture import texture_error, weigh_by_light
 from metalens.image.waves import PillarWave
 from metalens.optics import media
@@ -160,7 +160,7 @@ def gathering_error(
     wave = optics.wave
     if not isinstance(wave, PillarWave):
         return 0.0
-    grid = sampling(optics, window, wavelength_um)
+    grid = pupil_sampling(optics, window, wavelength_um)
     # points per sample, at half of Nyquist's step: its triangle is then summed to
     # 2e-3 of fine detail, at Nyquist's step to 5e-3
     per_sample = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)

@@ -117,7 +117,7 @@ class PupilSampling:
     window: Window
 
 
-def sampling(
+def pupil_sampling(
     optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf
 ) -> PupilSampling:
     """Nodes of the pupil and size of its padded transform for one window.
@@ -199,7 +199,7 @@ def psfs(
     Raises:
         PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
-    grid = sampling(optics, window, wavelength_um, finest_um)
+    grid = pupil_sampling(optics, window, wavelength_um, finest_um)
     shared = (grid, depths_um, wavelength_um, min(wavelength_um, finest_um), shift_um)
     return torch.stack([_point_psfs(optics, place, *shared) for place in at_um])
 

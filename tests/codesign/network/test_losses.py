@@ -107,13 +107,15 @@ def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
     """Off by 0.002 of the image (under the knee of 0.005), by 0.1 (beyond), outside; by
     0.01 and 0.2 of the axis.
     """
-    from codesign.network.supernet import Prediction
+    from codesign.network.supernet import NetworkPrediction
 
     points = torch.tensor([[[0.1, -0.4], [0.2, 0.3], [0.1, 0.51]]])
     axis = torch.tensor([[0.2, -0.7, -0.66]])
     told = points + torch.tensor([[[0.002, 0.0], [0.0, 0.1], [3.0, 3.0]]])
     turned = axis + torch.tensor([[0.01, 0.0, -0.2]])
-    found = Prediction(*(torch.zeros(1) for _ in range(5)), points=told, axis=turned)
+    found = NetworkPrediction(
+        *(torch.zeros(1) for _ in range(5)), points=told, axis=turned
+    )
     # two coordinates, two points inside
     seen = (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2
     looked = (0.1**2 / 2 / 0.3 + (2.0 - 0.15)) / 3

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from codesign.network import Prediction
+from codesign.network import NetworkPrediction
 from codesign.train import assess
 from codesign.train.assess import SensorFrames
 
@@ -31,7 +31,7 @@ class Typed(torch.nn.Module):
         part = slice(self.at, self.at + len(frames))
         self.at += len(frames)
         slip, depth = self.slip[part], torch.zeros(len(frames), 2, 7, 7)
-        return Prediction(
+        return NetworkPrediction(
             self.logits[part], slip[:, :2], slip, depth, slip, slip[:, None, :2], slip
         )
 
