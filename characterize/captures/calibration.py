@@ -299,58 +299,47 @@ def merge_brackets(
     merged = [
         _merge(frames, np.flatnonzero(group == kind), exposure_s) for kind in kinds
     ]
-    value, usable, saturated, floor, scale = (
-        np.stack(part) for part in zip(*merged, strict=True)
-    )
-    note = f"{len(group)} exposures merged to {len(kinds)} frames by inverse variance"
-    notes = (
-        (*frames.corrections, note) if len(kinds) < len(group) else frames.corrections
-    )
+    notes = frames.corrections
+    if len(kinds) < len(group):
+        notes += (
+            f"{len(group)} exposures merged to {len(kinds)} frames by inverse variance",
+        )
+    stacks = map(np.stack, zip(*merged, strict=True))
     common = frames.common_floor, frames.common_light
-    return ElectronFrames(
-        value, usable, saturated, floor, scale, frames.gain, notes, *common
-    ), np.sort(first)
+    return ElectronFrames(*stacks, frames.gain, notes, *common), np.sort(first)
 
 
-def _merge(frames: ElectronFrames, index: Array, exposure_s: Array) -> list[Array]:
+def _merge(
+    frames: ElectronFrames, index: Array, exposure_s: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """(y, x) electrons, usable, saturated, variance and scale of one merged frame.
+
+    The variance of the mean, 1 / norm = floor + rate / scale, is the weighted mean of
+    the brackets' own. Where no bracket is valid, the shortest stands.
 
     Args:
         frames: frames of all brackets.
         index: (k,) numbers of the frames to merge.
         exposure_s: (n,) exposures of all frames.
     """
-    exposure = exposure_s[index][:, None, None] / exposure_s[index].max()
+    exposure = (exposure_s[index] / exposure_s[index].max())[:, None, None]
+    electrons, variance_e2 = frames.electrons[index], frames.variance_e2[index]
+    scale = np.broadcast_to(frames.scale, frames.electrons.shape)[index]
     valid = frames.usable[index] & ~frames.saturated[index]
     total = np.maximum((valid * exposure).sum(0), 1e-12)
-    rate = np.maximum((frames.electrons[index] * valid).sum(0) / total, 0)
-    noise = frames.variance_e2[index] + rate * exposure / frames.scale[index]
-    weight = valid * exposure**2 / noise
-    has_weight = weight.sum(0) > 0
-    shortest = index[np.argmin(exposure_s[index])]
-    norm = np.where(has_weight, weight.sum(0), 1)
-    value = np.where(
-        has_weight, (weight * frames.electrons[index] / exposure).sum(0) / norm, 0
+    rate = np.maximum((electrons * valid).sum(0) / total, 0)
+    weight = valid * exposure**2 / (variance_e2 + rate * exposure / scale)
+    none = ~valid.any(0)
+    weight[exposure.argmin()] += none
+    norm = weight.sum(0)
+    shot = (weight**2 / exposure / scale).sum(0) / norm**2
+    return (
+        (weight * electrons / exposure).sum(0) / norm,
+        frames.usable[index].any(0),
+        none & frames.saturated[index].any(0),
+        (weight**2 * variance_e2 / exposure**2).sum(0) / norm**2,
+        1 / shot,
     )
-    value = np.where(has_weight, value, frames.electrons[shortest] / exposure.min())
-    # the merged noise is 1 / norm = floor + rate / scale: both parts are weighted means
-    # of the brackets' own
-    floor = (weight**2 * frames.variance_e2[index] / exposure**2).sum(0) / norm**2
-    shot = (weight**2 / exposure / frames.scale[index]).sum(0) / norm**2
-    floor = np.where(
-        has_weight, floor, frames.variance_e2[shortest] / exposure.min() ** 2
-    )
-    clipped = ~has_weight & frames.saturated[index].any(0)
-    return [
-        np.asarray(part)
-        for part in (
-            value,
-            frames.usable[index].any(0),
-            clipped,
-            floor,
-            1 / np.where(has_weight, shot, 1),
-        )
-    ]
 
 
 def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
@@ -512,9 +501,9 @@ def fit_noise_line(
             float(weight.sum() ** -0.5),
             intercept,
         )
-    design = np.stack([mean, np.ones_like(mean)], 1) / spread[:, None]
-    covariance = np.linalg.inv(design.T @ design)
-    slope, intercept = covariance @ design.T @ (variance / spread)
+    (slope, intercept), covariance = np.polyfit(
+        mean, variance, 1, w=1 / spread, cov="unscaled"
+    )
     return float(slope), float(covariance[0, 0] ** 0.5), max(float(intercept), 0.0)
 
 

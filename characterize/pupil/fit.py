@@ -21,20 +21,10 @@ from characterize.inference import (
 )
 from characterize.pupil.model import RELATIVE_PRIOR, PupilModel, PupilSpec
 from characterize.pupil.score import StackAgreement, measure_agreement, pupil_problems
-from metalens.core import config, store
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, FitError, FitRefused
 
-_STORED = (
-    "value",
-    "sigma",
-    "position_um",
-    "measured",
-    "predicted",
-    "residual_sigma",
-    "phase_rad",
-    "amplitude",
-)
 Optics = tuple[tuple[str, float, float], ...]
 
 
@@ -156,22 +146,11 @@ def save_pupil(
         fit: the fitted pupil.
         provenance: inputs and settings, for the record.
     """
-    arrays = {name: getattr(fit, name) for name in _STORED}
-    for name in ("names", "cautions", "problems"):
-        arrays[name] = np.array(getattr(fit, name) or ("",))
-    stated_lines = [
-        line for line in config.dumps(fit.spec).splitlines() if not line.endswith("nan")
-    ]
-    attributes: dict[str, store.Attribute] = {
-        "spec": "\n".join(stated_lines) + "\n",
-        "chi2_per_dof": fit.chi2_per_dof,
-        "converged": fit.converged,
-        "reason": fit.reason,
-    }
+    arrays, attributes = store.flatten_record(fit)
     attributes |= {f"fitted_{name}": value for name, value, _ in fit.optics}
     for label in ("agreement", "held_out"):
-        score = getattr(fit, label)
-        if score is not None:
+        if score := getattr(fit, label):
+            del attributes[label]
             entries = dataclasses.asdict(score).items()
             attributes |= {f"{label}_{key}": value for key, value in entries}
     store.save(path, "pupil", arrays, attributes=attributes, provenance=provenance)
@@ -258,11 +237,11 @@ def crop_to_bead(
     corner = np.clip(np.subtract(center, half), 0, np.subtract(shape[1:], window))
     top, left = corner.tolist()
     inner = (slice(None), slice(top, top + window), slice(left, left + window))
-    electrons, usable, saturated, variance_e2, scale = (
+    parts = (
         np.broadcast_to(getattr(frames, name), shape)[inner]
         for name in ("electrons", "usable", "saturated", "variance_e2", "scale")
     )
-    data = FitImages(electrons, usable, saturated, variance_e2, scale, spec.model_error)
+    data = FitImages(*parts, spec.model_error)
     return data, (center[0] - half - top, center[1] - half - left)
 
 
@@ -337,12 +316,13 @@ def fit_optics(
         for quantity in spec.free
     ]
     fitted = zip(spec.free, values, sigma, strict=True)
-    orders = {
-        quantity: getattr(spec, quantity)
-        for quantity in ("phase_order", "amplitude_order")
-    }
     fitted_spec = replace(
-        optics, free=(), stage_sigma_um=model.stage_sigma_um, model=spec.model, **orders
+        optics,
+        free=(),
+        stage_sigma_um=model.stage_sigma_um,
+        model=spec.model,
+        phase_order=spec.phase_order,
+        amplitude_order=spec.amplitude_order,
     )
     return PupilModel(fitted_spec, stage_factor * model.position_um), tuple(
         (name, value, value * relative) for name, value, relative in fitted

@@ -10,6 +10,11 @@ import numpy as np
 from characterize.inference import FitImages
 from metalens.core.arrays import Array
 
+# correlation below which the window holds no bead of this kind
+_LEAST_NCC = 0.8
+# share of the light; correct optics leave about 0.1, an aperture wrong by a fifth 0.3
+_MOST_UNEXPLAINED = 0.35
+
 
 @dataclass(frozen=True, slots=True)
 class StackAgreement:
@@ -63,35 +68,26 @@ def pixel_noise_e(data: FitImages) -> float:
     return 1.4826 * float(np.median(np.abs(step - np.median(step)))) / math.sqrt(2)
 
 
-def pupil_problems(
-    score: StackAgreement,
-    stopped: str,
-    *,
-    least_ncc: float = 0.8,
-    most_unexplained: float = 0.35,
-) -> list[str]:
+def pupil_problems(score: StackAgreement, stopped: str) -> list[str]:
     """Reasons to refuse a pupil, in words.
 
     Args:
         score: of the planes left out, else of the fitted ones.
         stopped: why the fit stopped before it converged; empty where it did.
-        least_ncc: correlation below which the window holds no bead of this kind.
-        most_unexplained: share of the light; correct optics leave about 0.1, an
-            aperture wrong by a fifth 0.3.
     """
     words = []
-    if stopped and score.unexplained > most_unexplained / 2:
+    if stopped and score.unexplained > _MOST_UNEXPLAINED / 2:
         words.append(f"not converged ({stopped})")
-    if score.ncc < least_ncc:
+    if score.ncc < _LEAST_NCC:
         words.append(
-            f"images and model correlate by {score.ncc:.2f} only (need {least_ncc}): "
+            f"images and model correlate by {score.ncc:.2f} only (need {_LEAST_NCC}): "
             "too little light, planes out of order, or no bead at the centre of the "
             "window; give center = [row, column]"
         )
-    if score.unexplained > most_unexplained:
+    if score.unexplained > _MOST_UNEXPLAINED:
         words.append(
             f"the pupil misses {score.unexplained:.0%} of the light beyond noise (at "
-            f"most {most_unexplained:.0%} allowed): numerical_aperture, wavelength_um, "
+            f"most {_MOST_UNEXPLAINED:.0%} allowed): numerical_aperture, wavelength_um, "
             "pixel_um, index, bead_um or step_um may be wrong, a second bead may be in "
             "the window, or planes are missing or out of order"
         )

@@ -62,7 +62,5 @@ def zernike_basis(which: list[Index], x: Array, y: Array) -> Array:
         y: (*shape) y in the pupil over its radius.
     """
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
-    basis = np.empty((len(which), *x.shape))
-    for row, index in zip(basis, which, strict=True):
-        row[...] = zernike_polynomial(index, rho, theta)
-    return basis
+    basis = [zernike_polynomial(index, rho, theta) for index in which]
+    return np.array(basis).reshape(len(which), *x.shape)
