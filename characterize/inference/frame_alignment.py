@@ -260,11 +260,11 @@ def _chi_square_of_turn(k: int, expected: Array, light: Array, noise: Array) -> 
 
 
 def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
-    """Nominal frames without background, clipped as the measured ones.
+    """Nominal frames above their rim, clipped as the measured ones.
 
     The same share of pixels is clipped in each.
     """
-    images = model.images(_bare(x))[0]
+    images = model.images(x)[0]
     tops = [
         np.quantile(image, 1 - share)
         for image, share in zip(images, clipped, strict=True)
@@ -325,14 +325,6 @@ def _plainest_turn(scores: Array) -> int:
     best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
     halved = (1 - scores[best]) < 0.5 * (1 - scores[0])
     return best if halved and scores[best] - scores[0] > 0.02 else 0
-
-
-def _bare(x: Array) -> Array:
-    """Parameters without background, at unit gain: only the shape matters here."""
-    out = x.copy()
-    for name in ("background_e", "background_x_e", "background_y_e"):
-        out[PLACE[name]] = 0.0
-    return out
 
 
 def arrangement_text(arrangement: FrameArrangement) -> list[str]:

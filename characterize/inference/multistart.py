@@ -36,9 +36,8 @@ from metalens.lens import Lens
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another mode is reported
 _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-_LEANING_RAD = 0.3  # of the astigmatic starts
 _ASIDE_UM = 50.0  # largest offset of a window
-_PROMISING, _MOST, _AGAIN = 40.0, 2, 3
+_MOST, _AGAIN = 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
 _PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of the prior
 _TRIAL = SolverSettings(iterations=6, step_tolerance=0.5, near=math.inf, finish=False)
@@ -107,50 +106,33 @@ def named_images(
 def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
-    Short fits to a few frames from the nominal lens and from astigmatic ones place the
-    windows; the best of them is fitted to all frames, and :func:`find_other_modes`
-    starts from its end and from the promising others.
+    A short fit to a few frames from the nominal lens places the windows; it is
+    continued on all frames, and :func:`find_other_modes` starts from its end.
 
     Returns:
         (the task with its windows fixed at the light, modes).
     """
-    few = few_frames(task.model.setting)
-    plain = starting_point(task)
-    # about its focus a lens with the opposite even aberrations gives nearly the same
-    # images, and the nominal one lies between
-    leaning = [
-        with_values(plain, {name: size})
-        for name in _EVEN[:2]
-        for size in (_LEANING_RAD, -_LEANING_RAD)
-    ]
-    trials = [_short(task, few, x) for x in (plain, *leaning)]
-    first, *others = sorted(trials, key=lambda trial: trial.merit)
+    first = _short(task, few_frames(task.model.setting), starting_point(task))
     task = hold_windows(task, first.value)
-    promising = [t.value for t in others if t.merit < first.merit + _PROMISING]
-    best = refine_fit(task, first.value)
-    return task, find_other_modes(task, [best], promising)
+    return task, find_other_modes(task, [refine_fit(task, first.value)])
 
 
-def find_other_modes(
-    task: SearchTask, ends: list[FitSolution], begins: Sequence[Array] = ()
-) -> list[FitSolution]:
+def find_other_modes(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
     """The modes, and those that other starts lead to, until the best stays.
 
-    Starts are ``begins``, mirror images of the best (:func:`mirrored_starts`), and
-    places along the bias (:func:`starts_along_bias`).
+    Starts are mirror images of the best (:func:`mirrored_starts`), and places along the
+    bias (:func:`starts_along_bias`).
 
     Args:
         task: model, frames, priors and arrangement of the search.
         ends: fits of the modes so far, best first.
-        begins: (p,) further starts.
     """
     for _ in range(_AGAIN):
         best = ends[0]
-        starts = [*begins, *mirrored_starts(task, best), *starts_along_bias(task, best)]
+        starts = [*mirrored_starts(task, best), *starts_along_bias(task, best)]
         ends = distinct_modes([*ends, *follow_starts(task, ends, starts)])
         if ends[0].merit > best.merit - 1:
             break
-        begins = ()
     return ends
 
 

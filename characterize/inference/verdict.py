@@ -25,17 +25,6 @@ _ONE_COLOUR_NM = 2.0
 _STRUCTURE = 4.5
 
 
-def is_chi_square_consistent(solution: FitSolution, gain: SensorNoise) -> bool:
-    """Whether chi-square is that of noise: within 15 %, or four of its own sigma where
-    pixels or flats are few.
-
-    Args:
-        solution: the fit that is judged.
-        gain: noise of the sensor.
-    """
-    return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
-
-
 def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
     """Whether frames have less noise than the noise model says, in words.
 
@@ -58,19 +47,12 @@ def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
 
 
 def _allowed(solution: FitSolution, gain: SensorNoise) -> float:
-    """Deviation of reduced chi-square from 1 that noise and the gain's error allow."""
-    chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
-    return max(MISFIT - 1, min(chance, 0.5))
-
-
-def chance_of(solution: FitSolution) -> float:
-    """Standard deviation of chi-square per degree of freedom over the pixels that
-    count.
-
-    Args:
-        solution: the fit that is judged.
+    """Deviation of reduced chi-square from 1 that is no fault: 15 %, or four of its own
+    sigma, with the gain's error, where pixels or flats are few; half at most.
     """
-    return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
+    counted = max(float((solution.residual_sigma != 0).sum()), 1.0)
+    chance = math.hypot(math.sqrt(2 / counted), gain.gain_sigma_e / gain.gain_e)
+    return max(MISFIT - 1, min(4 * chance, 0.5))
 
 
 def fit_problems(
@@ -99,7 +81,7 @@ def fit_problems(
             "for intervals that hold; expose longer, or average frames"
         )
     outliers = float((np.abs(solution.residual_sigma) > 6).mean())
-    if gain.known and not is_chi_square_consistent(solution, gain):
+    if gain.known and solution.chi2_per_dof > 1 + _allowed(solution, gain):
         frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))
         words.append(
             f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, not 1: the model does not explain "
@@ -202,7 +184,10 @@ def correlated_residuals_text(
     r = np.clip(residual_sigma, -6, 6) / np.sqrt(1 + np.square(flat_sigma))
     found = []
     sides = np.array(
-        [_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])]
+        [
+            neighbour_correlation(r[:, :, 1:], r[:, :, :-1]),
+            neighbour_correlation(r[:, 1:], r[:, :-1]),
+        ]
     )
     worst = int(np.argmax(sides.max(0)))
     if sides.max() > _STRUCTURE:
@@ -223,8 +208,13 @@ def correlated_residuals_text(
     return found
 
 
-def _together(first: Array, second: Array) -> Array:
-    """(n,) mean product of neighbours over its standard deviation."""
+def neighbour_correlation(first: Array, second: Array) -> Array:
+    """(n,) mean product of neighbours over its standard deviation.
+
+    Args:
+        first: (n, y, x) residuals.
+        second: those of their neighbours.
+    """
     product = first * second
     return np.asarray(
         product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1))

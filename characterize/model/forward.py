@@ -25,13 +25,10 @@ from characterize.model.pillars import (
     pillar_change_of,
 )
 from characterize.model.setting import (
-    LIGHT,
-    WAVEFRONT_ERRORS,
     AngleGroup,
     FrameSetting,
     SpectralLine,
     background_planes,
-    light_maps,
     true_depth,
 )
 from metalens.core import threads
@@ -209,10 +206,11 @@ class ForwardModel:
                 in rad; imaginary parts attenuate.
         """
         part = copy.copy(self)
-        part.groups = [
-            group.bent(shapes(group.reduced.u, group.reduced.v))
-            for group in self.groups
-        ]
+        part.groups = []
+        for group in self.groups:
+            maps = shapes(group.reduced.u, group.reduced.v)
+            named = {f"residual_{k}": phase for k, phase in enumerate(maps)}
+            part.groups.append(group.with_phases(named))
         return part
 
     def images(
@@ -440,8 +438,8 @@ class ForwardModel:
                     )
                     by_bias = (wider - narrower) / (2 * _BIAS_STEP_UM)
                 slope = by_bias * group.cd_maps[CD_ERRORS[name]] * phasor
-            elif (phase_map := group.phase_map(name)) is not None:
-                slope = 1j * phase_map * pupil * phasor
+            elif name in group.phase_maps:
+                slope = 1j * group.phase_maps[name] * pupil * phasor
             elif name in GEOMETRY or name in RESPONSE_ERRORS:
                 shift = difference_step(x, name)
                 slope = 0.0
@@ -499,16 +497,12 @@ class ForwardModel:
         phase += exit_path
         phase *= k
         phase -= reduced.known
-        phase += np.tensordot(
-            [x[PLACE[name]] for name in WAVEFRONT_ERRORS], group.phase_maps, 1
+        errors = {
+            name: float(x[PLACE[name]]) for name in group.phase_maps if name in PLACE
+        }
+        return phase + sum(
+            value * group.phase_maps[name] for name, value in errors.items() if value
         )
-        uneven = x[[PLACE[name] for name in LIGHT]]
-        light = (
-            -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1)
-            if uneven.any()
-            else 0.0
-        )
-        return phase + light
 
     def _operators(
         self, x: Array, group: AngleGroup, terms: CouplingTerms | None = None

@@ -104,7 +104,6 @@ def background_planes(x: Array, setting: FrameSetting) -> Array:
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
-WAVEFRONT_ERRORS = {name: n for n, name in enumerate(names_of_kind(WavefrontError))}
 LIGHT = ("light_x", "light_y", "light_r")
 
 
@@ -123,8 +122,9 @@ def light_maps(u: Array, v: Array) -> Array:
 class AngleGroup:
     """Frames of one field angle, and the lens on nodes for it.
 
-    index: of the frames. phase_maps, cd_maps, residual: (m, q, p) on the nodes: phase by
-    wave-front parameters, diameter by CD parameters, residual phase modes.
+    index: of the frames. phase_maps: {name: (q, p) phase on the nodes for one unit of a
+    parameter, rad; imaginary parts attenuate}. cd_maps: (m, q, p) diameters by CD
+    parameters.
     shaded_parts: behind a stop the same frames in parts of equal shadow; where the stop
     is not at the pillars, one part for each depth.
     """
@@ -132,9 +132,8 @@ class AngleGroup:
     index: Array
     pillars: PillarResponse
     reduced: CompressedLens
-    phase_maps: Array
+    phase_maps: dict[str, Array]
     cd_maps: Array
-    residual: Array
     shaded_parts: tuple["AngleGroup", ...] = ()
 
     @property
@@ -146,19 +145,12 @@ class AngleGroup:
     def of(
         cls, index: Array, pillars: PillarResponse, reduced: CompressedLens
     ) -> "AngleGroup":
-        """Without a residual phase."""
-        phase_maps, cd_maps = (
-            derivative_maps(kind, reduced.u, reduced.v)
-            for kind in (WavefrontError, CDError)
-        )
-        return cls(
-            index,
-            pillars,
-            reduced,
-            phase_maps,
-            cd_maps,
-            np.empty((0, *reduced.u.shape)),
-        )
+        """With the phases of wave-front parameters and of uneven illumination."""
+        u, v = reduced.u, reduced.v
+        names = *names_of_kind(WavefrontError), *LIGHT
+        maps = *derivative_maps(WavefrontError, u, v), *(-0.5j * light_maps(u, v))
+        phases = dict(zip(names, maps, strict=True))
+        return cls(index, pillars, reduced, phases, derivative_maps(CDError, u, v))
 
     def shaded(self, lens: Lens, depth_um: Array) -> "AngleGroup":
         """The group behind the lens' stop, in parts of frames with equal shadows.
@@ -195,28 +187,12 @@ class AngleGroup:
         shaded_parts = tuple(part for part in parts if part is not None)
         return dataclasses.replace(self, index=place, shaded_parts=shaded_parts)
 
-    def bent(self, residual: Array) -> "AngleGroup":
-        """With the shapes of a residual phase; shaded parts have the same nodes."""
-        shaded_parts = tuple(
-            dataclasses.replace(g, residual=residual) for g in self.shaded_parts
-        )
-        return dataclasses.replace(self, residual=residual, shaded_parts=shaded_parts)
-
-    def phase_map(self, name: str) -> Array | None:
-        """(q, p) phase on the nodes for one unit of a wave-front parameter, rad.
-
-        Imaginary for uneven illumination; None for any other parameter.
-        """
-        if name.startswith("residual_"):
-            return np.asarray(self.residual[int(name.removeprefix("residual_"))])
-        if name in LIGHT:
-            return np.asarray(
-                -0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)]
-            )
-        return (
-            np.asarray(self.phase_maps[WAVEFRONT_ERRORS[name]])
-            if name in WAVEFRONT_ERRORS
-            else None
+    def with_phases(self, maps: dict[str, Array]) -> "AngleGroup":
+        """With further phase maps; shaded parts have the same nodes."""
+        return dataclasses.replace(
+            self,
+            phase_maps=self.phase_maps | maps,
+            shaded_parts=tuple(part.with_phases(maps) for part in self.shaded_parts),
         )
 
 
