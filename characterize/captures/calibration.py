@@ -4,6 +4,7 @@ merged; all of it reported.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -304,14 +305,14 @@ def merge_brackets(
         notes += (
             f"{len(group)} exposures merged to {len(kinds)} frames by inverse variance",
         )
-    stacks = map(np.stack, zip(*merged, strict=True))
+    value, usable, saturated, floor, scale = map(np.stack, zip(*merged, strict=True))
     common = frames.common_floor, frames.common_light
-    return ElectronFrames(*stacks, frames.gain, notes, *common), np.sort(first)
+    return ElectronFrames(
+        value, usable, saturated, floor, scale, frames.gain, notes, *common
+    ), np.sort(first)
 
 
-def _merge(
-    frames: ElectronFrames, index: Array, exposure_s: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+def _merge(frames: ElectronFrames, index: Array, exposure_s: Array) -> tuple[Any, ...]:
     """(y, x) electrons, usable, saturated, variance and scale of one merged frame.
 
     The variance of the mean, 1 / norm = floor + rate / scale, is the weighted mean of

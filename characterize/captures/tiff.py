@@ -6,6 +6,7 @@ import math
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,8 +98,7 @@ def _axis_order(file: Any) -> str | None:
     tags of ImageJ or OME. An array that tifffile wrote at once may have any order: that
     of its metadata, else None.
     """
-    metadata = file.shaped_metadata or ({},)
-    axes = str(metadata[0].get("axes", ""))
+    axes = str((file.shaped_metadata or [{}])[0].get("axes", ""))
     writer = str(file.pages.first.tags.valueof(305, ""))
     is_array = writer.startswith("tifffile") or file.is_shaped
     if file.is_imagej or file.is_ome or not is_array or axes[1:].endswith("YX"):
@@ -217,8 +217,9 @@ def _read_tags(
     time point steps through the slices anew. A spacing of ImageJ without a unit is in
     um; a unit that is no length (pixels) gives neither steps nor pixel.
     """
-    none = np.empty(0)
-    positions, slow_first = none, False
+    tags: dict[str, Any]
+    positions: Array = np.empty(0)
+    slow_first = False
     if file.is_imagej and file.imagej_metadata:
         source, tags = "ImageJ", file.imagej_metadata
         unit = str(tags.get("unit", ""))
@@ -234,7 +235,7 @@ def _read_tags(
             words = (
                 "the OME tags are no XML: what they say of stage and pixel is not read"
             )
-            return none, math.nan, (words,)
+            return positions, math.nan, (words,)
         source, tags = "OME", next(_elements(root, "Pixels"), {})
         step, pixel = (
             float(tags.get(f"PhysicalSize{axis}", math.nan))
@@ -248,7 +249,7 @@ def _read_tags(
         slow_first = order.index("Z") > order.index("T")
         positions = _plane_positions(root, "TZ" if slow_first else "ZT")
     else:
-        return none, math.nan, ()
+        return positions, math.nan, ()
     if channels > 1:
         raise CaptureError(
             f"{path}: {channels} channels in one file; save the one that is to be "
@@ -266,7 +267,7 @@ def _read_tags(
     return positions, pixel, tuple(notes)
 
 
-def _elements(root: ElementTree.Element, name: str) -> Any:
+def _elements(root: ElementTree.Element, name: str) -> Iterator[dict[str, str]]:
     """Attributes of each element of a name, of whatever namespace."""
     return (e.attrib for e in root.iter() if str(e.tag).rpartition("}")[2] == name)
 

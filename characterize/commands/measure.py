@@ -146,7 +146,7 @@ def _edge(options: Options, folder: Path) -> Outcome:
     mtf = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([mtf.frequency_per_um, mtf.modulation], 1).round(6)
     rows = [{"frequency_per_um": f, "modulation": m} for f, m in curve.tolist()]
-    values = {
+    values: dict[str, object] = {
         "mtf50_per_um": mtf.mtf50_per_um,
         "nyquist_per_um": 0.5 / pixel,
         "pixel_um": pixel,
@@ -280,12 +280,14 @@ def _pillars(
 
 def _frame_row(row: frames.FrameMetrics) -> dict[str, object]:
     """Metrics of a frame as one flat record."""
-    values = dataclasses.asdict(row)
-    spot = values.pop("spot")
-    major, minor = spot.pop("d4sigma_um")
-    x, y = spot.pop("centroid_um")
-    widths = {"d4sigma_major_um": major, "d4sigma_minor_um": minor}
-    return values | spot | widths | {"centroid_x_um": x, "centroid_y_um": y}
+    values: dict[str, object] = dataclasses.asdict(row)
+    values.pop("spot")
+    spot: dict[str, object] = dataclasses.asdict(row.spot)
+    for name, parts in (("d4sigma", ("major", "minor")), ("centroid", "xy")):
+        pair = getattr(row.spot, f"{name}_um")
+        spot |= {f"{name}_{part}_um": v for part, v in zip(parts, pair, strict=True)}
+        del spot[f"{name}_um"]
+    return values | spot
 
 
 def _write_tables(

@@ -2,7 +2,6 @@
 frequencies of the picture.
 """
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -35,19 +34,13 @@ class ImageLattice:
     @property
     def kind(self) -> str:
         """Square, hexagonal, rectangular or oblique, to 2 % and 1.5 degrees."""
-        length_a = float(np.linalg.norm(self.a))
-        length_b = float(np.linalg.norm(self.b))
-        angle = math.degrees(
-            math.acos(np.clip(float(self.a @ self.b) / length_a / length_b, -1, 1))
-        )
+        length_a, length_b = (float(np.linalg.norm(v)) for v in (self.a, self.b))
+        cosine = abs(float(self.a @ self.b)) / length_a / length_b
+        angle = math.degrees(math.acos(min(cosine, 1.0)))
         equal = abs(length_a / length_b - 1) < 0.02
         if abs(angle - 90) < 1.5:
             return "square" if equal else "rectangular"
-        return (
-            "hexagonal"
-            if equal and min(abs(angle - 60), abs(angle - 120)) < 1.5
-            else "oblique"
-        )
+        return "hexagonal" if equal and abs(angle - 60) < 1.5 else "oblique"
 
     def sites(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """((n, 2) row and column, (n, 2) index j and i) of the sites whose cell lies in
@@ -56,27 +49,13 @@ class ImageLattice:
         Args:
             shape: (rows, columns) of the frame.
         """
-        corners = (
-            np.array(list(itertools.product((0, shape[0]), (0, shape[1]))))
-            - self.origin
-        )
-        index = corners @ np.linalg.inv(np.stack([self.b, self.a]))
-        low = np.floor(index.min(0)).astype(int)
-        high = np.ceil(index.max(0)).astype(int)
-        j, i = (
-            indices.ravel()
-            for indices in np.meshgrid(
-                *(
-                    np.arange(first, last + 1)
-                    for first, last in zip(low, high, strict=True)
-                ),
-                indexing="ij",
-            )
-        )
-        place = self.origin + j[:, None] * self.b + i[:, None] * self.a
+        # rows of a reduced lattice lie half a pitch apart or more
+        reach = math.ceil(2 * math.hypot(*shape[:2]) / self.pitch_px) + 1
+        index = np.indices((2 * reach + 1,) * 2).reshape(2, -1).T - reach
+        place = self.origin + index @ np.stack([self.b, self.a])
         half = 0.45 * self.pitch_px
         inside = ((place >= half) & (place <= np.array(shape[:2]) - half)).all(1)
-        return place[inside], np.stack([j, i], 1)[inside]
+        return place[inside], index[inside]
 
 
 def find_lattice(flat: Array, pitch_px: float | None = None) -> ImageLattice:
@@ -164,17 +143,15 @@ def _fourier_amplitude(windowed: Array, wave: Array) -> complex:
 def _refined(windowed: Array, wave: Array) -> Array:
     """(2,) frequency of the largest Fourier amplitude close to ``wave``."""
     step = 0.3 / max(windowed.shape)
-    simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
-    options = {
-        "initial_simplex": simplex,
-        "xatol": 1e-3,
-        "fatol": np.inf,
-    }  # whatever the unit of the picture
     solution = optimize.minimize(
         lambda offset: -abs(_fourier_amplitude(windowed, wave + offset * step)),
-        simplex[0],
+        np.zeros(2),
         method="Nelder-Mead",
-        options=options,
+        options={
+            "initial_simplex": np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]]),
+            "xatol": 1e-3,
+            "fatol": np.inf,  # whatever the unit of the picture
+        },
     )
     return np.asarray(wave + solution.x * step)
 

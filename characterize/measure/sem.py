@@ -432,11 +432,9 @@ def scale_from_bar(image: Array, bar_nm: float) -> float:
         CaptureError: no bar of at least 20 pixels.
     """
     strip = np.asarray(image)[-max(len(image) // 4, 1) :]
-    bright = strip >= strip.max()
-    longest = 0
-    for line in bright:
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-        longest = max(longest, int((edges[1::2] - edges[::2]).max(initial=0)))
+    along_rows = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
+    runs = ndimage.label(strip >= strip.max(), along_rows)[0]
+    longest = int(np.bincount(runs.ravel())[1:].max())
     if longest < 20:
         raise CaptureError(
             f"no scale bar: longest bright run is {longest} pixels; "

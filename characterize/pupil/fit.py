@@ -6,6 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -237,11 +238,11 @@ def crop_to_bead(
     corner = np.clip(np.subtract(center, half), 0, np.subtract(shape[1:], window))
     top, left = corner.tolist()
     inner = (slice(None), slice(top, top + window), slice(left, left + window))
-    parts = (
-        np.broadcast_to(getattr(frames, name), shape)[inner]
+    parts: dict[str, Any] = {
+        name: np.broadcast_to(getattr(frames, name), shape)[inner]
         for name in ("electrons", "usable", "saturated", "variance_e2", "scale")
-    )
-    data = FitImages(*parts, spec.model_error)
+    }
+    data = FitImages(**parts, model_error=spec.model_error)
     return data, (center[0] - half - top, center[1] - half - left)
 
 
