@@ -136,11 +136,8 @@ def read_stage(folder: Path) -> StageRows | None:
             columns, a value that is no number, a page that is not whole; file and row
             are named. A table in another format (``stage.xlsx``).
     """
-    if path := naming.find_table(folder, "stage"):
-        return _parse_rows(
-            _read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path
-        )
-    return None
+    path = naming.find_table(folder, "stage")
+    return _parse_rows(_read_table(path), path) if path else None
 
 
 def read_about(folder: Path) -> dict[str, Any]:
@@ -217,40 +214,35 @@ def _check_entries(description: dict[str, Any], path: Path) -> dict[str, Any]:
         if name not in _NUMBERS:
             continue
         requirement, is_valid = _NUMBERS[name]
-        number = (
-            isinstance(value, int | float)
-            and not isinstance(value, bool)
-            and math.isfinite(value)
-        )
-        if not number or not is_valid(value):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (is_number and math.isfinite(value) and is_valid(value)):
             raise CaptureError(
                 f"{path}: {name} = {value!r}, need a number {requirement}"
             )
-    return description | (
-        {"bits": int(description["bits"])} if "bits" in description else {}
-    )
+    if "bits" in description:
+        description["bits"] = int(description["bits"])
+    return description
 
 
-def _read_csv(path: Path) -> list[dict[str, Any]]:
+def _read_table(path: Path) -> list[dict[str, Any]]:
+    """Records of a CSV table, or of a JSON list of objects, one a frame."""
     try:
-        lines = reading.read_text(path).splitlines(keepends=True)
-        table: list[dict[str, Any]] = list(csv.DictReader(lines, skipinitialspace=True))
-    except (csv.Error, UnicodeDecodeError) as error:
+        text = reading.read_text(path)
+        if path.suffix.lower() != ".csv":
+            table = json.loads(text)
+        else:
+            lines = text.splitlines(keepends=True)
+            table = list(csv.DictReader(lines, skipinitialspace=True))
+    except (csv.Error, ValueError, RecursionError) as error:
         raise CaptureError(
-            f"{path}: not a table in UTF-8 or UTF-16 text: {error}"
+            f"{path}: not {path.suffix[1:].upper()} in UTF-8 or UTF-16 text: {error}"
         ) from None
-    while table and not any(table[-1].values()):  # as spreadsheets leave below theirs
-        table.pop()
-    return table
-
-
-def _read_json(path: Path) -> list[dict[str, Any]]:
-    try:
-        table = json.loads(reading.read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(table, list) or not all(isinstance(row, dict) for row in table):
         raise CaptureError(f"{path}: need a list of objects, one a frame")
+    while table and not any(table[-1].values()):  # as spreadsheets leave below theirs
+        table.pop()
+    if not table:
+        raise CaptureError(f"{path}: no rows; need one a frame")
     return table
 
 
@@ -261,65 +253,36 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
         table: one record a row, by column names.
         path: the stage file, for messages.
     """
-    if not table:
-        raise CaptureError(f"{path}: no rows; need one a frame")
-    separator = next(
-        (mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None
-    )
-    if separator:
-        raise CaptureError(
-            f"{path}: columns parted by {separator!r}; save it with commas, and points "
-            "in the numbers"
-        )
-    table = [
-        _normalized_keys(entries, path, row) for row, entries in enumerate(table, 2)
-    ]
-    for row, entries in enumerate(table, 2):
-        for key in entries:
-            if key in _BARE:
-                units = (
-                    "_s (or _ms, _us)"
-                    if key == "exposure"
-                    else "_um (or _nm, _mm, _cm, _m)"
-                )
-                raise CaptureError(
-                    f"{path}: column {key!r} without a unit; name it {key}{units}"
-                )
-            if key == _PLANNED:
-                raise CaptureError(
-                    f"{path}: {_PLANNED} is what a plan asks for, no time; write the "
-                    "exposure that each frame had as exposure_s (or _ms, _us)"
-                )
-            if key not in _COLUMNS:
-                raise CaptureError(
-                    f"{path}, row {row}: unknown column "
-                    f"{key!r}{nearest_name_hint(str(key), _COLUMNS)}"
-                )
-        if not entries.get("file"):
+    for mark in ";\t|":
+        if mark in next(iter(table[0]), ""):
             raise CaptureError(
-                f"{path}, row {row}: no 'file'; name the image of every row"
+                f"{path}: columns parted by {mark!r}; save it with commas, and points "
+                "in the numbers"
             )
-    columns: dict[str, list[str]] = {}
+    table = [_checked_row(entries, path, row) for row, entries in enumerate(table, 2)]
+    columns: dict[str, str] = {}
     for key in table[0]:
-        columns.setdefault(_COLUMNS[key][0], []).append(key)
-    for keys in columns.values():
-        if len(keys) > 1:
+        other = columns.setdefault(_COLUMNS[key][0], key)
+        if other != key:
             raise CaptureError(
-                f"{path}: columns {' and '.join(keys)} say the same; leave the one "
-                "that holds"
+                f"{path}: columns {other} and {key} say the same; leave the one that "
+                "holds"
             )
 
     def values_of(quantity: str, default: float) -> Array:
         """(n,) values of a quantity in um, rad or s."""
         if quantity not in columns:
             return np.full(len(table), default)
-        (key,) = columns[quantity]
-        return _column(table, key, path) * _COLUMNS[key][1]
+        key = columns[quantity]
+        numbers = [
+            _number(entries.get(key), key, f"{path}, row {row}: {key} is")
+            for row, entries in enumerate(table, 2)
+        ]
+        return np.array(numbers) * _COLUMNS[key][1]
 
-    pages = values_of("page", np.nan)
     return StageRows(
         tuple(str(entries["file"]) for entries in table),
-        tuple(int(page) if page == page else None for page in pages),
+        tuple(None if page < 0 else int(page) for page in values_of("page", -1.0)),
         values_of("position", np.nan),
         np.stack([values_of("angle", 0.0), values_of("angle along y", 0.0)], 1),
         values_of("exposure", np.nan),
@@ -327,7 +290,7 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
     )
 
 
-def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
+def _checked_row(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
     """A row with column names in small letters, without blanks, micro signs as u."""
     if None in entries:
         raise CaptureError(
@@ -344,7 +307,43 @@ def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str,
             f"{path}: columns {', '.join(entries)} are not all different; leave the "
             "ones that hold"
         )
+    for key in plain:
+        if key in _BARE:
+            units = "s (or _ms, _us)" if key == "exposure" else "um (or _nm, _mm, _m)"
+            raise CaptureError(
+                f"{path}: column {key!r} without a unit; name it {key}_{units}"
+            )
+        if key == _PLANNED:
+            raise CaptureError(
+                f"{path}: {_PLANNED} is what a plan asks for, no time; write the "
+                "exposure that each frame had as exposure_s (or _ms, _us)"
+            )
+        if key not in _COLUMNS:
+            raise CaptureError(
+                f"{path}, row {row}: unknown column "
+                f"{key!r}{nearest_name_hint(str(key), _COLUMNS)}"
+            )
+    if not plain.get("file"):
+        raise CaptureError(f"{path}, row {row}: no 'file'; name the image of every row")
     return plain
+
+
+def _number(text: Any, key: str, where: str) -> float:
+    """Finite number of a cell; pages are whole, exposures above 0."""
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        hint = " with a point, as 0.73" if "," in str(text) else ""
+        raise CaptureError(f"{where} {text!r}, need a number{hint}") from None
+    if not math.isfinite(value):
+        raise CaptureError(f"{where} {value}, need a finite number")
+    if key == "page" and (value != round(value) or value < 0):
+        raise CaptureError(f"{where} {value:g}, need a whole number from 0 on")
+    if key.startswith("exposure") and value <= 0:
+        raise CaptureError(
+            f"{where} {value:g}, need above 0; leave the column out if unknown"
+        )
+    return value
 
 
 def unlisted_images_text(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
@@ -400,27 +399,3 @@ def normalize_spelling(name: str) -> str:
     dots.
     """
     return unicodedata.normalize("NFC", name)
-
-
-def _column(table: list[dict[str, Any]], key: str, path: Path) -> Array:
-    """(n,) finite numbers of a column; pages are whole, exposures above 0."""
-    values = []
-    for row, entries in enumerate(table, 2):
-        text = entries.get(key)
-        where = f"{path}, row {row}: {key} is"
-        try:
-            value = float(text)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
-            has_comma = isinstance(text, str) and "," in text
-            hint = " with a point, as 0.73" if has_comma else ""
-            raise CaptureError(f"{where} {text!r}, need a number{hint}") from None
-        if not math.isfinite(value):
-            raise CaptureError(f"{where} {value}, need a finite number")
-        if key == "page" and value != round(value):
-            raise CaptureError(f"{where} {value:g}, need a whole number from 0 on")
-        if key.startswith("exposure") and value <= 0:
-            raise CaptureError(
-                f"{where} {value:g}, need above 0; leave the column out if unknown"
-            )
-        values.append(value)
-    return np.array(values)
