@@ -4,67 +4,31 @@ design that is known.
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from characterize.measure import overlay, sem
 from metalens.cell import Lattice
 from metalens.core.errors import CaptureError
 from metalens.lens import DiameterMap
+from tests.characterize.micrographs import draw_pillars
 
 PIXEL, PITCH = 3.7, 310.0  # nm
 
 
-def picture(place_px, diameter_nm, shape, *, top=0.35, rim=1.0, gap=0.2, seed=0):
-    """Discs with a bright rim of 5 px and a top of its own, three samples a pixel side,
-    blur and noise.
-    """
-    over, reach = 3, 120
-    fine = np.full((shape[0] * over + 2 * reach, shape[1] * over + 2 * reach), gap)
-    for (row, column), size in zip(place_px, diameter_nm, strict=True):
-        middle = [int(round((p + 0.5) * over)) + reach for p in (row, column)]
-        if (
-            min(middle) < reach
-            or middle[0] > fine.shape[0] - reach
-            or middle[1] > fine.shape[1] - reach
-        ):
-            continue
-        part = fine[
-            middle[0] - reach : middle[0] + reach, middle[1] - reach : middle[1] + reach
-        ]
-        y, x = (
-            (np.arange(-reach, reach) + m - reach + 0.5) / over - 0.5 for m in middle
-        )
-        r = np.hypot(x[None] - column, y[:, None] - row) - size / 2 / PIXEL
-        part[...] = np.where(r < 0, np.where(r > -5, rim, top), part)
-    image = (
-        fine[reach:-reach, reach:-reach]
-        .reshape(shape[0], over, shape[1], over)
-        .mean((1, 3))
-    )
-    noise = 0.04 * np.random.default_rng(seed).standard_normal(shape)
-    return 3000 * (ndimage.gaussian_filter(image, 1.2) + noise) + 500
+def picture(place_px, diameter_nm, shape, *, top=0.35):
+    """Discs with a bright rim of 5 px and a top of its own."""
+    rng = np.random.default_rng(0)
+    look = {"top": top, "rim": 1.0, "rim_px": 5.0, "blur": 1.2, "noise": 0.04}
+    sizes = np.asarray(diameter_nm) / PIXEL
+    return 3000 * draw_pillars(shape, place_px, sizes, rng=rng, **look) + 500
 
 
 def lattice(turn_deg, angle_deg, ratio, shape, jitter=0.0, seed=0):
     """Places of all sites in the picture for a lattice turned by ``turn_deg``, its
     vectors ``angle_deg`` apart.
     """
-    a = (
-        PITCH
-        / PIXEL
-        * np.array([np.sin(np.radians(turn_deg)), np.cos(np.radians(turn_deg))])
-    )
-    b = (
-        ratio
-        * PITCH
-        / PIXEL
-        * np.array(
-            [
-                np.sin(np.radians(turn_deg + angle_deg)),
-                np.cos(np.radians(turn_deg + angle_deg)),
-            ]
-        )
-    )
+    turns = np.radians([turn_deg, turn_deg + angle_deg])
+    vectors = PITCH / PIXEL * np.stack([np.sin(turns), np.cos(turns)], 1)
+    a, b = vectors * [[1.0], [ratio]]
     index = np.mgrid[-12:13, -12:13].reshape(2, -1).T
     place = np.array([11.3, 17.9]) + index[:, :1] * a + index[:, 1:] * b
     keep = ((place > -60) & (place < np.array(shape) + 60)).all(1)
