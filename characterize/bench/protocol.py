@@ -264,7 +264,7 @@ def _unstated_shifts(
     )
     sizes = unfitted_sizes(known, lens)
     return unmodelled_effects.expected_shifts(
-        SearchTask(model, data, x, known, None, free, sizes)
+        SearchTask(model, data, x, known, free, sizes)
     )
 
 

@@ -52,6 +52,7 @@ from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
 _ROUGH = 0.1  # relative error of the slopes of pillars above which it is said
+_DECISIVE = 5.0  # significance of findings in residuals that cost the trust
 # score tests, shifts by unstated effects, and stated values that the frames contradict
 ResidualAnalysis = tuple[list[ScoreTest], UnmodelledShifts, list[ResidualFinding]]
 
@@ -131,11 +132,10 @@ def _fit(
         model, data, start, scan_um=scan_um, reach_um=reach_um
     )
     task = SearchTask(
-        model.about(multistart.window_um(arrangement, model)),
+        model.about(arrangement.middle_um),
         data.arranged(lambda part: orient_frames(part, arrangement.orientation)),
         start,
         known,
-        arrangement,
         options.free,
         sizes,
     )
@@ -149,7 +149,7 @@ def _fit(
             "slopes of the pillars by height and index are known to "
             f"{model.response.error:.0%} only"
         )
-    task, ends = multistart.search_modes(task)
+    task, ends = multistart.search_modes(task, arrangement)
     task, ends = multistart.place_windows(task, ends)
     task, ends, analysis = _with_likely_causes(task, ends, frames.gain, cautions)
     _refuse(_problems(task, ends[0], frames.gain), options, analysis[0])
@@ -312,7 +312,7 @@ def _result(
         problems=(
             *_problems(task, solution, gain),
             *verdict.held_back(names, solution, task.prior),
-            *unmodelled_effects.decisive_findings(findings),
+            *(finding.words for finding in findings if finding.sigma > _DECISIVE),
         ),
         low=low,
         high=high,

@@ -23,8 +23,10 @@ from characterize.model import PLACE, ForwardModel, FrameSetting
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitRefused
+from metalens.fabrication import wavelength_scale
 
 _EVERY = range(8)  # orientation
+_ASIDE_UM = 50.0  # largest offset of a window
 # likeness by which a lens at another distance must be better
 _CLEARER = 0.05
 # likeness within which orientations cannot be distinguished: ten times what errors of
@@ -43,8 +45,8 @@ _DISTANCES = 17
 class FrameArrangement:
     """What the nominal lens says about the frames.
 
-    stage_zero_um, distance_um: best of the scan; shift_px: (y, x) mean displacement of
-    the light.
+    stage_zero_um, distance_um: best of the scan; middle_um: (x, y) of the
+    window's middle from the chief ray, by the light in the frames.
     likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage
     zero.
     order: (n,) frame that fits the i-th stated depth best, where it clearly differs
@@ -57,7 +59,7 @@ class FrameArrangement:
 
     stage_zero_um: float
     distance_um: float
-    shift_px: tuple[float, float]
+    middle_um: tuple[float, float]
     likeness: float
     order: Array | None
     order_seen: bool
@@ -236,11 +238,15 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     }
     pairs = zip(orient_frames(light, chosen), expected, noise.tolist(), strict=True)
     shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
-    y, x_px = np.median(shifts, axis=0).tolist()
+    most = _ASIDE_UM * wavelength_scale(frames.model.lens.wavelength_um)
+    y_um, x_um = -np.median(shifts, axis=0) * frames.model.setting.pixel_um
     return FrameArrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
-        shift_px=(y, x_px),
+        middle_um=(
+            float(np.clip(x_um, -most, most)),
+            float(np.clip(y_um, -most, most)),
+        ),
         likeness=likeness,
         order=order,
         order_seen=order_seen,

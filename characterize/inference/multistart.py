@@ -30,13 +30,11 @@ from characterize.model import (
 )
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.fabrication import wavelength_scale
 from metalens.lens import Lens
 
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another mode is reported
 _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-_ASIDE_UM = 50.0  # largest offset of a window
 _MOST, _AGAIN = 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
 _PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of the prior
@@ -47,10 +45,9 @@ _WORTH = 10.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SearchTask:
-    """What is searched: the model and its data, all start values, what is known, how
-    the frames lie, what is free.
+    """What is searched: the model and its data, all start values, what is known, what is
+    free.
 
-    arrangement: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes
     (``characterize.model.UNFITTED``).
     """
@@ -59,7 +56,6 @@ class SearchTask:
     data: FitImages
     start: Array
     known: dict[str, KnownValue]
-    arrangement: FrameArrangement | None
     free: tuple[str, ...] = ()
     unfitted: dict[str, float] = field(default_factory=dict)
 
@@ -103,16 +99,23 @@ def named_images(
     return images
 
 
-def search_modes(task: SearchTask) -> tuple[SearchTask, list[FitSolution]]:
+def search_modes(
+    task: SearchTask, arrangement: FrameArrangement
+) -> tuple[SearchTask, list[FitSolution]]:
     """Modes of the posterior, best first, within ``MODES_WITHIN`` of the best.
 
     A short fit to a few frames from the nominal lens places the windows; it is
     continued on all frames, and :func:`find_other_modes` starts from its end.
 
+    Args:
+        task: model, frames and priors of the search.
+        arrangement: how the frames lie.
+
     Returns:
         (the task with its windows fixed at the light, modes).
     """
-    first = _short(task, few_frames(task.model.setting), starting_point(task))
+    few = few_frames(task.model.setting)
+    first = short_fit(task, few, starting_point(task, arrangement))
     task = hold_windows(task, first.value)
     return task, find_other_modes(task, [refine_fit(task, first.value)])
 
@@ -124,7 +127,7 @@ def find_other_modes(task: SearchTask, ends: list[FitSolution]) -> list[FitSolut
     bias (:func:`starts_along_bias`).
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         ends: fits of the modes so far, best first.
     """
     for _ in range(_AGAIN):
@@ -141,7 +144,7 @@ def starts_along_bias(task: SearchTask, best: FitSolution) -> list[Array]:
     none where the bias is fixed.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         best: the best fit so far.
     """
     if "bias_nm" not in task.names:
@@ -163,13 +166,13 @@ def follow_starts(
     At most ``_MOST``, none equal to one of ``ends`` or to another.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         ends: the fits so far, best first.
         begins: (p,) starts.
     """
     problem, trials = task.posed(), list[FitSolution]()
     for begin in begins:
-        if all(_sigma_distance(begin, end) > 2.0 for end in ends):
+        if all(sigma_distance(begin, end) > 2.0 for end in ends):
             with contextlib.suppress(FitError):  # starts outside the model's range
                 trials.append(problem.fit(begin, _TRIAL, ends[0].slopes))
     modes = list(ends)
@@ -177,7 +180,7 @@ def follow_starts(
         if (
             len(modes) < len(ends) + _MOST
             and trial.merit < ends[0].merit + MODES_WITHIN + _WORTH
-            and all(_sigma_distance(trial.value, mode) > 1.0 for mode in modes)
+            and all(sigma_distance(trial.value, mode) > 1.0 for mode in modes)
         ):
             modes.append(refine_fit(task, trial.value, trial.slopes))
     return modes[len(ends) :]
@@ -193,7 +196,7 @@ def mirrored_starts(task: SearchTask, best: FitSolution) -> list[Array]:
     conditional mean.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         best: fit that is reversed.
     """
     value, covariance = best.value, best.covariance
@@ -257,11 +260,11 @@ def widen_search(task: SearchTask, begin: Array) -> list[FitSolution]:
     out of the model's range.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         begin: (parameters,) start of the search.
     """
     try:
-        best = refine_fit(task, _opened(task, begin))
+        best = refine_fit(task, opened_start(task, begin))
         return find_other_modes(task, [best])
     except FitError:
         return []
@@ -277,7 +280,7 @@ def widen_priors(
     (type-II maximum likelihood), so that it hardly pulls.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         ends: the modes, best first.
         names: of the parameters whose priors are in doubt.
     """
@@ -302,11 +305,11 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
     infinite where they lead out of the model's range.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         frees: names of the parameters that are fitted too.
     """
     more = dataclasses.replace(task, free=(*task.free, *frees))
-    begin = _opened(more, task.all_of(best.value))
+    begin = opened_start(more, task.all_of(best.value))
     settings = SolverSettings(iterations=12, step_tolerance=0.3, near=1.0, finish=False)
     try:
         return more.posed().fit(begin, settings).merit
@@ -323,22 +326,30 @@ def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
     modes: list[FitSolution] = []
     for end in sorted(ends, key=lambda e: e.merit):
         likely = end.merit < modes[0].merit + MODES_WITHIN if modes else True
-        if likely and all(_sigma_distance(end.value, mode) > 1.0 for mode in modes):
+        if likely and all(sigma_distance(end.value, mode) > 1.0 for mode in modes):
             modes.append(end)
     return modes
 
 
-def _sigma_distance(value: Array, end: FitSolution) -> float:
-    """Distance in sigma of the end's own parabola."""
+def sigma_distance(value: Array, end: FitSolution) -> float:
+    """Distance of a place from the end of a fit, in sigma of its own parabola.
+
+    Args:
+        value: (p,) the place.
+        end: of the fit.
+    """
     step = value - end.value
     square = step @ leastsquares.invert_information(end.covariance) @ step
     return float(math.sqrt(max(square, 0.0)))
 
 
-def _short(task: SearchTask, few: Array, begin: Array) -> FitSolution:
-    """Short fit on few frames from all parameters ``begin``.
+def short_fit(task: SearchTask, few: Array, begin: Array) -> FitSolution:
+    """Short fit on few frames; its prior keeps wave-front errors near 0.
 
-    The prior keeps wave-front errors near 0.
+    Args:
+        task: model, frames and priors of the search.
+        few: indices of the frames.
+        begin: all parameters.
     """
     problem = task.posed(few)
     waves = np.array([name.endswith("_rad") for name in task.names])
@@ -349,7 +360,9 @@ def _short(task: SearchTask, few: Array, begin: Array) -> FitSolution:
     short = SolverSettings(
         iterations=4, step_tolerance=1.0, near=math.inf, finish=False
     )
-    return dataclasses.replace(problem, prior=prior).fit(_opened(task, begin), short)
+    return dataclasses.replace(problem, prior=prior).fit(
+        opened_start(task, begin), short
+    )
 
 
 def refine_fit(
@@ -358,15 +371,20 @@ def refine_fit(
     """A fit to the end.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         value: (p,) where the fit begins.
         slopes: (p, n, y, x) Jacobian of a place close by.
     """
     return task.posed().fit(value, SolverSettings(iterations=80), slopes)
 
 
-def _opened(task: SearchTask, x: Array) -> Array:
-    """(p,) fitted ones of all parameters; sizes that have no slope at 0 start off it."""
+def opened_start(task: SearchTask, x: Array) -> Array:
+    """(p,) fitted ones of all parameters; sizes that have no slope at 0 start off it.
+
+    Args:
+        task: with the names of the fitted ones.
+        x: all parameters.
+    """
     off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5, "glass_um": 50.0}
     return np.array([x[PLACE[name]] or off.get(name, 0.0) for name in task.names])
 
@@ -426,43 +444,24 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def window_um(
-    arrangement: FrameArrangement, model: ForwardModel
-) -> tuple[float, float]:
-    """(x, y) of the window's middle from the chief ray, um, by the light in the frames.
-
-    Args:
-        arrangement: how the frames lie.
-        model: the forward model.
-    """
-    most = _ASIDE_UM * wavelength_scale(model.lens.wavelength_um)
-    x, y = (
-        float(np.clip(-shift * model.setting.pixel_um, -most, most))
-        for shift in arrangement.shift_px[::-1]
-    )
-    return x, y
-
-
-def starting_point(task: SearchTask) -> Array:
+def starting_point(task: SearchTask, arrangement: FrameArrangement) -> Array:
     """All parameters of the nominal lens, placed by the frames.
 
     Stage zero, distance, decentre, background and gain are estimated from the frames.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
+        arrangement: how the frames lie.
     """
-    model, data, arrangement = task.model, task.data, task.arrangement
-    if arrangement is None:
-        raise FitError("a search begins where the frames lie; arrange them first")
-    place = window_um(arrangement, model)
+    model, data = task.model, task.data
     glow = model.setting.glow
     level = float(np.median((data.electrons / glow)[data.usable]))
     values = {
         "stage_zero_um": arrangement.stage_zero_um,
         "distance_um": arrangement.distance_um,
         "background_e": level,
-        "decentre_x_um": place[0],
-        "decentre_y_um": place[1],
+        "decentre_x_um": arrangement.middle_um[0],
+        "decentre_y_um": arrangement.middle_um[1],
     }
     x = with_values(task.start, values)
     light = model.images(with_values(x, {"background_e": 0.0}))[0]

@@ -78,15 +78,6 @@ class ResidualFinding:
     sigma: float
 
 
-def decisive_findings(findings: Sequence[ResidualFinding]) -> list[str]:
-    """Findings beyond 5 sigma, in words: no fit with one passes its checks.
-
-    Args:
-        findings: what residuals hold.
-    """
-    return [finding.words for finding in findings if finding.sigma > 5]
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class ScoreTest:
     """Score test of one effect: chi-square by which the residuals lean along it, degrees
@@ -259,7 +250,7 @@ def run_score_tests(
     Where chi-square exceeds 1, noise is scaled by its root.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         mode: the fit it is judged at.
     """
     x = task.all_of(mode.value)
@@ -379,7 +370,7 @@ def systematic_effects(
     """Changes of the images by every systematic effect that is not fitted.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         x: all parameters, in the order of ``PARAMETERS``.
         slopes: derivatives of the images by the fitted parameters.
     """

@@ -256,7 +256,7 @@ def psf_verdict(task: SearchTask, posterior: FitPosterior) -> str:
     and angles, √(tr(C JJᵀ) / |I|²), without background and at the brightness of the best.
 
     Args:
-        task: model, frames, priors and arrangement of the search.
+        task: model, frames and priors of the search.
         posterior: the posterior, with its covariance C.
     """
     best = posterior.best

@@ -160,11 +160,6 @@ class SmoothKernel:
         return np.asarray(size * (1 / r - 1j * self.k) * np.exp(1j * phase))
 
 
-def map_to_span(span: tuple[float, float], t: Array) -> Array:
-    """Places ``t`` on [-1, 1], mapped to a span."""
-    return np.asarray((span[0] + span[1]) / 2 + (span[1] - span[0]) / 2 * t)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class CouplingTerms:
     """Low-rank remainder of the kernel for a cell of distances, on the samples of a window.
@@ -610,7 +605,7 @@ class CompressedLens:
         wx).
         """
         probes = np.array([-1.0, 0.0, 1.0])
-        p, q = (map_to_span(span, probes) for span in (kernel.p, kernel.q))
+        p, q = (np.linspace(*span, 3) for span in (kernel.p, kernel.q))
         across = {"p": p, "q": q, "X": wx * probes, "Y": wy * probes}
 
         def count(name: str, span: tuple[float, float]) -> int:
@@ -620,8 +615,8 @@ class CompressedLens:
                 n: g.reshape(-1, 1) for n, g in zip(others, grid, strict=True)
             }
 
-            t = legendre.gauss_legendre_nodes(_TRIAL)[0]
-            values = kernel.remainder(**at, **{name: map_to_span(span, t)})
+            at[name] = legendre.mapped_nodes(_TRIAL, *span)
+            values = kernel.remainder(**at)
             needed = legendre.needed_node_count(values, self.tolerance / 10)
             if needed > _TRIAL:
                 raise FitError(

@@ -2,7 +2,6 @@
 pixel area, gain, background.
 """
 
-import functools
 import math
 from dataclasses import dataclass
 
@@ -56,11 +55,13 @@ class DetectorGrid:
     def axes_um(self) -> tuple[Array, Array]:
         """(y, x) of the fine samples from the chief ray, um.
 
-        ``middle_um`` is at pixel ((rows - 1) / 2, (columns - 1) / 2).
+        One lies at the middle of each pixel; ``middle_um`` is at pixel
+        ((rows - 1) / 2, (columns - 1) / 2).
         """
         x, y = self.middle_um
+        off = (self.oversample - 1) // 2 - (self.oversample - 1) / 2
         rows, columns = (
-            (np.arange(n) - (n - 1) / 2) * self.fine_um for n in self.fine_shape
+            (np.arange(n) - (n - 1) / 2 + off) * self.fine_um for n in self.fine_shape
         )
         return rows + y, columns + x
 
@@ -89,8 +90,7 @@ class DetectorGrid:
             intensity: (..., y, x) on the fine grid.
             transfer: of the blur, (..., fy, fx).
         """
-        shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
-        blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
+        blurred = fft.irfft2(fft.rfft2(intensity) * transfer, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (
             slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns)
@@ -116,16 +116,6 @@ def detector_transfer(
         return shared[None]
     discs = np.stack([disc_transfer(fy, fx, size) for size in sizes_um])
     return np.asarray(shared * discs)
-
-
-@functools.lru_cache(maxsize=4)
-def _half_step(grid: DetectorGrid) -> Array:
-    """Transfer function of a shift by half a fine sample.
-
-    For even oversampling, where no sample lies at a pixel's centre.
-    """
-    fy, fx = grid.frequencies()
-    return np.asarray(np.exp(-1j * np.pi * (fy + fx) * grid.fine_um))
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:

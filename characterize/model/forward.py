@@ -313,15 +313,13 @@ class ForwardModel:
             slopes[list(names).index("pixel_percent")] /= ratio
         return frames, slopes
 
-    def _pitch_slope(self, x: Array, step_percent: float = 0.3) -> Array:
+    def _pitch_slope(self, x: Array) -> Array:
         """(n, rows, columns) derivative by the pixel pitch per percent: central
-        difference.
+        difference over 0.3 percent.
         """
-        up, down = (
-            self.with_pixel_pitch(1 + sign * step_percent / 100).images(x)[0]
-            for sign in (1, -1)
-        )
-        return np.asarray((up - down) / (2 * step_percent))
+        step = 0.3 * (np.arange(len(x)) == _PITCH)
+        up, down = (self.images(at)[0] for at in (x + step, x - step))
+        return np.asarray((up - down) / (2 * step.sum()))
 
     def _light(
         self,

@@ -14,7 +14,6 @@ from metalens.core.errors import FitError
 from metalens.optics import Layers, media
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
-_TOGETHER = 20_000  # numbers of an array that stays in the cache
 Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
@@ -169,33 +168,21 @@ def source_paths(
     Raises:
         FitError: the plate does not fit between source and lens.
     """
-    lateral = [values[PLACE[f"source_{a}_um"]] for a in "xy"]
-    out = np.empty((len(depth_um), *x_um.shape))
-    count = max(1, _TOGETHER // x_um.size)
-    for first in range(0, len(depth_um), count):
-        z = depth_um[first : first + count].reshape(-1, *(1,) * x_um.ndim)
-        apparent_um = films.apparent_um(z)
-        chief = (
-            tangents[0] - lateral[0] / apparent_um,
-            tangents[1] - lateral[1] / apparent_um,
-        )
-        out[first : first + count] = media.source_path(
-            films.front, x_um, y_um, chief, 1 / z
-        )
+    z = depth_um.reshape(-1, *(1,) * x_um.ndim)
+    apparent_um = films.apparent_um(z)
+    chief = (
+        tangents[0] - values[PLACE["source_x_um"]] / apparent_um,
+        tangents[1] - values[PLACE["source_y_um"]] / apparent_um,
+    )
+    path_um = media.source_path(films.front, x_um, y_um, chief, 1 / z)
     if values[PLACE["glass_um"]] != 0:
-        for path, z in zip(out, films.apparent_um(depth_um).tolist(), strict=True):
-            chief = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
-            path += extra_path(x_um, y_um, tangents=chief, depth_um=z, values=values)
-    return out
+        at = {"tangents": chief, "depth_um": apparent_um, "values": values}
+        path_um = path_um + extra_path(x_um, y_um, **at)
+    return np.asarray(path_um)
 
 
 def extra_path(
-    x_um: Array,
-    y_um: Array,
-    *,
-    tangents: tuple[float, float],
-    depth_um: float,
-    values: Array,
+    x_um: Array, y_um: Array, *, tangents: tuple[Any, Any], depth_um: Any, values: Array
 ) -> Array:
     """(*shape) path added by the plate of glass for (x, y) on the lens, um.
 

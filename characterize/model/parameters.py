@@ -7,6 +7,7 @@ here.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -340,6 +341,7 @@ _IN_PIXELS = (
     "decentre_x_um",
     "decentre_y_um",
 )  # which are as wide as the blur, and that as the wave is long
+_SIZES = "scale", "sigma", "low", "high", "plausible"  # that grow with the wavelength
 _UNFITTED = tuple(row.name for row in UNFITTED)
 _CAUSES = [PLACE[row.name] for row in PERTURBATIONS]
 
@@ -386,24 +388,18 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
     Args:
         names: of the parameters.
     """
-    wave = lens.wavelength_um
-    factors = [
-        wavelength_scale(wave) if name in _IN_PIXELS else prior_scale(name, wave)
-        for name in names
-    ]
-    rows = [
-        _times(PARAMETERS[PLACE[name]], factor)
-        for name, factor in zip(names, factors, strict=True)
-    ]
-    reach = [
-        lens.sensor_distance_um / 4 if row.name == "distance_um" else math.inf
-        for row in rows
-    ]
-    pairs = zip(rows, reach, strict=True)
-    return [
-        dataclasses.replace(row, low=max(row.low, -most), high=min(row.high, most))
-        for row, most in pairs
-    ]
+    rows = []
+    for name in names:
+        in_pixels = name in _IN_PIXELS
+        scale = wavelength_scale if in_pixels else functools.partial(prior_scale, name)
+        row, factor = PARAMETERS[PLACE[name]], scale(lens.wavelength_um)
+        sizes = {key: factor * getattr(row, key) for key in _SIZES}
+        if name == "distance_um":
+            most = lens.sensor_distance_um / 4
+            sizes["low"] = max(sizes["low"], -most)
+            sizes["high"] = min(sizes["high"], most)
+        rows.append(dataclasses.replace(row, **sizes))
+    return rows
 
 
 def type_b_sigma(name: str, lens: Lens) -> float:
@@ -417,14 +413,6 @@ def type_b_sigma(name: str, lens: Lens) -> float:
         return usual_parameters([name], lens)[0].unstated
     row = next(row for row in UNFITTED if row.name == name)
     return row.sigma * prior_scale(name, lens.wavelength_um)
-
-
-def _times(row: FitParameter, factor: float) -> FitParameter:
-    sizes = {
-        name: factor * getattr(row, name)
-        for name in ("scale", "sigma", "low", "high", "plausible")
-    }
-    return dataclasses.replace(row, **sizes)
 
 
 def unfitted_sizes(known: dict[str, KnownValue], lens: Lens) -> dict[str, float]:

@@ -188,7 +188,7 @@ def given(
         np.full(frames.shape, noise**2),
         np.full(frames.shape, 1e15),
     )
-    return Given(model, data, np.zeros(len(NAMES)), {}, None, names=names, prior=prior)
+    return Given(model, data, np.zeros(len(NAMES)), {}, names=names, prior=prior)
 
 
 def with_a_moved_frame(shots: Capture) -> Capture:

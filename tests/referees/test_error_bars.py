@@ -85,9 +85,7 @@ def test_the_fit_knows_how_much_its_frames_tell():
     start[PLACE["log_gain"]] = np.log(counted * (light * bare).sum() / (bare**2).sum())
     # four of its sigma
     assert frames.gain.gain_e == pytest.approx(session.gain_e, rel=0.1)
-    task = SearchTask(
-        model, data_of(frames, (slice(None), slice(None))), start, {}, None
-    )
+    task = SearchTask(model, data_of(frames, (slice(None), slice(None))), start, {})
     truth = start[[PLACE[name] for name in task.names]]
     found = task.posed().fit(truth, SolverSettings(iterations=0))
     want = seen_by_differences(
