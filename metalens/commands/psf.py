@@ -56,8 +56,11 @@ class PsfSettings:
         an angle, for sources at infinity too.
     source_shape: disc, square or gaussian.
     led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
-    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose
-        product is the spectrum (LED, filter, sensor).
+    source, filter, sensor: in place of led_fwhm_nm, curves over wavelength whose
+        product is the spectrum: spectrum of the source, transmission of a filter,
+        response of the sensor; any of the three. Each is a CSV file of wavelength (nm,
+        or um where its column says so) and value, or a name of colour-science ("D65").
+    spectrum: more such curves.
     wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add.
     weights: of each; none for equal.
     tolerance: relative L2 error of the PSFs.
@@ -87,6 +90,9 @@ class PsfSettings:
     source_deg: float = field(default=0.0, metadata={"signed": False})
     source_shape: psf.SourceShape = "disc"
     led_fwhm_nm: float = 0.0
+    source: Path | None = None
+    filter: Path | None = None
+    sensor: Path | None = None
     spectrum: tuple[Path, ...] = ()
     wavelengths_nm: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
@@ -110,7 +116,7 @@ class PsfSettings:
         fits = 2 <= self.samples <= MOST_SAMPLES and 0 < width < math.inf
         rows = self.height_um / width * self.samples if fits else 1.0
         whole = abs(rows - round(rows)) <= 1e-6 * rows
-        lights = self.spectrum, self.led_fwhm_nm, self.wavelengths_nm
+        lights = self.curves, self.led_fwhm_nm, self.wavelengths_nm
         checks = {
             "depths_mm": (
                 depths and (far - near) / step <= MOST_DEPTHS,
@@ -135,9 +141,9 @@ class PsfSettings:
                 f"window_um, and a height of a whole number of up to {MOST_SAMPLES} "
                 "samples of window_um / samples",
             ),
-            "spectrum, led_fwhm_nm, wavelengths_nm": (
+            "source, filter, sensor, spectrum, led_fwhm_nm, wavelengths_nm": (
                 sum(map(bool, lights)) <= 1,
-                "one of them, each is the whole spectrum",
+                "curves, a diode or wavelengths, each is the whole spectrum",
             ),
         }
         for names, (met, need) in checks.items():
@@ -216,11 +222,17 @@ class PsfSettings:
             (self.window_um, self.window_um / self.samples * self.samples_y),
             (self.samples, self.samples_y),
             self.offset_um,
-            self.source,
+            self.source_extent,
         )
 
     @property
-    def source(self) -> "psf.SourceExtent | None":
+    def curves(self) -> tuple[Path, ...]:
+        """Curves whose product is the spectrum."""
+        stated = self.source, self.filter, self.sensor, *self.spectrum
+        return tuple(curve for curve in stated if curve is not None)
+
+    @property
+    def source_extent(self) -> "psf.SourceExtent | None":
         """Size and shape of the source, None for a point."""
         if not (self.source_um or self.source_deg):
             return None
@@ -246,9 +258,9 @@ class PsfSettings:
             return spectra.SpectralNodes(
                 np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0
             )
-        if self.spectrum:
+        if self.curves:
             return spectra.read_measured_spectrum(
-                self.spectrum, within_um=device.proxy.wavelengths_um
+                self.curves, within_um=device.proxy.wavelengths_um
             )
         if not self.led_fwhm_nm:
             return None
@@ -334,8 +346,11 @@ class Options(CommonOptions):
         source_shape: disc, square or gaussian.
         led_fwhm_nm: width of the diode about the design wavelength, silicon's response
             included.
-        spectrum: CSV files of wavelength in nm and value, whose product is the spectrum
-            (LED, filter, sensor).
+        source: CSV file of the source's spectrum (wavelength in nm or um, value), or a
+            name of colour-science (D65).
+        filter: the same of a filter's transmission.
+        sensor: the same of the sensor's response. The spectrum is their product.
+        spectrum: more such curves.
         wavelengths_nm: wavelengths whose intensities add.
         weights: of those wavelengths; left out: equal.
         polarisation: scalar, flux, vector or auto.
@@ -367,6 +382,9 @@ class Options(CommonOptions):
     source_deg: float | None = None
     source_shape: psf.SourceShape | None = None
     led_fwhm_nm: float | None = None
+    source: Path | None = None
+    filter: Path | None = None
+    sensor: Path | None = None
     spectrum: tuple[Path, ...] | None = None
     wavelengths_nm: tuple[float, ...] | None = None
     weights: tuple[float, ...] | None = None
@@ -388,6 +406,8 @@ class Options(CommonOptions):
             value = getattr(self, name, None)
             if isinstance(value, tuple):
                 value = [str(v) if isinstance(v, Path) else v for v in value]
+            elif isinstance(value, Path):
+                value = str(value)
             if value is not None:
                 stated[name] = value
         if self.config is None:
@@ -560,7 +580,7 @@ def _of_built(path: Path, settings: PsfSettings, built: Any) -> psf.PsfStack:
     Raises:
         ConfigError: settings that are for a design.
     """
-    for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
+    for name in ("led_fwhm_nm", "curves", "wavelengths_nm", "layers", "own_cell"):
         if getattr(settings, name):
             raise ConfigError(
                 f"{path}: {name} is for a design; this {store.kind_of(path)} file has the wavelength and layers that "
@@ -646,7 +666,7 @@ def _of_design(
 
 
 def _provenance(path: Path, settings: PsfSettings) -> Provenance:
-    files = [path, *(file for file in settings.spectrum if file.is_file())]
+    files = [path, *(file for file in settings.curves if file.is_file())]
     return Provenance(
         config.dumps(settings), {file.name: store.sha256(file) for file in files}
     )

@@ -109,6 +109,7 @@ def nearest_name_hint(name: str, known: Iterable[str]) -> str:
 
 EXTRAS = {
     "torch": "optics",
+    "colour": "optics",
     "astropy": "fits",
     "cv2": "bench",
     "tifffile": "bench",

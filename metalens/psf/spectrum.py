@@ -4,15 +4,20 @@ that very weight.
 
 import functools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from metalens.core import reading
 from metalens.core.arrays import Array
-from metalens.core.errors import PropagationError
+from metalens.core.errors import PropagationError, nearest_name_hint
+
+if TYPE_CHECKING:
+    from colour import SpectralDistribution
 
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a spectrum
@@ -130,51 +135,55 @@ class MeasuredSpectrum:
 
 
 def read_measured_spectrum(
-    files: Sequence[Path], *, within_um: tuple[float, float]
+    curves: "Sequence[Path | str | SpectralDistribution]",
+    *,
+    within_um: tuple[float, float],
 ) -> MeasuredSpectrum:
-    """Normalised product of measured curves (LED, filter, sensor), where all exist.
+    """Normalised product of measured curves (source, filter, sensor), where all exist.
 
-    A file has two columns, wavelength in nm and value, separated by commas, semicolons
-    or blanks. Names of columns and lines that start with # are skipped. Where
-    semicolons, tabs or blanks separate the columns, a comma is the decimal point.
+    A file has two columns, wavelength and value, separated by commas, semicolons or
+    blanks. Wavelengths are in nm, or in um where the names of columns say so. Lines
+    that start with # are skipped. Where semicolons, tabs or blanks separate the
+    columns, a comma is the decimal point.
 
-    Values are interpolated linearly. The product is integrated by two-point Gauss rules
-    between the rows of all curves, and over 0.25 nm at most. A constant factor of each
-    curve drops out.
+    colour-science interpolates the values linearly. The product is integrated by
+    two-point Gauss rules between the rows of all curves, and over 0.25 nm at most. A
+    constant factor of each curve drops out.
 
     Args:
-        files: one for each curve.
+        curves: each a file, a name among colour-science's spectral distributions
+            (``SDS_ILLUMINANTS``, ``SDS_LIGHT_SOURCES``, ``SDS_FILTERS``, ``SDS_LENSES``,
+            ``SDS_LEFS``), or such a distribution.
         within_um: (least, largest) wavelength of the pillars' library, um; equal for a
             single wavelength, which cuts nothing off.
 
     Raises:
-        PropagationError: no file, a missing or malformed file, curves without a common
+        PropagationError: no curve, a missing or malformed file, curves without a common
             range, or light outside ``within_um`` (less than 1e-4 of the largest value
             is cut off).
     """
-    if not files:
+    if not curves:
         raise PropagationError(
-            "spectrum: no file; need one of wavelength in nm and value, or more"
+            "spectrum: no curve; need one of wavelength in nm and value, or more"
         )
-    curves = [_curve(file) for file in files]
-    low = max(c[0, 0] for c in curves)
-    high = min(c[-1, 0] for c in curves)
+    responses = [_response(curve) for curve in curves]
+    names = ", ".join(getattr(curve, "name", str(curve)) for curve in curves)
+    low = max(response.domain[0] for response in responses)
+    high = min(response.domain[-1] for response in responses)
     if low >= high:
-        raise PropagationError(
-            f"spectrum: {', '.join(map(str, files))} share no wavelength"
-        )
-    rows = np.concatenate([c[:, 0] for c in curves] + [np.arange(low, high, STEP_NM)])
+        raise PropagationError(f"spectrum: {names} share no wavelength")
+    rows = np.concatenate(
+        [r.domain for r in responses] + [np.arange(low, high, STEP_NM)]
+    )
     ends = np.unique(np.clip(rows, low, high))
     half = np.diff(ends) / 2
     middle = (ends[1:] + ends[:-1]) / 2
     # Gauss, of third degree
     nm = np.stack([middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1).ravel()
-    value = np.prod([np.interp(nm, c[:, 0], c[:, 1]) for c in curves], axis=0)
+    value = np.prod([response[nm] for response in responses], axis=0)
     share = value * np.repeat(half, 2)
     if not share.sum() > 0:
-        raise PropagationError(
-            f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere"
-        )
+        raise PropagationError(f"spectrum: the product of {names} is 0 everywhere")
     share = share / share.sum()
     um = nm * 1e-3
     bright = value > 1e-4 * value.max()
@@ -193,13 +202,53 @@ def _is_within(um: Array, within_um: tuple[float, float]) -> Array:
     return np.asarray((um >= within_um[0] - 1e-6) & (um <= within_um[1] + 1e-6))
 
 
-def _curve(file: Path) -> Array:
+def _response(curve: "Path | str | SpectralDistribution") -> "SpectralDistribution":
+    """The distribution of a file, name or distribution, interpolated linearly.
+
+    Raises:
+        PropagationError: no such file or name, or values that are not 0 or more.
+    """
+    import colour
+
+    if not isinstance(curve, colour.SpectralDistribution):
+        known = {
+            name: distribution
+            for table in (
+                colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES, colour.SDS_FILTERS,
+                colour.SDS_LENSES, colour.SDS_LEFS,
+            )
+            for name, distribution in table.items()
+        }  # fmt: skip
+        if Path(curve).is_file():
+            nm, values = _read_curve(Path(curve)).T
+            curve = colour.SpectralDistribution(values, nm, name=str(curve))
+        elif str(curve) in known:
+            curve = known[str(curve)]
+        else:
+            name = str(curve)
+            hint = "" if Path(name).suffix else nearest_name_hint(name, known)
+            raise PropagationError(
+                f"{name}: cannot be read: no such file, nor a distribution of "
+                f"colour-science{hint}"
+            )
+    if not (curve.range >= 0).all():
+        raise PropagationError(f"spectrum: {curve.name} has values below 0")
+    return colour.SpectralDistribution(
+        curve.range,
+        curve.domain,
+        name=curve.name,
+        interpolator=colour.LinearInterpolator,
+    )
+
+
+def _read_curve(file: Path) -> Array:
     """(n, [nm, value]) rows of a file, ascending in wavelength.
 
     Raises:
         PropagationError: a file that is no such table, naming the line.
     """
     rows: list[list[float]] = []
+    scale = 1.0  # nm per unit of the first column
     try:
         lines = reading.read_text(file).splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -208,10 +257,12 @@ def _curve(file: Path) -> Array:
         ) from None
     for number, line in enumerate(lines, 1):
         words = reading.split_columns(line)
+        if not rows and re.match(r"[^,;\d]*?(\b|_)([uµμ]m\b|micro)", line, re.I):
+            scale = 1e3
         if not words or words[0][0] in "#\"'":
             continue
         try:
-            nm, value = float(words[0]), float(words[1])
+            nm, value = scale * float(words[0]), float(words[1])
         except (ValueError, IndexError):
             if not rows:  # names of columns
                 continue
@@ -219,7 +270,7 @@ def _curve(file: Path) -> Array:
         if not (100 <= nm < np.inf and 0 <= value < np.inf):
             raise PropagationError(
                 f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 or more) and a value of 0 or "
-                "more: convert micrometres, and set what noise left below 0 to 0"
+                "more: name a column of micrometres wavelength_um, and set what noise left below 0 to 0"
             )
         rows.append([nm, value])
     if len(rows) < 2:

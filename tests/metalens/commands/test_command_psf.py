@@ -346,3 +346,51 @@ def test_a_source_too_wide_for_the_tolerance_is_told_with_its_own_cure(folder, c
     told = capsys.readouterr().out
     assert "is above the tolerance 1e-06: raise it or give a smaller source" in told
     assert "widen" not in told
+
+
+def test_source_filter_and_sensor_are_the_product_of_their_curves(folder, capsys):
+    # triangle from 838 to 862 nm, band from 844 to 862, ramp 850 + 2 (nm - 850): with
+    # u = (nm - 850) / 12 the weight is (1 - |u|) (850 + 24 u) for -1/2 < u < 1
+    wide = replace(
+        small_lens(), proxy=proxy_of([np.pi] * 2, [0.9, 0.0], (0.1, 0.3), (0.8, 0.9))
+    )
+    lens.save(folder / "wide.h5", wide)
+    (folder / "led.csv").write_text("wavelength (µm);p\n0,838;0\n0,85;4\n0,862;0\n")
+    (folder / "band.csv").write_text("# nm, T\n843.9999,0\n844,0.5\n870,0.5\n")
+    (folder / "qe.csv").write_text("nm\tqe\n800\t750\n900\t950\n")
+    files = {"source": "led.csv", "filter": "band.csv", "sensor": "qe.csv"}
+    keys = [word for key in files for word in (f"--{key}", folder / files[key])]
+    (folder / "s.toml").write_text(
+        "".join(f"{key} = '{folder / file}'\n" for key, file in files.items())
+    )
+    shown = ["--sources-mm", 1.3, "--angles-deg", 0, "--window-um", 16, "--samples", 24]
+    want = [
+        integrate.quad(
+            lambda u, n=n: (850 + 12 * u) ** n * (1 - abs(u)) * (850 + 24 * u),
+            -0.5,
+            1,
+            points=[0],
+        )[0]
+        for n in range(3)
+    ]
+    mean_nm = want[1] / want[0]
+    options = ["psf", folder / "wide.h5", *shown, "--tolerance", 1e-3, "--json"]
+    for form in (
+        [*keys, "-o", folder / "a.h5"],
+        ["--config", folder / "s.toml", "-o", folder / "b.h5"],
+    ):
+        assert call(*options, *form) == 0
+        stack = psf.load(form[-1])
+        nm = stack.wavelengths_um * 1e3
+        assert stack.weights @ nm == pytest.approx(mean_nm, abs=1e-3)
+        assert stack.weights @ (nm - mean_nm) ** 2 == pytest.approx(
+            want[2] / want[0] - mean_nm**2, rel=1e-3
+        )
+    refused = ["psf", folder / "lens.h5", *shown, *keys, "-o", folder / "c.h5"]
+    assert call(*refused) == 2
+    assert "pillars are known at 850 nm alone" in capsys.readouterr().err
+    assert call(*options, "--source", "LED-B1", "-o", folder / "c.h5") == 2
+    assert "known from 800 to 900 nm" in capsys.readouterr().err
+    assert call(*options, "--source", "LED-B11", "-o", folder / "c.h5") == 2
+    assert "'LED-B1'" in capsys.readouterr().err
+    assert not (folder / "c.h5").exists()
