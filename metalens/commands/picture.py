@@ -51,7 +51,7 @@ def image_picture(
 
     The picture is the radiance of the plane; each colour is imaged in the lens's light.
     Beyond its borders it goes on as at them. The image is irradiance, 1 on the axis of
-    an even plane of radiance 1 from which no light lands beyond the PSF's window.
+    an even plane of radiance 1 of which all light lands in the PSF's window.
 
     Args:
         lens_file: of the lens.
@@ -127,8 +127,8 @@ def image_picture(
     library = device.proxy.wavelengths_um
     summary = (
         f"sensor image within a relative error of {optics.error:.2g} of a texture; "
-        f"{outside:.2g} of the light lands beyond a window of {window * step_um:.3g} um "
-        f"about its image point and is left out{spectrum.outside_library_text(source, library)}"
+        f"{outside:.2g} of the light is absorbed, or lands beyond a window of {window * step_um:.3g} um "
+        f"about its image point{spectrum.outside_library_text(source, library)}"
     )
     return values, summary, optics.above(plane.tolerance)
 
