@@ -12,7 +12,6 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from metalens.core.arrays import Array
-from metalens.core.errors import ConfigError
 from metalens.design import Focus, PhaseOf, hyperbolic_phase, vortex_phase
 from metalens.design.free_form.settings import FisherSettings, ResolvedFisherSettings
 from metalens.image import (
@@ -26,7 +25,7 @@ from metalens.image import pupil as pupils
 
 RATE = 0.15  # first step of Adam, rad
 NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
-NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
+SMOOTH = 11  # iterations per iteration on the spline
 CHECKS = 20  # iterations between two evaluations of the deterministic figures
 CLIMB_IMAGES = 4  # images of a gradient step, at least two for every field angle
 DIRECTIONS = 4  # azimuths of the field from which the steps draw
@@ -120,12 +119,6 @@ class AxialObjective:
         ]
         return depths, fields, torch.rand(2, 2, generator=generator) - 0.5
 
-    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """See :class:`AxialObjective`."""
-        return score_phase(
-            phase_rad, self.pupil, focus_um=focus_um, settings=self.settings
-        )
-
 
 def score_phase(
     phase_rad: Tensor,
@@ -214,20 +207,17 @@ def _stacks(
 class FisherPhase:
     """A designed free-form phase.
 
-    controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every
-        node of the pupil.
+    nodes_rad: (n, n) free phase of every node of the pupil.
     focus_um: source distance of the hyperbolic part.
     zones: rings of the double helix below, 0 for none.
-    cells: whether the controls are one value for every node.
     score: of this phase.
     converged: whether the encircled energy is kept at every depth.
     starts: (information, least encircled energy) of each start.
     """
 
-    controls: Tensor
+    nodes_rad: Tensor
     focus_um: float
     zones: int
-    cells: bool
     score: DesignScore
     converged: bool
     starts: tuple[tuple[float, float], ...] = ()
@@ -250,7 +240,8 @@ def fisher_profile(
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase in rad, focus and free form, as a function of position.
 
-    phase(x, y) = hyperbolic phase + free form + vortices of the double helix.
+    phase(x, y) = hyperbolic phase + free phase of the nearest node + vortices of the
+    double helix.
 
     Args:
         focus: source and sensor distances; its source distance is used where the
@@ -265,46 +256,23 @@ def fisher_profile(
     pupil = design_pupil(focus, radius_um, resolved)
     design = optimize_free_form(pupil, resolved)
     base = replace(focus, source_distance_um=design.focus_um)
-    extra = free_form(design.controls.numpy(), pupil, cells=design.cells)
+    free_rad = design.nodes_rad.numpy()
 
     def phase(x_um: Array, y_um: Array) -> Array:
-        smooth = hyperbolic_phase(x_um, y_um[:, None], base) + extra(x_um, y_um)
-        return np.asarray(
-            smooth
-            + vortex_phase(x_um, y_um[:, None], radius_um=radius_um, zones=design.zones)
+        y = y_um[:, None]
+        cosines = np.sqrt(x_um**2 + y**2 + pupil.sensor_distance_um**2)
+        place = (pupil.nodes - 1) / 2
+        row, column = (
+            np.rint(a / cosines * pupil.nodes / (2 * pupil.edge) + place)
+            .clip(0, pupil.nodes - 1)
+            .astype(np.intp)
+            for a in (y, x_um)
         )
+        vortices = vortex_phase(x_um, y, radius_um=radius_um, zones=design.zones)
+        smooth = hyperbolic_phase(x_um, y, base) + vortices
+        return np.asarray(smooth + free_rad[row, column])
 
     return phase, design
-
-
-def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
-    """The free-form phase in rad as a function of x and y in um.
-
-    Args:
-        controls: (n, n) B-spline coefficients over the aperture, rad; with ``cells``
-            the phase of every node of the pupil, which the nearest node gives.
-        pupil: sampled pupil of the lens, its nodes even in direction cosine.
-        cells: whether the controls are one value for every node.
-    """
-
-    def smooth(x_um: Array, y_um: Array) -> Array:
-        across, down = (
-            bspline_weights(a / pupil.radius_um, len(controls)) for a in (x_um, y_um)
-        )
-        return np.asarray(down @ controls @ across.T)
-
-    def stepped(x_um: Array, y_um: Array) -> Array:
-        path = np.sqrt(x_um**2 + y_um[:, None] ** 2 + pupil.sensor_distance_um**2)
-        scale = pupil.nodes / (2 * pupil.edge)
-        middle = (pupil.nodes - 1) / 2
-        last = pupil.nodes - 1
-        row, column = (
-            np.clip(np.rint(a / path * scale + middle), 0, last).astype(np.intp)
-            for a in (y_um[:, None], x_um)
-        )
-        return np.asarray(controls[row, column])
-
-    return stepped if cells else smooth
 
 
 def design_pupil(
@@ -336,7 +304,6 @@ def optimize_free_form(pupil: Pupil, settings: ResolvedFisherSettings) -> Fisher
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
     """
-    objective = AxialObjective(pupil, settings)
     results = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
@@ -345,7 +312,7 @@ def optimize_free_form(pupil: Pupil, settings: ResolvedFisherSettings) -> Fisher
         )
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
         zones = settings.zones[start % len(settings.zones)]
-        results.append(_climb(pupil, settings, objective, focus, zones, generator))
+        results.append(_climb(pupil, settings, focus, zones, generator))
     starts = tuple((r.rank[1], float(r.score.encircled.min())) for r in results)
     return replace(max(results, key=lambda result: result.rank), starts=starts)
 
@@ -356,9 +323,7 @@ def phase_on(pupil: Pupil, profile: FisherPhase) -> Tensor:
     Args:
         profile: what was designed or computed.
     """
-    return _Phase(pupil, 0 if profile.cells else len(profile.controls), profile.zones)(
-        profile.controls
-    )
+    return _vortices(pupil, profile.zones) + profile.nodes_rad
 
 
 def bspline_weights(position: Array, count: int) -> Array:
@@ -378,80 +343,65 @@ def bspline_weights(position: Array, count: int) -> Array:
 def _climb(
     pupil: Pupil,
     settings: ResolvedFisherSettings,
-    objective: AxialObjective,
     focus_um: float,
     zones: int,
     generator: torch.Generator,
 ) -> FisherPhase:
     """Gradient ascent (Adam) of the objective from one random start, coarse to fine.
 
-    Stage by stage the controls are refined to the next grid. A penalty holds the
-    encircled energy above ``settings.encircled`` plus a margin, which follows the
-    deterministic figures. Only iterates of the last grid are judged.
+    A spline of ``settings.controls`` across the aperture is followed by a free phase of
+    every node. A penalty holds the encircled energy above ``settings.encircled`` plus a
+    margin, which follows the deterministic figures. Only the free phases are judged.
 
     Args:
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
-        objective: loss and figures.
         focus_um: source distance of the hyperbolic part, um.
         zones: rings of the double helix; 0 for none.
         generator: of random numbers.
     """
-    controls = _initial_controls(settings, zones, generator)
+    objective, base = AxialObjective(pupil, settings), _vortices(pupil, zones)
+    # on a double helix a tenth of the spread, which keeps its vortices
+    spread = settings.spread_rad * (0.1 if zones else 1.0)
+    size = settings.controls
+    values = spread * torch.randn(size, size, generator=generator, dtype=torch.float64)
+    down, across = (
+        torch.from_numpy(bspline_weights(axis.ravel() / pupil.radius_um, size))
+        for axis in reversed([a.numpy() for a in pupils.coordinates(pupil)])
+    )
     total = settings.iterations
-    done = 0
+    first = min(max(1, total // SMOOTH), total - 1)
     margin = 0.01  # encircled energy beyond the bound that the penalty asks for
-    best: FisherPhase | None = None
-    for grid, count in zip(settings.grids, _shares(settings), strict=True):
-        if grid == 0:
-            controls = _Phase(pupil, len(controls), 0)(controls)
-        elif len(controls) != grid:
-            controls = _refined(controls, grid)
-        controls = controls.detach().requires_grad_(True)
-        rate = RATE if grid else NODE_RATE
-        build = _Phase(pupil, grid, zones)
-        optimizer = torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
-        for _ in range(count):
+    judged: list[FisherPhase] = []
+    stages = (True, RATE, range(first)), (False, NODE_RATE, range(first, total))
+    for smooth, rate, steps in stages:
+        if not smooth:
+            values = ((down @ values) * across).sum(1).reshape(base.shape)
+        values = values.detach().requires_grad_(True)
+        optimizer = torch.optim.Adam([values], lr=rate, betas=(0.9, 0.99))
+        for done in steps:
             for group in optimizer.param_groups:
                 group["lr"] = _rate(rate, done, total)
-            loss, energy = objective.loss(build(controls), focus_um, generator)
+            free = values
+            if smooth:
+                free = ((down @ values) * across).sum(1).reshape(base.shape)
+            loss, energy = objective.loss(base + free, focus_um, generator)
             missing = torch.relu(settings.encircled + margin - energy)
             loss = loss + _penalty(missing, done / total)
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
-            done += 1
-            if grid == settings.grids[-1] and (done % CHECKS == 0 or done == total):
-                score = objective.judge(build(controls).detach(), focus_um)
-                spare = float(score.encircled.min()) - settings.encircled
-                latest = FisherPhase(
-                    controls.detach().clone(),
-                    focus_um,
-                    zones,
-                    settings.grids[-1] == 0,
-                    score,
-                    converged=spare >= -5e-4,
-                )
-                if best is None or latest.rank > best.rank:
-                    best = latest
-                # proportional feedback, so that the figures exceed the bound by 0.0015
-                margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
-        controls = controls.detach()
-    if best is None:
-        raise ConfigError("no iterate was judged")
-    return best
-
-
-def _initial_controls(
-    settings: ResolvedFisherSettings, zones: int, generator: torch.Generator
-) -> Tensor:
-    """(n, n) random controls of the coarsest grid in rad, normal with ``spread_rad``.
-
-    On a double helix a tenth of the spread, which keeps its vortices.
-    """
-    spread = settings.spread_rad * (0.1 if zones else 1.0)
-    size = settings.grids[0]
-    return spread * torch.randn(size, size, generator=generator, dtype=torch.float64)
+            if smooth or ((done + 1) % CHECKS and done + 1 < total):
+                continue
+            nodes = values.detach().clone()
+            score = score_phase(
+                base + nodes, pupil, focus_um=focus_um, settings=settings
+            )
+            spare = float(score.encircled.min()) - settings.encircled
+            judged.append(FisherPhase(nodes, focus_um, zones, score, spare >= -5e-4))
+            # proportional feedback, so that the figures exceed the bound by 0.0015
+            margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
+    return max(judged, key=lambda design: design.rank)
 
 
 def _rate(first: float, done: int, total: int) -> float:
@@ -471,44 +421,7 @@ def _penalty(missing: Tensor, share: float) -> Tensor:
     return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
 
 
-def _shares(settings: FisherSettings) -> list[int]:
-    """Iterations of every stage: in proportion to its grid, at least one."""
-    weight = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
-    early = [
-        max(1, settings.iterations * grid // weight) for grid in settings.grids[:-1]
-    ]
-    return [*early, max(1, settings.iterations - sum(early))]
-
-
-class _Phase:
-    """Linear map from controls to the phase on the pupil's nodes, rad.
-
-    A spline of ``grid`` controls across the aperture, or for a grid of 0 the controls
-    themselves, plus the vortices of a double helix.
-    """
-
-    def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:
-        x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
-        vortices = vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones)
-        self.base = torch.from_numpy(vortices)
-        self.weights = [
-            torch.from_numpy(bspline_weights(axis.ravel() / pupil.radius_um, grid))
-            for axis in (y, x)
-            if grid
-        ]
-
-    def __call__(self, controls: Tensor) -> Tensor:
-        if not self.weights:
-            return self.base + controls
-        down, across = self.weights
-        spline = ((down @ controls) * across).sum(dim=1)
-        return self.base + spline.reshape(self.base.shape)
-
-
-def _refined(controls: Tensor, grid: int) -> Tensor:
-    """The same phase on a finer control grid, in the sense of least squares."""
-    place = np.linspace(-1, 1, 4 * grid)
-    coarse = bspline_weights(place, len(controls))
-    fine = bspline_weights(place, grid)
-    change = torch.from_numpy(np.linalg.lstsq(fine, coarse, rcond=None)[0])
-    return change @ controls @ change.mT
+def _vortices(pupil: Pupil, zones: int) -> Tensor:
+    """(nodes, nodes) phase of a double helix on the pupil's nodes, rad."""
+    x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
+    return torch.from_numpy(vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones))

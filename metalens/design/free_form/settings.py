@@ -27,10 +27,10 @@ class FisherSettings:
     radius_um: left out, 5.3 wavelength / NA.
     focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread
         between them. Left out, the middle two fifths of the depths, in 1/z.
-    grids: control points across the aperture, stage by stage; 0 as the last for one
-        free value a node of the pupil (cells of about 6 um), which sends light away
-        best where the energy allows it.
-    iterations: of all stages, shared in proportion to their grids. starts: tried.
+    controls: spline control points across the aperture in the first eleventh of the
+        iterations; after it every node of the pupil (a cell of about 6 um) is free,
+        which sends light away best where the energy allows it.
+    iterations: of both stages. starts: tried.
     zones: rings of the double helix that the starts begin from, in turn; 0 for none.
     spread_rad: deviation of the random start (a tenth of it on a double helix).
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
@@ -44,7 +44,7 @@ class FisherSettings:
     encircled: float = 0.5
     radius_um: float | None = None
     focus_mm: tuple[float, float] | None = None
-    grids: tuple[int, ...] = (16, 0)
+    controls: int = 16
     iterations: int = 800
     starts: int = 3
     zones: tuple[int, ...] = (0,)
@@ -76,15 +76,10 @@ class FisherSettings:
                 f"encircled = {self.encircled}, radius_um = {self.radius_um}, pixel_um = {self.pixel_um}: need a share "
                 "below 1, and a radius and pixels above 0"
             )
-        fine = (
-            (*self.grids[:-1], self.grids[-1] or 4)
-            if len(self.grids) > 1
-            else self.grids
-        )
-        if self.starts < 1 or self.iterations < 1 or not fine or min(fine) < 4:
+        if self.starts < 1 or self.iterations < 1 or self.controls < 4:
             raise ConfigError(
-                f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids = {self.grids}: need 4 "
-                "or more each, or 0 as the last of several"
+                f"starts, iterations = {self.starts}, {self.iterations}: need 1 or "
+                f"more; controls = {self.controls}: need 4 or more"
             )
         if not self.zones:
             raise ConfigError("zones = (): need at least one entry")
