@@ -8,7 +8,6 @@ import importlib
 import io
 import math
 import os
-import re
 import shutil
 import signal
 import sys
@@ -139,9 +138,6 @@ WHOLE = {
 }
 
 _LARGEST = 1e9  # size of a number among options, in its unit
-_PARTED = re.compile(
-    r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+"
-)  # numbers of an option, with commas
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -150,7 +146,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: words of the command line.
     """
-    _open_streams()
     try:
         status = _main(arguments)
     except KeyboardInterrupt:  # before the verb began
@@ -160,23 +155,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MetalensError as error:
         status = _refuse(str(error))
     return status
-
-
-def _open_streams() -> None:
-    """Open closed standard streams on the null device.
-
-    Otherwise the next file would take their number, and the output of libraries with
-    it.
-    """
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            null = os.open(os.devnull, os.O_RDWR)
-            if null != number:
-                os.dup2(null, number)
-                os.close(null)
-            mode = "w" if number else "r"
-            stream = os.fdopen(number, mode, encoding="utf-8", closefd=False)
-            setattr(sys, name, stream)
 
 
 def _main(arguments: Sequence[str] | None) -> int:
@@ -203,10 +181,6 @@ def _main(arguments: Sequence[str] | None) -> int:
         return _refuse(
             f"unknown command {words[0]!r}{nearest_name_hint(words[0], VERBS)}"
         )
-    try:
-        os.getcwd()
-    except OSError:  # libraries end the process there
-        return _refuse("the current folder does not exist any more; change to another")
     _prepare()
     return _guarded(words, debug=debug)
 
@@ -235,56 +209,29 @@ def _guarded(words: list[str], *, debug: bool) -> int:
 
     token = store.COMMAND.set(" ".join(words))
     try:
-        return _with_traceback(words) if debug else _dispatch(words[0], words[1:])
-    except FitRefused as error:
-        return _refuse(_message(error), FAILED_CHECK)
-    except (MetalensError, OSError) as error:
-        return _refuse(_message(error))
-    except ModuleNotFoundError as error:
-        hint = missing_extra(error)
-        if hint is None:
-            raise
-        return _refuse(hint)
-    except KeyboardInterrupt as error:
-        return _refuse(
-            _message(
-                error,
-                "interrupted; the output is as it was before, or new if it was finished",
-            ),
-            INTERRUPTED,
-        )
-    except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
-        return _refuse(
-            f"{type(error).__name__}: {_line(error)}; not foreseen: {_write_report(words)}"
-        )
+        return _dispatch(words[0], words[1:])
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 (the one handler at the top)
+        if debug:
+            traceback.print_exc()
+        message, status = _verdict(error)
+        return _refuse("; ".join([message, *getattr(error, "__notes__", ())]), status)
     finally:
         store.COMMAND.reset(token)
 
 
-def _with_traceback(words: list[str]) -> int:
-    """Run with --debug: the traceback of any error is shown before its one line."""
-    try:
-        return _dispatch(words[0], words[1:])
-    except BaseException:
-        traceback.print_exc()
-        raise
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300] or "no words"
-
-
-def _write_report(words: list[str]) -> str:
-    """Write command and traceback to a temporary file; a sentence with its name."""
-    try:
-        handle, name = tempfile.mkstemp(prefix="metalens-error-", suffix=".txt")
-        with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(
-                f"metalens {' '.join(words)}\npython {sys.version}\n\n{traceback.format_exc()}"
-            )
-    except OSError:
-        return "run it again with --debug to see where"
-    return f"please report {name} (--debug shows it)"
+def _verdict(error: BaseException) -> tuple[str, int]:
+    """(one line, exit status) for an error of a command."""
+    if isinstance(error, KeyboardInterrupt):
+        text = "interrupted; the output is as it was before, or new if it was finished"
+        return text, INTERRUPTED
+    if isinstance(error, ModuleNotFoundError) and (hint := missing_extra(error)):
+        return hint, BAD_INPUT
+    if isinstance(error, MetalensError | OSError):
+        refused = isinstance(error, FitRefused)
+        return str(error), FAILED_CHECK if refused else BAD_INPUT
+    line = " ".join(str(error).split())[:300]
+    unforeseen = f"{type(error).__name__}: {line}; not foreseen: --debug shows where"
+    return unforeseen, BAD_INPUT
 
 
 def _numba_cache() -> None:
@@ -300,11 +247,6 @@ def _numba_cache() -> None:
         return
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="metalens-numba-")
     atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
-
-
-def _message(error: BaseException, words: str = "") -> str:
-    """The text of an error, or ``words``, with the notes added on its way up."""
-    return "; ".join([words or str(error), *getattr(error, "__notes__", ())])
 
 
 def _dispatch(verb: str, words: list[str]) -> int:
@@ -341,13 +283,6 @@ def _dispatch(verb: str, words: list[str]) -> int:
     except BrokenPipeError:  # whoever was shown the help went away
         report.silence_output()
         return SUCCESS
-    except SystemExit as end:
-        if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):
-            separated = parted.replace(",", " ").replace("=", " ")
-            return _refuse(
-                f"{parted}: part the numbers of a list by blanks, as {separated}; a decimal has a point"
-            )
-        raise
     _check_numbers(options)
     for name, where in WHOLE.get(verb, {}).items():
         if getattr(options, name) is not None:

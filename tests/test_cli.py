@@ -21,22 +21,6 @@ def test_help_lists_every_verb():
         assert f"  {verb}" in done.stdout
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--heights-um", "0.1,0.25,0.4"),
-        ("--heights-um=0,3",),
-        ("--diameter-um", "0,15"),
-    ],
-)
-def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
-    done = run("field cell.toml", *words)
-    assert done.returncode == cli.BAD_INPUT
-    assert done.stderr.splitlines()[-1].startswith(
-        f"metalens: error: {words[-1]}: part the numbers of a list by blanks"
-    )
-
-
 def test_no_command_and_unknown_command_are_bad_input():
     assert run().returncode == cli.BAD_INPUT
     done = process("desing")

@@ -384,6 +384,8 @@ def flush_output(text: str = "") -> None:
     Raises:
         OutputError: it cannot be written otherwise, as to a full disk.
     """
+    if sys.stdout is None:  # closed
+        return
     try:
         sys.stdout.write(text)
         sys.stdout.flush()

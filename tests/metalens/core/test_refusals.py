@@ -129,7 +129,7 @@ def test_a_damaged_matlab_file_is_refused_by_type(tmp_path):
             read_matlab(tmp_path / "b.mat")
 
 
-def test_what_nobody_foresaw_is_one_line_and_a_report(monkeypatch, capsys):
+def test_what_nobody_foresaw_is_one_line_and_shown_by_debug(monkeypatch, capsys):
     def fail(options):
         raise ZeroDivisionError("of the program")
 
@@ -137,10 +137,6 @@ def test_what_nobody_foresaw_is_one_line_and_a_report(monkeypatch, capsys):
     assert call("design d.toml") == cli.BAD_INPUT
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    report = Path(told.split("please report ")[1].split()[0])
-    assert "Traceback" in report.read_text()
-    report.unlink()
+    assert "ZeroDivisionError: of the program; not foreseen: --debug" in told
     assert call("design d.toml --debug") == cli.BAD_INPUT
-    told = capsys.readouterr().err
-    assert "Traceback" in told
-    Path(told.split("please report ")[1].split()[0]).unlink()
+    assert "Traceback" in capsys.readouterr().err
