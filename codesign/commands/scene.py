@@ -101,10 +101,8 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    if options.image is not None:
-        return _run_picture(options, options.image)
-    if options.depth_mm or options.width_mm:
-        raise ConfigError("--depth-mm, --width-mm: of a picture; need --image")
+    if options.image or options.depth_mm or options.width_mm:
+        return picture.run(options, options.lens or options.config, options.output)
     settings = (
         config.load(options.config, SceneSettings)
         if options.config
@@ -143,23 +141,6 @@ def run(options: Options) -> int:
             failures.append(images.problem)
             summary += f"\n{images.error:.2g} of a texture is the error of the image: {folder}/image.png{images.light}"
     return options.console.judged(values, summary, failures)
-
-
-def _run_picture(options: Options, image: Path) -> int:
-    """Image a picture; exit 1 where the error is above the tolerance."""
-    lens_file = options.lens or options.config
-    if lens_file is None or (options.lens and options.config):
-        raise ConfigError("--image: need one lens (lens.h5), which images the picture")
-    plane = picture.PicturePlane(
-        options.depth_mm, options.width_mm, options.fwhm_nm, options.tolerance
-    )
-    with options.claim_folder(options.output) as draft:
-        values, summary, problem = picture.image_picture(
-            lens_file, image, plane, draft.path
-        )
-    values["folder"] = str(options.output)
-    text = f"{options.output}/sensor.png: {summary}"
-    return options.console.judged(values, text, [problem])
 
 
 def _rendered(
