@@ -152,13 +152,24 @@ def _rendered(
 
 
 def _render_and_write(settings: SceneSettings, folder: Path) -> None:
-    """Render frames, write scene, labels and sheet."""
+    """Render frames, write scene.h5 (kind ``scene``), labels and sheet.
+
+    Accuracy: light and coverage to 1/510 (8 bits), depth to 1 um (16 bits, up to 65
+    mm).
+    """
     camera = PinholeCamera(settings.pixels, settings.pitch_um)
     rendered = _rendered(settings, settings.frames, camera, settings.rig)
+    f, labels = rendered.frames, rendered.labels
+    arrays: dict[str, Array] = {
+        "radiance": _bytes(f.radiance),
+        "coverage": _bytes(f.coverage[:, 1]),
+        "depth_um": f.depth_um.clamp(0, 65535).round().numpy().astype(np.uint16),
+        "pupil": _bytes(rendered.pupil),
+    }
+    for name in type(labels).__slots__:
+        arrays[f"labels/{name}"] = getattr(labels, name).numpy()
     provenance = Provenance(config=config.dumps(settings), seed=settings.seed)
-    write_shard(
-        folder / "scene.h5", rendered, seed=settings.seed, provenance=provenance
-    )
+    store.save(folder / "scene.h5", "scene", arrays, provenance=provenance)
     store.write_text(folder / "labels.csv", _labels_csv(rendered))
     contact_sheet(rendered, folder / "sheet.png")
 
@@ -179,19 +190,18 @@ def _labels_csv(rendered: RenderedFrames) -> str:
     return "\n".join(lines) + "\n"
 
 
-def contact_sheet(
-    rendered: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
-) -> None:
-    """Write a PNG of frames in rows, then depth (near is bright) and pupil masks of the
-    first.
+def contact_sheet(rendered: RenderedFrames, path: Path) -> None:
+    """Write a PNG of up to 24 frames in rows, then depth (near is bright) and pupil
+    masks of the first row.
 
     Args:
-        rendered: rendered frames. path: of the file. columns: frames across.
-        most: frames shown at most.
+        rendered: rendered frames. path: of the file.
     """
     import cv2
 
-    light = rendered.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)
+    columns = 6
+
+    light = rendered.pinhole()[:24].clamp(0, 1) ** (1 / 1.8)
     depth = (rendered.frames.depth_um * rendered.frames.coverage).sum(1)[:columns]
     nearness = (depth.max() - depth) / (depth.max() - depth.min()).clamp_min(1e-9)
     size = light.shape[-1]
@@ -202,32 +212,6 @@ def contact_sheet(
         rows.append(tiles.transpose(1, 2).reshape(-1, columns * size))
     sheet = (255 * torch.cat(rows)).numpy().astype(np.uint8)
     store.write_bytes(path, cv2.imencode(".png", sheet)[1].tobytes())
-
-
-def write_shard(
-    path: Path, rendered: RenderedFrames, *, seed: int, provenance: Provenance
-) -> None:
-    """One HDF5 file (kind ``scene``) of frames, masks and labels: light and coverage in
-    8 bits, depth in um.
-
-    Args:
-        path: of the file. rendered: frames to write. seed: of the random generator.
-        provenance: of the file.
-
-    Accuracy: light to 1/510, coverage to 1/510, depth to 1 um (16 bits up to 65 mm).
-    """
-    f, labels = rendered.frames, rendered.labels
-    arrays: dict[str, Array] = {
-        "radiance": _bytes(f.radiance),
-        "coverage": _bytes(f.coverage[:, 1]),
-        "depth_um": f.depth_um.clamp(0, 65535).round().numpy().astype(np.uint16),
-        "pupil": _bytes(rendered.pupil),
-    }
-    arrays |= {
-        f"labels/{name}": getattr(labels, name).numpy()
-        for name in type(labels).__slots__
-    }
-    store.save(path, "scene", arrays, provenance=replace(provenance, seed=seed))
 
 
 def _bytes(values: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -63,10 +63,11 @@ def run(options: PictureOptions, lens_file: Path | None, target: Path) -> int:
 
     depth_um, width_um = 1e3 * options.depth_mm, 1e3 * options.width_mm
     sizes = depth_um > 0 <= width_um and options.fwhm_nm >= 0
+    sizes &= not (width_um and math.isinf(depth_um))
     if options.image is None or lens_file is None or not sizes:
         raise ConfigError(
             "a picture needs --image, one lens (lens.h5), --depth-mm above 0, and "
-            "--width-mm and --fwhm-nm of 0 or more"
+            "--width-mm (none at infinity) and --fwhm-nm of 0 or more"
         )
     device, scene = load(lens_file), read_colours(options.image)
     step_um = 2 * _half_width_um(device, depth_um, width_um) / scene.shape[2]
