@@ -304,8 +304,6 @@ def _check_numbers(options: Any) -> None:
     """
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if dataclasses.is_dataclass(value):
-            _check_numbers(value)
         if repr(value) == repr(field.default):
             continue
         for number in value if isinstance(value, tuple) else (value,):

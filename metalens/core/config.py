@@ -18,7 +18,6 @@ from metalens.core import reading
 from metalens.core.errors import ConfigError, nearest_name_hint
 
 Record = TypeVar("Record")
-_LARGEST = 1 << 24  # bytes of a config file
 # text: tabs and line ends, but no other control characters
 _PRINTABLE = re.compile(r"[^\x00-\x08\x0b-\x1f\x7f]*")
 _BACKSLASH = (
@@ -62,28 +61,17 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
     Raises:
         ConfigError: missing file, not text, or not TOML; empty where that is refused.
     """
-    path = Path(path)
     try:
-        with open(path, "rb") as file:
-            content = file.read(_LARGEST + 1)
-        if len(content) > _LARGEST:
-            raise ConfigError(
-                f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})"
-            )
-        text = reading.decode_text(content)
+        text = reading.read_text(path)
     except UnicodeDecodeError:
         raise ConfigError(
             f"{path}: not a text file; need TOML ({record.__name__}) that names files of data"
         ) from None
-    except OSError as error:
-        reason = str(error.strerror).lower()
+    except (OSError, ValueError) as error:  # a name with a NUL is a ValueError
+        reason = str(getattr(error, "strerror", error)).lower()
         raise ConfigError(
             f"{path}: {reason}; need a TOML config ({record.__name__})"
         ) from None
-    except ValueError as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{str(path)!r}: no name of a file ({error})") from None
     if not empty and not text.strip():
         raise ConfigError(
             f"{path}: empty; need settings ({record.__name__}), or a comment line for all defaults"

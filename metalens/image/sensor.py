@@ -38,12 +38,15 @@ class Sensor:
     bits: int = 10
 
     def __post_init__(self) -> None:
-        for name in ("pitch_um", "base_pitch_um", "full_well_e"):
-            _check(name, getattr(self, name), above=True)
-        for name in ("exposure_e", "ambient_e", "read_noise_e"):
-            _check(name, getattr(self, name), above=False)
-        if self.bits not in range(1, 17):
-            raise SceneError(f"bits = {self.bits}: need 1 to 16")
+        positive = self.pitch_um, self.base_pitch_um, self.full_well_e
+        others = self.exposure_e, self.ambient_e, self.read_noise_e
+        in_range = all(0 < value < math.inf for value in positive)
+        in_range &= all(0 <= value < math.inf for value in others)
+        if not (in_range and self.bits in range(1, 17)):
+            raise SceneError(
+                f"{self}: need finite values, pitches and full well above 0, the others "
+                "0 or more, and 1 to 16 bits"
+            )
 
     @property
     def well_e(self) -> float:
@@ -211,8 +214,11 @@ def low_snr(
         snr_db: signal-to-noise ratio.
         ambient_ratio: ambient light over the signal.
     """
-    _check("mean_irradiance", mean_irradiance, above=True)
-    _check("ambient_ratio", ambient_ratio, above=False)
+    if not (0 < mean_irradiance < math.inf and 0 <= ambient_ratio < math.inf):
+        raise SceneError(
+            f"mean_irradiance = {mean_irradiance}, ambient_ratio = {ambient_ratio}: need "
+            "one above 0 and one of 0 or more"
+        )
     q2 = 10 ** (snr_db / 10)
     area = float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     shot = q2 * (1 + ambient_ratio)
@@ -220,10 +226,3 @@ def low_snr(
     return replace(
         sensor, exposure_e=signal / mean_irradiance, ambient_e=signal * ambient_ratio
     )
-
-
-def _check(name: str, value: float, *, above: bool) -> None:
-    if not (math.isfinite(value) and (value > 0 if above else value >= 0)):
-        raise SceneError(
-            f"{name} = {value}: need a finite value {'above 0' if above else '>= 0'}"
-        )

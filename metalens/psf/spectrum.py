@@ -233,12 +233,9 @@ def _response(curve: "Path | str | SpectralDistribution") -> "SpectralDistributi
             )
     if not (curve.range >= 0).all():
         raise PropagationError(f"spectrum: {curve.name} has values below 0")
-    return colour.SpectralDistribution(
-        curve.range,
-        curve.domain,
-        name=curve.name,
-        interpolator=colour.LinearInterpolator,
-    )
+    response = curve.copy()
+    response.interpolator = colour.LinearInterpolator
+    return response
 
 
 def _read_curve(file: Path) -> Array:

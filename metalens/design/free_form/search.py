@@ -45,79 +45,55 @@ class DesignScore:
     encircled: Tensor
 
 
-class AxialObjective:
-    """Minus the log of the axial information I(z), averaged over depths and pixel
-    positions.
+def axial_loss(
+    phase_rad: Tensor,
+    pupil: Pupil,
+    focus_um: float,
+    settings: ResolvedFisherSettings,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Minus the log of the axial information I(z) at random depths, and the encircled
+    energy there.
 
-    The mean is over random depths, azimuths of the field and positions of the pixel
-    grid; every field angle has the same weight.
+    With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
+    log(mean I), I per mm² of the images, the means over depths. Depths are stratified
+    over the range, azimuths of the field are multiples of 90 degrees, and two positions
+    of the pixel grid are drawn. Every field angle has the same weight.
+
+    Args:
+        phase_rad: (nodes, nodes) phase without its focus, rad.
+        pupil: sampled pupil of the lens.
+        focus_um: source distance of the hyperbolic part, um.
+        settings: resolved settings of the design.
+        generator: of random depths, fields and positions.
     """
-
-    def __init__(self, pupil: Pupil, settings: ResolvedFisherSettings) -> None:
-        self.pupil, self.settings = pupil, settings
-
-    def loss(
-        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Loss and encircled energy at some depths, see :class:`AxialObjective`.
-
-        With e = ``settings.even``: -mean over positions of e mean(log I) + (1 - e)
-        log(mean I), I per mm² of the images, the means over depths.
-
-        Args:
-            phase_rad: (nodes, nodes) phase without its focus, rad.
-            focus_um: source distance of the hyperbolic part, um.
-            generator: of random depths, fields and positions.
-        """
-        settings = self.settings
-        depths, fields, positions = self._sample_views(generator)
-        near, far = _stacks(
-            phase_rad,
-            self.pupil,
-            focus_um,
-            depths,
-            fields,
-            settings,
-            settings.climb_window_um,
+    angles = settings.angles_deg
+    low, high = (1e3 * d for d in settings.depths_mm)
+    count = max(2, math.ceil(CLIMB_IMAGES / len(angles))) * len(angles)
+    strata = torch.randperm(count, generator=generator) + torch.rand(
+        count, generator=generator
+    )
+    depths = low + (high - low) / count * strata.double()
+    turns = torch.randint(0, DIRECTIONS, (count,), generator=generator).tolist()
+    fields = [
+        _field(angles[i % len(angles)], turn / DIRECTIONS)
+        for i, turn in enumerate(turns)
+    ]
+    positions = torch.rand(2, 2, generator=generator) - 0.5  # in pixels
+    width = settings.climb_window_um
+    near, far = _stacks(phase_rad, pupil, focus_um, depths, fields, settings, width)
+    total = phase_rad.new_zeros(())
+    for y, x in (positions * settings.pixel_um).tolist():
+        value = pixel_information(
+            near, far, shift_um=(y, x), **_information_options(settings)
         )
-        total = phase_rad.new_zeros(())
-        options = _information_options(settings)
-        for y, x in (positions * settings.pixel_um).tolist():
-            value = pixel_information(near, far, shift_um=(y, x), **options)
-            value = value.reshape(-1, len(settings.angles_deg))
-            mean_log = torch.log(value + 1e-4).mean()
-            log_mean = torch.log(value.mean(0) + 1e-4).mean()
-            gain = settings.even * mean_log + (1 - settings.even) * log_mean
-            total = total - gain / len(positions)
-        energy = encircled_energy(
-            near, settings.sample_um, radius_um=settings.radius_um
-        )
-        return total, energy
-
-    def _sample_views(
-        self, generator: torch.Generator
-    ) -> tuple[Tensor, list[Field], Tensor]:
-        """Source depths, fields and pixel positions of one step.
-
-        Depths are stratified over the range, azimuths are multiples of 90 degrees.
-
-        Returns:
-            (images,) depths in um, as many fields with the angles in turn, and (2, 2)
-            positions (y, x) of the pixel grid in pixels.
-        """
-        angles = self.settings.angles_deg
-        low, high = (1e3 * d for d in self.settings.depths_mm)
-        count = max(2, math.ceil(CLIMB_IMAGES / len(angles))) * len(angles)
-        strata = torch.randperm(count, generator=generator) + torch.rand(
-            count, generator=generator
-        )
-        depths = low + (high - low) / count * strata.double()
-        turns = torch.randint(0, DIRECTIONS, (count,), generator=generator).tolist()
-        fields = [
-            _field(angles[i % len(angles)], turn / DIRECTIONS)
-            for i, turn in enumerate(turns)
-        ]
-        return depths, fields, torch.rand(2, 2, generator=generator) - 0.5
+        value = value.reshape(-1, len(angles))
+        mean_log = torch.log(value + 1e-4).mean()
+        log_mean = torch.log(value.mean(0) + 1e-4).mean()
+        gain = settings.even * mean_log + (1 - settings.even) * log_mean
+        total = total - gain / len(positions)
+    radius_um = settings.radius_um
+    return total, encircled_energy(near, settings.sample_um, radius_um=radius_um)
 
 
 def score_phase(
@@ -360,7 +336,7 @@ def _climb(
         zones: rings of the double helix; 0 for none.
         generator: of random numbers.
     """
-    objective, base = AxialObjective(pupil, settings), _vortices(pupil, zones)
+    base = _vortices(pupil, zones)
     # on a double helix a tenth of the spread, which keeps its vortices
     spread = settings.spread_rad * (0.1 if zones else 1.0)
     size = settings.controls
@@ -385,7 +361,7 @@ def _climb(
             free = values
             if smooth:
                 free = ((down @ values) * across).sum(1).reshape(base.shape)
-            loss, energy = objective.loss(base + free, focus_um, generator)
+            loss, energy = axial_loss(base + free, pupil, focus_um, settings, generator)
             missing = torch.relu(settings.encircled + margin - energy)
             loss = loss + _penalty(missing, done / total)
             optimizer.zero_grad()

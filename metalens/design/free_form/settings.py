@@ -114,20 +114,17 @@ class FisherSettings:
                 f"pixel_um = {pixel}: need at most {climb_window / 3:.3g} um for a lens whose spots are seen in a "
                 f"window of {climb_window:g} um"
             )
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        values |= {
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
             "depths_mm": (near * 1e-3, far * 1e-3),
             "radius_um": self.radius_um or reach.disc_um(lens),
-        }
-        values["focus_mm"] = self.focus_mm or between_mm((near, far), *FOCI)
-        values |= {
+            "focus_mm": self.focus_mm or between_mm((near, far), *FOCI),
             "pixel_um": pixel,
             "sample_um": reach.sample_um(lens, pixel),
             "step_um": reach.depth_step_um(lens, near),
+            "window_um": window,
+            "climb_window_um": climb_window,
         }
-        return ResolvedFisherSettings(
-            **values, window_um=window, climb_window_um=climb_window
-        )
+        return ResolvedFisherSettings(**values)
 
 
 @dataclass(frozen=True, slots=True)
