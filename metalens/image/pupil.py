@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import PropagationError
+from metalens.image.rays import middle_direction
+from metalens.optics import Layers
 from metalens.optics.paths import path_difference, sensor_path, source_path
 
 
@@ -241,7 +243,9 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
             x, y, amplitude(pupil), None, -k * path_difference(x**2 + y**2, focus_um)
         )
     cx, cy = (d * t for t in field.tangents)
-    mx, my = _middle(pupil.radius_um, cx, cy, d)
+    air = Layers().after(d, pupil.wavelength_um)
+    centre = torch.tensor((cx, cy), dtype=torch.float64)
+    mx, my = (-middle_direction(air, pupil.radius_um, centre)).tolist()
     qy, qx = torch.meshgrid(
         node_cosines(pupil) + my, node_cosines(pupil) + mx, indexing="ij"
     )
@@ -273,13 +277,3 @@ def wrap_phase(phase_rad: Tensor) -> Tensor:
         phase_rad: phase, rad.
     """
     return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))
-
-
-def _middle(radius_um: float, cx: float, cy: float, d: float) -> tuple[float, float]:
-    """(x, y) middle of the direction cosines from (cx, cy) to the aperture's rim."""
-    turn = torch.arange(256, dtype=torch.float64) * (2 * math.pi / 256)
-    x = radius_um * torch.cos(turn) - cx
-    y = radius_um * torch.sin(turn) - cy
-    path = torch.sqrt(x**2 + y**2 + d**2)
-    qx, qy = x / path, y / path
-    return float(qx.min() + qx.max()) / 2, float(qy.min() + qy.max()) / 2

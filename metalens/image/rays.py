@@ -68,13 +68,7 @@ def rays(
     axis = (
         torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2
     ) * step
-    azimuth = torch.arange(256, dtype=torch.float64, device=device) * (
-        2 * math.pi / 256
-    )
-    rim = centre - radius * torch.stack([torch.cos(azimuth), torch.sin(azimuth)], -1)
-    rim_reach = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
-    rim_p = media.ray_direction(after, rim_reach)[:, None] * rim / rim_reach[:, None]
-    middle = (rim_p.amin(0) + rim_p.amax(0)) / 2
+    middle = middle_direction(after, radius, centre)
     py, px = torch.meshgrid(axis + middle[1], axis + middle[0], indexing="ij")
     p = torch.hypot(px, py).clamp(1e-12, 0.98 * after.layers[0][0])
     reach_per_p = media.lateral_reach(after, p) / p
@@ -96,6 +90,21 @@ def rays(
         middle,
         *path_derivatives(after, middle),
     )
+
+
+def middle_direction(after: Media, radius: float, centre: Tensor) -> Tensor:
+    """(x, y) middle of the directions p from the rim of a round lens to a place.
+
+    Args:
+        after: media behind the pillars.
+        radius: of the lens, um.
+        centre: (x, y) place on the sensor, um.
+    """
+    azimuth = torch.arange(256).to(centre) * (2 * math.pi / 256)
+    rim = centre - radius * torch.stack([torch.cos(azimuth), torch.sin(azimuth)], -1)
+    reach = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
+    p = media.ray_direction(after, reach)[:, None] * rim / reach[:, None]
+    return (p.amin(0) + p.amax(0)) / 2
 
 
 def through_stop(

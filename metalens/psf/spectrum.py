@@ -212,13 +212,12 @@ def _response(curve: "Path | str | SpectralDistribution") -> "SpectralDistributi
 
     if not isinstance(curve, colour.SpectralDistribution):
         known = {
-            name: distribution
-            for table in (
-                colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES, colour.SDS_FILTERS,
-                colour.SDS_LENSES, colour.SDS_LEFS,
-            )
-            for name, distribution in table.items()
-        }  # fmt: skip
+            **colour.SDS_ILLUMINANTS,
+            **colour.SDS_LIGHT_SOURCES,
+            **colour.SDS_FILTERS,
+            **colour.SDS_LENSES,
+            **colour.SDS_LEFS,
+        }
         if Path(curve).is_file():
             nm, values = _read_curve(Path(curve)).T
             curve = colour.SpectralDistribution(values, nm, name=str(curve))

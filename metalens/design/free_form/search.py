@@ -135,9 +135,7 @@ def score_phase(
             )
         values.append(torch.stack(information).mean(0))
         energies.append(torch.stack(encircled).amin(0))
-    if len(values) == 1:
-        return DesignScore(values[0], energies[0])
-    return DesignScore(torch.stack(values), torch.stack(energies))
+    return DesignScore(torch.stack(values).squeeze(0), torch.stack(energies).squeeze(0))
 
 
 def _information_options(settings: ResolvedFisherSettings) -> dict[str, Any]:
