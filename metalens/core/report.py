@@ -59,7 +59,7 @@ class Table:
     @property
     def cells(self) -> list[list[str]]:
         """Rows as text, numbers with ``digits`` significant digits."""
-        return [[self._text(value) for value in row] for row in self.rows]
+        return [[in_figures(value, self.digits) for value in row] for row in self.rows]
 
     @property
     def text(self) -> str:
@@ -74,9 +74,6 @@ class Table:
         """
         rows = align_columns([list(self.head), *self.cells])
         return "\n".join([self.caption, *rows] if self.caption else rows)
-
-    def _text(self, value: Any) -> str:
-        return in_figures(value, self.digits)
 
 
 @dataclass(frozen=True, slots=True)

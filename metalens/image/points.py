@@ -57,14 +57,6 @@ class Window:
             raise PropagationError(
                 f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3"
             )
-        if not 0 <= self.components <= self.whole:
-            raise PropagationError(
-                f"{self.components} components of the field: need 0 to {self.whole}"
-            )
-        if not self.period >= SPARE:
-            raise PropagationError(
-                f"nodes of a period of {self.period} windows: need {SPARE} or more"
-            )
 
     @property
     def whole(self) -> int:

@@ -73,7 +73,10 @@ def stray_of(
     focus = wave.focus
     frame = grid.frame
     d = optics.layers.after(optics.distance_um, focus.wavelength_um).reduced_um
-    depth, source = (_reduced(optics, z) for z in (depth_um, focus.source_distance_um))
+    depth, source = (
+        optics.layers.before(z, focus.wavelength_um).reduced_um
+        for z in (depth_um, focus.source_distance_um)
+    )
     shares = wave.orders(focus.wavelength_um, ORDERS)
     shape = (
         scipy.fft.next_fast_len(2 * frame[0], real=True),
@@ -199,13 +202,6 @@ def _middle(light: Array, place_um: Array, count: int) -> Array:
     centroids = light[bright] @ place_um.ravel() / total[bright]
     directions = np.linspace(0, len(light) - 1, count)
     return np.asarray(np.interp(directions, bright, centroids))
-
-
-def _reduced(optics: Optics, depth_um: float) -> float:
-    """Σ t/n from a source at this depth to the lens; inf for a collimated beam."""
-    if math.isinf(depth_um):
-        return depth_um
-    return optics.layers.before(depth_um, optics.wave.focus.wavelength_um).reduced_um  # type: ignore[attr-defined]
 
 
 def add_stray(image: Tensor, light: Tensor, stray: StrayLight, grid: Grid) -> Tensor:

@@ -393,4 +393,8 @@ def test_source_filter_and_sensor_are_the_product_of_their_curves(folder, capsys
     assert "known from 800 to 900 nm" in capsys.readouterr().err
     assert call(*options, "--source", "LED-B11", "-o", folder / "c.h5") == 2
     assert "'LED-B1'" in capsys.readouterr().err
+    (folder / "bad.csv").write_text("840,1\n850,x\n")
+    for name, named in (("bad.csv", "line 2"), ("none.csv", "cannot be read")):
+        assert call(*options, "--sensor", folder / name, "-o", folder / "c.h5") == 2
+        assert named in capsys.readouterr().err
     assert not (folder / "c.h5").exists()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.core.errors import PropagationError
 from metalens.design import Focus
 from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
 from metalens.image.rays import Rays, polarisation_factors
@@ -201,17 +200,6 @@ def test_the_gradient_of_both_polarisations_is_that_of_differences():
         wide = torch.stack([score(at + s) - score(at - s) for s in step]) / 2e-2
     # float32, steps of 1e-2
     assert torch.allclose(slope, wide, rtol=5e-3, atol=5e-3 * float(wide.abs().max()))
-
-
-def test_a_count_of_components_that_there_is_not_is_refused():
-    with pytest.raises(
-        PropagationError, match="7 components of the field: need 0 to 6"
-    ):
-        Window(5, 1.0, components=7, flux=False)
-    with pytest.raises(
-        PropagationError, match="5 components of the field: need 0 to 4"
-    ):
-        Window(5, 1.0, components=5)
 
 
 @pytest.mark.parametrize("order", [(1.0, 1.5), (1.6, 1.0, 1.3)])

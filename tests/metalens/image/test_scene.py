@@ -57,29 +57,6 @@ def test_constant_radiance_stays_constant_at_every_edge():
     assert (slow - 0.37).abs().max() < 1e-12
 
 
-def _single(frames):
-    return Frames(
-        frames.radiance.float(), frames.coverage.float(), frames.depth_um.float()
-    )
-
-
-def test_constant_radiance_stays_constant_in_single_precision():
-    """The mean is not transformed: nothing is left to round but the mean itself."""
-    image = _imager(STACK.float())(_single(_eye(radiance=0.37)))
-    assert float((image / 0.37 - 1).abs().max()) < 1e-6
-
-
-def test_compiled_weights_give_the_image_of_the_differentiable_path():
-    """In single precision without gradients the weights are compiled; in double
-    precision they are torch's.
-    """
-    frames = _eye()
-    exact = _imager()(frames)
-    quick = _imager(STACK.float())(_single(frames))
-    # depths that round to the next of 4096 codes
-    assert float((quick - exact).norm() / exact.norm()) < 2e-5
-
-
 def test_a_sharp_near_edge_hides_a_blurred_far_sheet():
     """Light of the hidden sheet does not bleed onto the near one; behind the edge its
     colour goes on unchanged.
@@ -133,25 +110,6 @@ def test_few_kernels_meet_the_tolerance(tolerance):
     assert made.error <= tolerance
     error = float((fast - slow).norm() / slow.norm())
     assert error < tolerance + 4e-5  # the look-up table's 4096 depths
-
-
-def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
-    """The image is linear in the radiance: its derivative along a change is the image
-    of the change.
-    """
-    frames = _single(_eye())
-    imager = _imager(STACK.float())
-    change = (
-        torch.rand(frames.radiance.shape, generator=torch.Generator().manual_seed(0))
-        * frames.coverage
-    )
-
-    def seen(light):
-        return imager(Frames(light, frames.coverage, frames.depth_um))
-
-    slope = torch.func.jvp(seen, (frames.radiance,), (change,))[1]
-    # the two paths' depth codes
-    assert float((slope - seen(change)).abs().max()) < 2e-5
 
 
 def test_gradient_reaches_the_psfs():

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.core.errors import PropagationError
 from metalens.optics import Layers
 from metalens.psf import lens_psfs, spectrum
 from tests.referees import vectorial
@@ -234,33 +233,6 @@ def test_energies_of_directions_and_depths_compare_through_the_irradiance_of_a_s
         700.0 / away / away**2, rel=1e-12
     )
     assert stack.irradiance_per_um2[1, 1] == pytest.approx(1500.0**-2, rel=1e-12)
-
-
-def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
-    (tmp_path / "led.csv").write_text(
-        "# LED\nwavelength_nm,power\n830,0.0\n848,7.0\n871,0.0\n"
-    )
-    (tmp_path / "filter.csv").write_text("840;0\n841;3\n860;3\n861;0\n")
-    files = [tmp_path / "led.csv", tmp_path / "filter.csv"]
-    found = spectrum.read_measured_spectrum(files, within_um=(0.8, 0.9))
-    nm = found.wavelengths_um * 1e3
-    assert (nm.min(), nm.max()) == pytest.approx((840.25, 860.75), abs=0.26)
-    fine = np.arange(840, 861, 1e-3)
-    line = np.interp(fine, [830, 848, 871], [0, 7, 0]) * np.interp(
-        fine, [840, 841, 860, 861], [0, 3, 3, 0]
-    )
-    assert found.share @ nm == pytest.approx((line * fine).sum() / line.sum(), abs=0.02)
-    rule = spectrum.spectral_nodes(found, path_um=50.0, tolerance=1e-4)
-    assert rule.weights @ rule.wavelengths_um * 1e3 == pytest.approx(
-        found.share @ nm, rel=1e-9
-    )
-    with pytest.raises(PropagationError, match="pillars are known from 845 to 850"):
-        spectrum.read_measured_spectrum(files, within_um=(0.845, 0.85))
-    (tmp_path / "bad.csv").write_text("840,1\n850,x\n")
-    with pytest.raises(PropagationError, match=r"bad\.csv: line 2"):
-        spectrum.read_measured_spectrum([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
-    with pytest.raises(PropagationError, match=r"none\.csv: cannot be read"):
-        spectrum.read_measured_spectrum([tmp_path / "none.csv"], within_um=(0.8, 0.9))
 
 
 def test_light_of_a_diode_beyond_the_library_is_told():
