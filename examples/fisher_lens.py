@@ -39,7 +39,7 @@ helix = torch.from_numpy(vortex_phase(x, y, radius_um=500.0, zones=2))
 made = design_fisher.optimize_free_form(
     optics, FisherSettings(iterations=150, starts=1).about(aim, optics.radius_um)
 )
-free = design_fisher.phase_on(optics, made)
+free = made.nodes_rad
 print(made.reason, "; information and least energy:", made.starts)
 
 # %% [markdown]

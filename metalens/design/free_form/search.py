@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from metalens.core.arrays import Array
-from metalens.design import Focus, PhaseOf, hyperbolic_phase, vortex_phase
+from metalens.design import Focus, PhaseOf, hyperbolic_phase
 from metalens.design.free_form.settings import FisherSettings, ResolvedFisherSettings
 from metalens.image import (
     Field,
@@ -183,7 +183,6 @@ class FisherPhase:
 
     nodes_rad: (n, n) free phase of every node of the pupil.
     focus_um: source distance of the hyperbolic part.
-    zones: rings of the double helix below, 0 for none.
     score: of this phase.
     converged: whether the encircled energy is kept at every depth.
     starts: (information, least encircled energy) of each start.
@@ -191,7 +190,6 @@ class FisherPhase:
 
     nodes_rad: Tensor
     focus_um: float
-    zones: int
     score: DesignScore
     converged: bool
     starts: tuple[tuple[float, float], ...] = ()
@@ -214,8 +212,7 @@ def fisher_profile(
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase in rad, focus and free form, as a function of position.
 
-    phase(x, y) = hyperbolic phase + free phase of the nearest node + vortices of the
-    double helix.
+    phase(x, y) = hyperbolic phase + free phase of the nearest node.
 
     Args:
         focus: source and sensor distances; its source distance is used where the
@@ -242,9 +239,7 @@ def fisher_profile(
             .astype(np.intp)
             for a in (y, x_um)
         )
-        vortices = vortex_phase(x_um, y, radius_um=radius_um, zones=design.zones)
-        smooth = hyperbolic_phase(x_um, y, base) + vortices
-        return np.asarray(smooth + free_rad[row, column])
+        return np.asarray(hyperbolic_phase(x_um, y, base) + free_rad[row, column])
 
     return phase, design
 
@@ -285,19 +280,9 @@ def optimize_free_form(pupil: Pupil, settings: ResolvedFisherSettings) -> Fisher
             settings.focus_mm[0] + share * (settings.focus_mm[1] - settings.focus_mm[0])
         )
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
-        zones = settings.zones[start % len(settings.zones)]
-        results.append(_climb(pupil, settings, focus, zones, generator))
+        results.append(_climb(pupil, settings, focus, generator))
     starts = tuple((r.rank[1], float(r.score.encircled.min())) for r in results)
     return replace(max(results, key=lambda result: result.rank), starts=starts)
-
-
-def phase_on(pupil: Pupil, profile: FisherPhase) -> Tensor:
-    """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus.
-
-    Args:
-        profile: what was designed or computed.
-    """
-    return _vortices(pupil, profile.zones) + profile.nodes_rad
 
 
 def bspline_weights(position: Array, count: int) -> Array:
@@ -318,7 +303,6 @@ def _climb(
     pupil: Pupil,
     settings: ResolvedFisherSettings,
     focus_um: float,
-    zones: int,
     generator: torch.Generator,
 ) -> FisherPhase:
     """Gradient ascent (Adam) of the objective from one random start, coarse to fine.
@@ -331,14 +315,12 @@ def _climb(
         pupil: sampled pupil of the lens.
         settings: resolved settings of the design.
         focus_um: source distance of the hyperbolic part, um.
-        zones: rings of the double helix; 0 for none.
         generator: of random numbers.
     """
-    base = _vortices(pupil, zones)
-    # on a double helix a tenth of the spread, which keeps its vortices
-    spread = settings.spread_rad * (0.1 if zones else 1.0)
     size = settings.controls
-    values = spread * torch.randn(size, size, generator=generator, dtype=torch.float64)
+    values = settings.spread_rad * torch.randn(
+        size, size, generator=generator, dtype=torch.float64
+    )
     down, across = (
         torch.from_numpy(bspline_weights(axis.ravel() / pupil.radius_um, size))
         for axis in reversed([a.numpy() for a in pupils.coordinates(pupil)])
@@ -350,7 +332,7 @@ def _climb(
     stages = (True, RATE, range(first)), (False, NODE_RATE, range(first, total))
     for smooth, rate, steps in stages:
         if not smooth:
-            values = ((down @ values) * across).sum(1).reshape(base.shape)
+            values = ((down @ values) * across).sum(1).reshape(pupil.nodes, -1)
         values = values.detach().requires_grad_(True)
         optimizer = torch.optim.Adam([values], lr=rate, betas=(0.9, 0.99))
         for done in steps:
@@ -358,8 +340,8 @@ def _climb(
                 group["lr"] = _rate(rate, done, total)
             free = values
             if smooth:
-                free = ((down @ values) * across).sum(1).reshape(base.shape)
-            loss, energy = axial_loss(base + free, pupil, focus_um, settings, generator)
+                free = ((down @ values) * across).sum(1).reshape(pupil.nodes, -1)
+            loss, energy = axial_loss(free, pupil, focus_um, settings, generator)
             missing = torch.relu(settings.encircled + margin - energy)
             loss = loss + _penalty(missing, done / total)
             optimizer.zero_grad()
@@ -368,11 +350,9 @@ def _climb(
             if smooth or ((done + 1) % CHECKS and done + 1 < total):
                 continue
             nodes = values.detach().clone()
-            score = score_phase(
-                base + nodes, pupil, focus_um=focus_um, settings=settings
-            )
+            score = score_phase(nodes, pupil, focus_um=focus_um, settings=settings)
             spare = float(score.encircled.min()) - settings.encircled
-            judged.append(FisherPhase(nodes, focus_um, zones, score, spare >= -5e-4))
+            judged.append(FisherPhase(nodes, focus_um, score, spare >= -5e-4))
             # proportional feedback, so that the figures exceed the bound by 0.0015
             margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
     return max(judged, key=lambda design: design.rank)
@@ -393,9 +373,3 @@ def _penalty(missing: Tensor, share: float) -> Tensor:
         share: of the iterations that are done; the penalty grows fivefold.
     """
     return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
-
-
-def _vortices(pupil: Pupil, zones: int) -> Tensor:
-    """(nodes, nodes) phase of a double helix on the pupil's nodes, rad."""
-    x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
-    return torch.from_numpy(vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones))

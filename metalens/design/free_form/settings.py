@@ -31,8 +31,7 @@ class FisherSettings:
         iterations; after it every node of the pupil (a cell of about 6 um) is free,
         which sends light away best where the energy allows it.
     iterations: of both stages. starts: tried.
-    zones: rings of the double helix that the starts begin from, in turn; 0 for none.
-    spread_rad: deviation of the random start (a tenth of it on a double helix).
+    spread_rad: deviation of the random start.
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
         0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
@@ -47,7 +46,6 @@ class FisherSettings:
     controls: int = 16
     iterations: int = 800
     starts: int = 3
-    zones: tuple[int, ...] = (0,)
     spread_rad: float = field(default=3.0, metadata={"signed": False})
     even: float = 0.1
     normalisation: Literal["sum", "l2"] = "l2"
@@ -81,8 +79,6 @@ class FisherSettings:
                 f"starts, iterations = {self.starts}, {self.iterations}: need 1 or "
                 f"more; controls = {self.controls}: need 4 or more"
             )
-        if not self.zones:
-            raise ConfigError("zones = (): need at least one entry")
 
     def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":
         """Settings for one lens, with its depths, foci and disc where they were left
