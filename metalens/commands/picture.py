@@ -150,6 +150,6 @@ def read_colours(picture: Path) -> Array:
     pixels = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ConfigError(f"{picture}: no picture that can be read (PNG, TIFF, JPEG)")
-    largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    largest = np.iinfo(str(pixels.dtype)).max if pixels.dtype.kind == "u" else 1
     colours = np.atleast_3d(pixels)[..., :3][..., ::-1].astype(np.float32) / largest
     return np.ascontiguousarray(np.moveaxis(colours, -1, 0))

@@ -104,7 +104,8 @@ def middle_direction(after: Media, radius: float, centre: Tensor) -> Tensor:
     rim = centre - radius * torch.stack([torch.cos(azimuth), torch.sin(azimuth)], -1)
     reach = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
     p = media.ray_direction(after, reach)[:, None] * rim / reach[:, None]
-    return (p.amin(0) + p.amax(0)) / 2
+    middle: Tensor = (p.amin(0) + p.amax(0)) / 2
+    return middle
 
 
 def through_stop(

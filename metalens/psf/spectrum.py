@@ -210,29 +210,28 @@ def _response(curve: "Path | str | SpectralDistribution") -> "SpectralDistributi
     """
     import colour
 
-    if not isinstance(curve, colour.SpectralDistribution):
-        known = {
-            **colour.SDS_ILLUMINANTS,
-            **colour.SDS_LIGHT_SOURCES,
-            **colour.SDS_FILTERS,
-            **colour.SDS_LENSES,
-            **colour.SDS_LEFS,
-        }
-        if Path(curve).is_file():
-            nm, values = _read_curve(Path(curve)).T
-            curve = colour.SpectralDistribution(values, nm, name=str(curve))
-        elif str(curve) in known:
-            curve = known[str(curve)]
-        else:
-            name = str(curve)
-            hint = "" if Path(name).suffix else nearest_name_hint(name, known)
-            raise PropagationError(
-                f"{name}: cannot be read: no such file, nor a distribution of "
-                f"colour-science{hint}"
-            )
-    if not (curve.range >= 0).all():
-        raise PropagationError(f"spectrum: {curve.name} has values below 0")
-    response = curve.copy()
+    known = {
+        **colour.SDS_ILLUMINANTS,
+        **colour.SDS_LIGHT_SOURCES,
+        **colour.SDS_FILTERS,
+        **colour.SDS_LENSES,
+        **colour.SDS_LEFS,
+    }
+    if not isinstance(curve, str | Path):
+        response = curve.copy()
+    elif Path(curve).is_file():
+        nm, values = _read_curve(Path(curve)).T
+        response = colour.SpectralDistribution(values, nm, name=str(curve))
+    elif str(curve) in known:
+        response = known[str(curve)].copy()
+    else:
+        hint = "" if Path(curve).suffix else nearest_name_hint(str(curve), known)
+        raise PropagationError(
+            f"{curve}: cannot be read: no such file, nor a distribution of "
+            f"colour-science{hint}"
+        )
+    if not (response.range >= 0).all():
+        raise PropagationError(f"spectrum: {response.name} has values below 0")
     response.interpolator = colour.LinearInterpolator
     return response
 
