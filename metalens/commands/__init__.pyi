@@ -1,3 +1,4 @@
+from . import picture as picture
 from .common import MASKS as MASKS
 from .common import CommonOptions as CommonOptions
 from .common import DistributedOptions as DistributedOptions
