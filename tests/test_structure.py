@@ -248,6 +248,7 @@ def test_no_module_takes_the_name_of_a_standard_one():
 
 IMPORTED_AS = {  # the last three come with the package that they are named after here
     "cv2": "opencv-contrib-python-headless",
+    "colour": "colour-science",
     "OCP": "build123d",
     "cycler": "matplotlib",
     "mpl_toolkits": "matplotlib",

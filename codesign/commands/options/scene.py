@@ -1,6 +1,4 @@
-"""SCENE.toml to rendered eyes: a contact sheet, masks and labels; or a picture through a
-lens.
-"""
+"""Rendered eyes of SCENE.toml, or a picture through a lens."""
 
 from dataclasses import dataclass
 from pathlib import Path
