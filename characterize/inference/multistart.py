@@ -2,7 +2,6 @@
 to the end.
 """
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from characterize.model import (
     parameter_vector,
     usual_parameters,
 )
+from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.lens import Lens
@@ -170,11 +170,16 @@ def follow_starts(
         ends: the fits so far, best first.
         begins: (p,) starts.
     """
-    problem, trials = task.posed(), list[FitSolution]()
-    for begin in begins:
-        if all(sigma_distance(begin, end) > 2.0 for end in ends):
-            with contextlib.suppress(FitError):  # starts outside the model's range
-                trials.append(problem.fit(begin, _TRIAL, ends[0].slopes))
+    problem = task.posed()
+
+    def attempt(begin: Array) -> FitSolution | None:
+        try:
+            return problem.fit(begin, _TRIAL, ends[0].slopes)
+        except FitError:  # outside the model's range
+            return None
+
+    far = [x for x in begins if all(sigma_distance(x, end) > 2.0 for end in ends)]
+    trials = [trial for trial in threads.run_each(attempt, far) if trial is not None]
     modes = list(ends)
     for trial in sorted(trials, key=lambda trial: trial.merit):
         if (
