@@ -84,7 +84,7 @@ def train(polynomials, steps=200):
     trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
     losses = [record.task for record in trainer.run()]
     seen = assess.sensor_frames(trainer, batches, 6)
-    recalibrate_batch_norm(made.net, member, assess.batched_frames(seen))
+    recalibrate_batch_norm(made.net, member, seen.frames.split(seen.batch))
     return trainer, losses
 
 

@@ -27,8 +27,6 @@ from codesign.train import (
 )
 from metalens import lens as lenses
 
-APART = 7919  # difference of the seeds of retrainings, so that their steps differ
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NetworkAccuracy:
@@ -197,7 +195,8 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
     Args:
         inner: of the run. config: of the retraining.
     """
-    seed = inner.seed + APART * (config.seed + 1)
+    # a prime apart, so that steps of different retrainings differ
+    seed = inner.seed + 7919 * (config.seed + 1)
     return inner.fine_tuning(config.steps, seed, weights=config.rate)
 
 

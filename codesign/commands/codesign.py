@@ -37,7 +37,6 @@ CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
 SETTINGS = "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
-SHOWN = 8  # test frames that are kept with the answers
 
 
 def run(options: Options) -> int:
@@ -239,7 +238,7 @@ def _write_results(
         f"network_{i}": f"budget {row['budget_mmacs']:g} million MACs"
         for i, row in enumerate(rows)
     }
-    answers = results.predictions_of_frames(ends, SHOWN)
+    answers = results.predictions_of_frames(ends, count=8)
     store.save(folder / ANSWERS, "answers", answers, attributes=labels)
 
 

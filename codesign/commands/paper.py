@@ -19,7 +19,6 @@ from metalens.core import report, store
 from metalens.core.errors import ConfigError
 
 JSON, PAGE = "paper.json", "report.html"
-DIM_DB = 15.0
 
 
 def run(options: Options) -> int:
@@ -107,7 +106,7 @@ def _run_measurements(options: Options, folder: Path) -> None:
     config = ExperimentConfig(subjects=options.subjects)
     for name, settings in (
         ("experiment", config),
-        ("dim", replace(config, snr_db=DIM_DB)),
+        ("dim", replace(config, snr_db=15.0)),
     ):
         if not (folder / name / "experiment.json").is_file():
             options.console.say(f"measuring: {name}")

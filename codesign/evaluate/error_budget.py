@@ -31,8 +31,6 @@ from metalens.psf import neighbour_coupling
 NONE = math.nan
 TOTAL, MEASURED = "all links", "measured, all at once"
 SOLVED = 12  # diameters at which pillars are solved again
-FINER = 30.0  # factor by which the tolerance of those solutions is smaller
-THINNED = 320  # frames on which small changes of the optics are judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +144,8 @@ class NetworkReading:
         self.judged = self.trial.group(experiment.AXIAL)
         self.judged[calibration] = False
         rows = np.flatnonzero(self.judged)
-        self._rows = rows[:: max(1, len(rows) // THINNED)]
+        # some 320 frames judge small changes of the optics
+        self._rows = rows[:: max(1, len(rows) // 320)]
         self._thinned = [
             frames.rows(torch.from_numpy(self._rows[of_subject] % len(states)))
             for subject, frames in enumerate(self.subjects)
@@ -418,7 +417,7 @@ class ErrorBudget:
 
     def _solver(self) -> Iterator[BudgetEntry]:
         """Entries of pillar solver and proxy, against a solver with a tolerance
-        ``FINER`` times smaller.
+        30 times smaller.
 
         The complex ratio at ``SOLVED`` diameters is interpolated to every pillar,
         linearly in its logarithm.
@@ -426,7 +425,7 @@ class ErrorBudget:
         lens = self.lens
         library = self.given.library
         diameters_um = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
-        tolerance = (library.sweep.bar if library else self.given.tolerance) / FINER
+        tolerance = (library.sweep.bar if library else self.given.tolerance) / 30
         engine = workers.choose_engine(lens.cell)
         solve = workers.solve_to_tolerance(
             lens.cell, Incidence(lens.wavelength_um), tolerance=tolerance, engine=engine

@@ -41,7 +41,6 @@ from metalens.image import Imager, Sensor, low_snr
 AXIAL, LATERAL = "axial", "lateral"
 # streams of the random generator
 LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
-TURNS = 4  # corrections of an eye's direction, each leaves a twentieth of the error
 BEFORE, EACH = 100_000, 120  # people who calibrated before: first number, frames each
 
 
@@ -219,7 +218,7 @@ def turn_eyes(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
         gaze_rad=torch.from_numpy(np.radians(looks_deg)) + kappa,
         mount_rad=unmounted,
     )
-    for _ in range(TURNS):
+    for _ in range(4):  # each leaves a twentieth of the error
         error_deg = looks_deg - face_angles(eye.eye_axes(turned, rig)[1].numpy(), rig)
         turned = replace(
             turned, gaze_rad=turned.gaze_rad + torch.from_numpy(np.radians(error_deg))

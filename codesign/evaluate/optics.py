@@ -18,7 +18,6 @@ from metalens.image import Frames, Grid, Normalisation, axial_information, image
 from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens, passed_um2
 
-WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 KINDS = ("gaze", "slip", "separability")
 
 
@@ -82,7 +81,7 @@ class MeasurementSettings:
             lens, pixel_um * min(self.binnings)
         )
         window_um = self.window_um or reach.window_um(
-            lens, (nearest_um, farthest_um), airy=WINDOW
+            lens, (nearest_um, farthest_um), airy=56.4
         )
         return replace(
             self,

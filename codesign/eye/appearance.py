@@ -44,11 +44,7 @@ CAUSES: Mapping[str, FrameAugmentation] = {
     name: FrameAugmentation(**row)
     for name, row in tomllib.loads(_DATA.read_text("utf-8")).items()
 }
-RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
-TAPS = 15  # of the kernel of a movement, at most its length
-SHIFT = 4  # binary places of a pixel that lashes are drawn to
 ARC = np.linspace(0, 1, 5)  # along a lash
-SHADES = (110, 160, 210, 255)  # of lashes in turn, of 255
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -232,11 +228,11 @@ def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
             rise * ARC**2 - sink * ARC
         )
         points = np.stack([roots[:, None] + lean[:, None] * ARC, height], 2)
-        strokes = np.round(points * 2**SHIFT).astype(np.int32)
+        strokes = np.round(points * 16).astype(np.int32)
         thick = max(1, size // 200)
-        for k, shade in enumerate(SHADES):
-            some = list(strokes[k :: len(SHADES)])
-            cv2.polylines(canvas, some, False, shade, thick, cv2.LINE_AA, SHIFT)
+        for k, shade in enumerate((110, 160, 210, 255)):
+            some = list(strokes[k::4])
+            cv2.polylines(canvas, some, False, shade, thick, cv2.LINE_AA, shift=4)
     return torch.from_numpy(canvas).float() / 255
 
 
@@ -293,7 +289,7 @@ def _add_reflections(canvas: _Canvas, radiance: float, draws: Array) -> None:
 
 def _add_rim(canvas: _Canvas, width: float, draws: Array) -> None:
     """Add an opaque rim of spectacles before the face: a band along a circular arc at
-    RIM_DEPTH of the eye's median depth, on the near sheet.
+    0.7 of the eye's median depth (some 6 mm before the face), on the near sheet.
     """
     x, y = canvas.places
     radius = 0.45 + 0.5 * draws[6]
@@ -306,7 +302,7 @@ def _add_rim(canvas: _Canvas, width: float, draws: Array) -> None:
     light, cover, depth = canvas.light, canvas.cover, canvas.depth
     # the far sheet's depth is 0 behind skin, most of many frames
     eye_depths = depth[1][depth[1] > 0]
-    rim_depth = (eye_depths if len(eye_depths) else depth[0]).median() * RIM_DEPTH
+    rim_depth = (eye_depths if len(eye_depths) else depth[0]).median() * 0.7
     for hidden in (light, cover, canvas.pupil):
         hidden *= 1 - band
     light[0] += band * shine
@@ -349,10 +345,10 @@ def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     32 points of the line, each shared bilinearly between four pixels.
 
     Args:
-        length_px: length of the motion in pixels, limited to the kernel's TAPS.
+        length_px: length of the motion in pixels, limited to the kernel's 15 taps.
         angle_rad: angle of the line to the x axis.
     """
-    reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
+    reach = min(int(np.ceil(length_px / 2)), 7)
     along = ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach)
     cells = np.arange(-reach, reach + 1)
     columns, rows = (

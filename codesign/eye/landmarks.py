@@ -11,18 +11,15 @@ NAMES = (
     "medial canthus", "lateral canthus", "upper margin", "lower margin",
     "limbus temporal", "limbus down", "limbus nasal", "limbus up", "corneal apex",
 )  # fmt: skip
-CONVERGED_UM = 1e-6  # converged distance on the iris: 1e-9 of a tangent
-# least depth of projected points; also for points behind the camera
-NEAREST_UM = 500.0
 
 
 def project_points(points_um: Tensor) -> Tensor:
-    """(..., 2) tangents x / z, y / z of points (..., 3).
+    """(..., 2) tangents x / z, y / z of points (..., 3), z of 500 um at least.
 
     Args:
         points_um: (..., 3) points before the camera.
     """
-    return points_um[..., :2] / points_um[..., 2:].clamp_min(NEAREST_UM)
+    return points_um[..., :2] / points_um[..., 2:].clamp_min(500.0)
 
 
 def landmark_points(p: Mapping[str, Tensor]) -> Tensor:
@@ -127,7 +124,8 @@ def iris_to_camera(
     for _ in range(steps):
         here, right, down = trace_to_iris(p, tangents + offsets[:, None, None])
         error = here - iris_um
-        if not tangents.requires_grad and float(error.abs().max()) < CONVERGED_UM:
+        # 1e-6 um on the iris are 1e-9 of a tangent
+        if not tangents.requires_grad and float(error.abs().max()) < 1e-6:
             break
         slope = torch.stack([right - here, down - here], -1) / 1e-6
         step = torch.linalg.solve_ex(slope, error[..., None])[0][..., 0]

@@ -34,7 +34,6 @@ POPULATION: Mapping[str, SubjectTrait] = {
 TEXTURES = (
     "t_iris", "t_vein", "t_skin", "t_fine", "t_lash", "offset_x", "offset_y", "turn",
 )  # fmt: skip
-BLEND_UM = 1600.0  # over which lid shell and face plane run into each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +255,8 @@ def model_parameters(
         "pupil_r": t["pupil_radius_um"],
         "pupil_d": pupil_plane,
         "lid_r": sclera + t["lid_thickness_um"],
-        "blend": torch.full_like(size, BLEND_UM),
+        # over which lid shell and face plane run into each other
+        "blend": torch.full_like(size, 1600.0),
         "edge": 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0,
         "upper": upper,
         "lower": lower,

@@ -21,13 +21,6 @@ from metalens.core.errors import TrainingError
 # head), its radius 0.6 mm (size, and magnification by the cornea), angles between sphere
 # and gaze 5 degrees (kappa and mounting), roll 0.05 rad.
 SPREAD = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
-# error of a frame in the first fit, weighed against SPREAD; in the second the residual
-# of the first, 0.3 at least
-READING_DEG = 1.0
-# of the regressor's weights: from ten clean points to eight noisy points
-PENALTIES = 0.01, 0.1, 1.0, 10.0
-FOLDS = 4  # that the penalty is chosen over
-TRIAL_STEPS = 40  # of a fit whose penalty is on trial
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,7 +93,8 @@ class SphereCalibrator:
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
 
         Minimises |gaze error / reading|² + |parameters / SPREAD|² twice, the second
-        time with the residual of the first as reading error. The regressor learns the
+        time with the residual of the first (1 degree in the first fit, 0.3 at least) as
+        reading error. The regressor learns the
         remaining errors; its penalty is 1 where there are no more points than
         parameters of the sphere, else cross-validated.
 
@@ -126,7 +120,7 @@ class SphereCalibrator:
             error = sphere_of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
             return np.concatenate([error.ravel() / reading_deg, unit])
 
-        own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
+        own = least_squares(residual, np.zeros(len(SPREAD)), args=(1.0,)).x
         degrees_of_freedom = max(1, 2 * len(pupil) - len(own))
         square = (residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum()
         reading_deg = max(0.3, float(np.sqrt(square / degrees_of_freedom)))
@@ -157,11 +151,11 @@ def _cross_validated_penalty(
         features: (n, 5). errors: (n, 2) errors of the sphere, deg.
     """
     _, stimulus = np.unique(gaze_deg, axis=0, return_inverse=True)
-    fold: Array = np.ravel(stimulus) % FOLDS
+    fold: Array = np.ravel(stimulus) % 4
 
     def validation_error(penalty: float) -> float:
         total = 0.0
-        for number in range(FOLDS):
+        for number in range(4):
             held_out = fold == number
             if held_out.any() and (~held_out).sum() >= 3:
                 fitted = regressor.fit_regressor(
@@ -170,14 +164,14 @@ def _cross_validated_penalty(
                     hidden=hidden,
                     penalty=penalty,
                     seed=seed,
-                    steps=TRIAL_STEPS,
+                    steps=40,
                 )
                 total += float(
                     ((fitted(features[held_out]) - errors[held_out]) ** 2).sum()
                 )
         return total
 
-    return min(PENALTIES, key=validation_error)
+    return min((0.01, 0.1, 1.0, 10.0), key=validation_error)
 
 
 def angle_deg(one: Array, other: Array) -> Array:

@@ -13,10 +13,6 @@ from metalens.core.arrays import Array
 from metalens.core.errors import StoreError, TrainingError
 from metalens.core.store import typed_reader
 
-# of expectation maximisation: predictions have converged, variances near 0 still fall
-ROUNDS = 40
-# initial deviations between people: of the offset, and of any other term per unit
-KAPPA_DEG, OTHERS_DEG = 5.0, 1.0
 LEAST = 1e-9  # deg²: lower bound of variances
 
 
@@ -56,7 +52,7 @@ class MixedModel:
 
 
 def fit_mixed_model(
-    design: Array, gaze_deg: Array, person: Array, *, first: Array, rounds: int = ROUNDS
+    design: Array, gaze_deg: Array, person: Array, *, first: Array, rounds: int = 40
 ) -> MixedModel:
     """Linear mixed model of largest likelihood, by ``rounds`` of expectation
     maximisation.
@@ -184,8 +180,9 @@ def learn_population(
     readings = _joined_readings(read)
     middle, spread = readings.mean(0), np.maximum(readings.std(0), 1e-9)
     design = _quadratic_terms(readings, middle, spread)
-    first = np.full(design.shape[1], OTHERS_DEG**2)
-    first[0] = KAPPA_DEG**2
+    # deg², between people: of the offset (kappa), and of any other term per unit
+    first = np.ones(design.shape[1])
+    first[0] = 25.0
     return PopulationPrior(
         fit_mixed_model(design, gaze_deg - _axis_deg(read), person, first=first),
         middle,

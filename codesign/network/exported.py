@@ -16,7 +16,6 @@ from codesign.network.architecture import Architecture
 from codesign.network.supernet import Supernet
 from metalens.core.store import replace_atomically
 
-OPSET = 17
 FRAMES = "pixels of the sensor, rows from the top, in any unit: every frame is brought to mean 0 and deviation 1"
 OUTPUTS = {  # name: what it is
     "mask_logits": "(batch, y, x) log odds of the pupil, on a grid over the whole frame",
@@ -128,7 +127,7 @@ def write_onnx(
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 network, (example,), str(part), dynamo=False, input_names=["frames"], output_names=list(names),
-                opset_version=OPSET, dynamic_axes={name: {0: "batch"} for name in ("frames", *names)},
+                opset_version=17, dynamic_axes={name: {0: "batch"} for name in ("frames", *names)},
             )  # fmt: skip
         with torch.no_grad():
             values = network(example)

@@ -8,10 +8,7 @@ from torch.nn import functional as F
 
 from codesign.network.supernet import NetworkPrediction
 
-SPREAD_WEIGHT = 0.1  # of the uncertainty's own loss: it moves its own layer alone
 POINT_UNIT, AXIS_UNIT = 0.05, 0.1  # of the image's width; of a unit vector: 6 degrees
-# of these units: linear beyond half a per cent of the image, and 2 degrees
-POINT_KNEE, AXIS_KNEE = 0.1, 0.3
 
 
 def dice_loss(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
@@ -115,7 +112,7 @@ def depth_reading_loss(
     error = (prediction.slip - slip_mm / scale_mm).detach()
     variance = torch.exp(2 * prediction.slip_log_sd)
     uncertainty = F.gaussian_nll_loss(error, torch.zeros_like(error), variance)
-    return depth_weight * depth + SPREAD_WEIGHT * uncertainty
+    return depth_weight * depth + 0.1 * uncertainty  # it moves its own layer alone
 
 
 def pose_loss(
@@ -135,14 +132,11 @@ def pose_loss(
     """
     inside = (points.abs() < 0.5).all(-1)
     point_error = F.smooth_l1_loss(
-        prediction.points / POINT_UNIT,
-        points / POINT_UNIT,
-        beta=POINT_KNEE,
-        reduction="none",
+        prediction.points / POINT_UNIT, points / POINT_UNIT, beta=0.1, reduction="none"
     ).mean(-1)
     point_loss = (point_error * inside).sum() / inside.sum().clamp_min(1)
     axis_loss = F.smooth_l1_loss(
-        prediction.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=AXIS_KNEE
+        prediction.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=0.3
     )
     return axis_weight * axis_loss + point_weight * point_loss
 

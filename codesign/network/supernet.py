@@ -30,10 +30,6 @@ from codesign.network.cost import (
 from codesign.network.windows import resample_image
 from metalens.core.errors import TrainingError
 
-BATCHES = 100  # batches that the means reach back over
-# added to the variance: a wave that is rare in frames is not amplified without bound
-EPSILON = 1e-2
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NetworkPrediction:
@@ -117,10 +113,10 @@ class SlicedNorm(nn.Module):
 
 
 class RunningNorm(nn.Module):
-    """(x - m) / sqrt(v + EPSILON) a channel, m and v those of the last batches, this
+    """(x - m) / sqrt(v + 0.01) a channel, m and v those of the last batches, this
     one included.
 
-    Of n batches the n-th has a share of 1 / n, from BATCHES batches on of 1 / BATCHES.
+    Of n batches the n-th has a share of 1 / n, from 100 batches on of 1 / 100.
     Gradients do not go through m and v.
     Evaluation moves nothing, nor does a batch that is not finite. In double precision:
     a power's mean is many times its
@@ -142,7 +138,8 @@ class RunningNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if self.training:
             self._follow(x)
-        scale = torch.rsqrt((self.square - self.mean**2).clamp_min(0) + EPSILON)
+        # a wave that is rare in frames is not amplified without bound
+        scale = torch.rsqrt((self.square - self.mean**2).clamp_min(0) + 1e-2)
         return (x - self.mean.to(x)[:, None, None]) * scale.to(x)[:, None, None]
 
     @torch.no_grad()
@@ -158,7 +155,7 @@ class RunningNorm(nn.Module):
             )
         if bool(torch.isfinite(moments).all()):
             self.batches += 1
-            share = 1 / min(int(self.batches), BATCHES)
+            share = 1 / min(int(self.batches), 100)
             self.mean.lerp_(moments[0], share)
             self.square.lerp_(moments[1], share)
 

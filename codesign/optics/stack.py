@@ -54,8 +54,6 @@ from metalens.optics.paths import sensor_path, source_path
 from metalens.psf import Source
 
 Family = Literal["free", "radial"]
-SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
-ROWS = 64  # of pillars whose phase is computed at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,7 +324,7 @@ def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
     """The trained phase, rad, as a function of pillar positions in um.
 
     The sum of the hyperbolic focus and :func:`phase_at`, for
-    :func:`metalens.design.make`; computed in blocks of ROWS rows.
+    :func:`metalens.design.make`; computed in blocks of 64 rows.
 
     Args:
         settings: of the lens and its image.
@@ -336,8 +334,7 @@ def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
     def phase(x_um: Array, y_um: Array) -> Array:
         x, y = (torch.from_numpy(np.asarray(a, float)) for a in (x_um, y_um[:, None]))
         blocks = [
-            phase_at(settings, coefficients_rad, x, rows)
-            for rows in torch.split(y, ROWS)
+            phase_at(settings, coefficients_rad, x, rows) for rows in torch.split(y, 64)
         ]
         focus = profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
         return np.asarray(focus + torch.cat(blocks).numpy())
@@ -375,7 +372,7 @@ def trained_lens(
     width_um = 0.0 if light is None else light.fwhm_nm * 1e-3
 
     def lens_of_band(half_um: float) -> Lens:
-        offsets_um = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
+        offsets_um = np.linspace(-half_um, half_um, 5 if half_um else 1)
         wavelengths_um = tuple((offsets_um + middle_um).tolist())
         cells = library.sweep(settings.cell, wavelengths_um=wavelengths_um)
         lens, _ = make(

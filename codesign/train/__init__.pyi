@@ -10,7 +10,6 @@ from .assess import bootstrap_interval as bootstrap_interval
 from .assess import bootstrap_ratio as bootstrap_ratio
 from .evolution import EvaluatedCandidate as EvaluatedCandidate
 from .evolution import best_candidate as best_candidate
-from .evolution import pareto_front as pareto_front
 from .imaging import frame_wide as frame_wide
 from .imaging import read_out as read_out
 from .results import BudgetResult as BudgetResult

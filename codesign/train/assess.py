@@ -241,7 +241,7 @@ def predict_frames(
     net.eval()
     device = next(net.parameters()).device
     predictions = [
-        net(part.to(device), architecture) for part in batched_frames(frames)
+        net(part.to(device), architecture) for part in frames.frames.split(frames.batch)
     ]
     net.train(was_training)
     slip, centre, mask, log_sd, depth, axis = (
@@ -261,18 +261,6 @@ def predict_frames(
     )
 
 
-def batched_frames(frames: SensorFrames) -> list[Tensor]:
-    """Frames a batch at a time.
-
-    Args:
-        frames: frames of the sensor with their truth.
-    """
-    return [
-        frames.frames[i : i + frames.batch]
-        for i in range(0, len(frames.frames), frames.batch)
-    ]
-
-
 def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
     """Training frames in batches, to measure batch statistics on; never frames for
     scores.
@@ -284,7 +272,8 @@ def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
     """
     stacks = trainer.light.stacks
     if not stacks:
-        return batched_frames(sensor_frames(trainer, trainer.scenes, batches))
+        frames = sensor_frames(trainer, trainer.scenes, batches)
+        return list(frames.frames.split(frames.batch))
     return [
         sensor_frames(trainer, trainer.scenes, 1, stack=made, first=number).frames
         for number, made in zip(range(batches), itertools.cycle(stacks), strict=False)

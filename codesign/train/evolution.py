@@ -160,8 +160,7 @@ def search(
     budget: float,
     seed: int,
 ) -> tuple[EvaluatedCandidate, ...]:
-    """A whole search: every candidate in order of birth; :func:`best_candidate` and
-    :func:`pareto_front` read it.
+    """A whole search: every candidate in order of birth (:func:`best_candidate`).
 
     Args:
         plan: of the search. evaluate: error of an architecture.
@@ -228,26 +227,6 @@ def best_candidate(candidates: Sequence[EvaluatedCandidate]) -> EvaluatedCandida
         candidates: with error and cost.
     """
     return min(candidates, key=lambda c: (_rank(c.error), c.macs))
-
-
-def pareto_front(
-    candidates: Sequence[EvaluatedCandidate],
-) -> tuple[EvaluatedCandidate, ...]:
-    """Candidates that no other beats in both error and cost, cheapest first.
-
-    In order of cost, each with a lower error than all before it; non-finite errors are
-    left out.
-
-    Args:
-        candidates: with error and cost.
-    """
-    front: list[EvaluatedCandidate] = []
-    for candidate in sorted(candidates, key=lambda c: (c.macs, _rank(c.error))):
-        if np.isfinite(candidate.error) and (
-            not front or candidate.error < front[-1].error
-        ):
-            front.append(candidate)
-    return tuple(front)
 
 
 def sample_sandwich(

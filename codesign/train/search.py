@@ -20,7 +20,6 @@ from codesign.train.run import CodesignRun, finest_pitch_um, save_run
 from codesign.train.trainer import Trainer
 
 PEOPLE_EACH = 20  # frames of a person, of which a fifth calibrates
-SLOWER = 4  # rates of the inner optimisation are those of training over this
 
 
 def specialise_candidate(
@@ -41,8 +40,9 @@ def specialise_candidate(
     key = repr((architecture, budget_mmacs)).encode()
     seed = source.inner.seed + 1000 + zlib.crc32(key) % 1_000_003
     steps = settings.search.inner_steps, settings.run.finetune_steps
+    # a quarter of those of training
     rates = {
-        name: getattr(source.inner, name).rate / SLOWER
+        name: getattr(source.inner, name).rate / 4
         for name in ("weights", "optics", "pitch")
     }
     joint = source.inner.fine_tuning(steps[0], seed, **rates)

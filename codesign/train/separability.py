@@ -25,7 +25,6 @@ from metalens.image import (
 from metalens.image import sensor as camera
 
 Motions = Literal["axial", "all"]
-STREAM = 4  # of the scenes: no other frames are drawn from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +104,8 @@ def triplet_frames(
         scenes: frames by number. config: motions, steps and weights of Eq. 6.
         step: number of the training step.
     """
-    anchors = replace(scenes, stream=STREAM).states(step, config.triplets)
+    # no other frames are drawn from this stream
+    anchors = replace(scenes, stream=4).states(step, config.triplets)
     return [
         render(states, rig=scenes.rig, camera=scenes.camera, exposed=anchors).frames
         for states in moved_states(anchors, config.directions)

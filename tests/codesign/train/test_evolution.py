@@ -7,8 +7,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from codesign.network import architecture as arch
 from codesign.network import cost
@@ -107,28 +105,11 @@ def test_a_network_that_diverged_is_never_the_best():
     bad = EvaluatedCandidate(arch.smallest_architecture(SPACE), float("nan"), 1.0)
     good = EvaluatedCandidate(arch.largest_architecture(SPACE), 5.0, 2.0)
     assert evolution.best_candidate([bad, good]) == good
-    assert evolution.pareto_front([bad, good]) == (good,)
 
 
 def test_budget_below_the_smallest_network_is_refused():
     with pytest.raises(TrainingError, match="below the smallest network"):
         _run(budget=1e5)
-
-
-@given(st.lists(st.tuples(st.floats(0, 10), st.floats(1, 10)), min_size=1, max_size=30))
-def test_pareto_set_is_what_no_other_beats(points):
-    candidates = [
-        EvaluatedCandidate(arch.smallest_architecture(SPACE), e, m) for e, m in points
-    ]
-    front = evolution.pareto_front(candidates)
-    for member in front:
-        assert not any(
-            (c.error < member.error and c.macs <= member.macs)
-            or (c.error <= member.error and c.macs < member.macs)
-            for c in candidates
-        )
-    for c in candidates:
-        assert any(m.error <= c.error and m.macs <= c.macs for m in front)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.03, 0.1, 0.3, 0.9])
