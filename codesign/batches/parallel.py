@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from codesign.batches.surface_frames import FrameBatch
+from codesign.eye.population import select_rows
 from metalens.core.errors import TrainingError
 
 
@@ -81,17 +82,10 @@ def batch_share(batch: FrameBatch) -> FrameBatch:
         )
     rows = slice(process_rank() * size, (process_rank() + 1) * size)
     return FrameBatch(
-        _rows(batch.frames, rows),
+        select_rows(batch.frames, rows),
         batch.mask[rows],
         batch.slip_mm[rows],
-        None if batch.pose is None else _rows(batch.pose, rows),
-    )
-
-
-def _rows(record: Any, rows: slice) -> Any:
-    """The selected frames of a record of tensors."""
-    return type(record)(
-        *(getattr(record, name)[rows] for name in type(record).__slots__)
+        None if batch.pose is None else select_rows(batch.pose, rows),
     )
 
 

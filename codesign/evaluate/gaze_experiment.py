@@ -59,9 +59,7 @@ class ExperimentTrials:
     slip_mm: Array
 
     def __getitem__(self, rows: Array) -> "ExperimentTrials":
-        return ExperimentTrials(
-            *(getattr(self, name)[rows] for name in ExperimentTrials.__slots__)
-        )
+        return eye.select_rows(self, rows)
 
     def group(self, kind: str) -> Array:
         """(n,) True for frames of the axial or lateral states; both hold the origin.

@@ -258,14 +258,7 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumbe
 
 def _load_json(path: Path, *needed: str) -> dict[str, Any]:
     """Content of a JSON file; refuses one that lacks a ``needed`` key."""
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise StoreError(f"{path}: no such file; measure it first") from None
-    except json.JSONDecodeError as error:
-        raise StoreError(
-            f"{path}: not a JSON file ({error}); measure it again"
-        ) from None
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     missing = [name for name in needed if name not in content]
     if missing:
         raise StoreError(

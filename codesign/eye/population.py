@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -34,6 +35,19 @@ POPULATION: Mapping[str, SubjectTrait] = {
 TEXTURES = (
     "t_iris", "t_vein", "t_skin", "t_fine", "t_lash", "offset_x", "offset_y", "turn",
 )  # fmt: skip
+
+
+Record = TypeVar("Record")
+
+
+def select_rows(record: Record, rows: Any) -> Record:
+    """The same rows of every array of a record.
+
+    Args:
+        record: dataclass of arrays alone. rows: their numbers, a slice or a mask.
+    """
+    names = type(record).__slots__  # type: ignore[attr-defined]
+    return type(record)(*(getattr(record, name)[rows] for name in names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +129,7 @@ class EyeStates:
         return len(self.traits)
 
     def __getitem__(self, rows: slice | Tensor) -> "EyeStates":
-        return EyeStates(*(getattr(self, name)[rows] for name in self.__slots__))
+        return select_rows(self, rows)
 
     def trait(self, name: str) -> Tensor:
         """(n,) values of one trait.

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from codesign.eye.population import (
     _turn,
     eye_axes,
     model_parameters,
+    select_rows,
 )
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
@@ -102,12 +102,11 @@ class RenderedFrames:
 
     def rows(self, rows: Tensor) -> "RenderedFrames":
         """Some of the frames with their labels; ``rows``: their numbers."""
-
-        def of(record: Any) -> Any:
-            parts = (getattr(record, name)[rows] for name in type(record).__slots__)
-            return type(record)(*parts)
-
-        return RenderedFrames(of(self.frames), self.pupil[rows], of(self.labels))
+        return RenderedFrames(
+            select_rows(self.frames, rows),
+            self.pupil[rows],
+            select_rows(self.labels, rows),
+        )
 
     def pinhole(self) -> Tensor:
         """(n, y, x) what a perfect lens would show."""

@@ -131,10 +131,6 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
     Raises:
         ConfigError: less than 16 pixels remain.
     """
-    if not (pitch_um > 0 and window_um > 0 and 0 < resolution <= 1):
-        raise ConfigError(
-            f"window {window_um} um, pitch {pitch_um} um, resolution {resolution}: need all above 0"
-        )
     size = window_um / pitch_um * resolution
     if size < LEAST_SIZE:
         raise ConfigError(

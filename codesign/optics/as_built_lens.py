@@ -3,7 +3,7 @@ averaged over cells of the pupil.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 import torch
@@ -106,6 +106,7 @@ class PillarCells:
         return self.t
 
 
+@dataclass(eq=False)
 class MadeLens:
     """A design that returns the PSFs of any lens fabricated from it.
 
@@ -117,16 +118,14 @@ class MadeLens:
     it.
     """
 
-    def __init__(
-        self,
-        design: Lens,
-        settings: OpticsConfig,
-        *,
-        response: Sensitivity | None = None,
-    ) -> None:
-        self.design = design
-        self.settings = settings
-        self.response = response or proxy_sensitivity(design)
+    design: Lens
+    settings: OpticsConfig
+    _: KW_ONLY
+    response: Sensitivity = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        design, settings = self.design, self.settings
+        self.response = self.response or proxy_sensitivity(design)
         d = design.diameters
         self.focus = Focus(
             design.wavelength_um, design.sensor_distance_um, design.source_distance_um

@@ -4,7 +4,7 @@ formed anew where it moved, and their frames on the sensor.
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from metalens.psf import pixel_count
 Draw = Callable[[int], DrawnLensErrors | None]
 
 
+@dataclass(eq=False)
 class StepImaging:
     """Imager of the frames of every step: kept while the lens is fixed, renewed as it
     moves.
@@ -34,27 +35,20 @@ class StepImaging:
     formed every ``refresh`` steps and when the lens stops. Between these it is that of
     the last time, while the gradient is that of the present lens (see
     :mod:`codesign.optics.image_formation`).
+
+    stacks: PSFs of a lens that is made, one of them a step. draw: error of a made lens,
+    by step.
     """
 
-    def __init__(
-        self,
-        optics: OpticsConfig,
-        stacks: Sequence[PixelPsfStack],
-        *,
-        refresh: int,
-        draws: int,
-        seed: int,
-        draw: Draw,
-    ) -> None:
-        """``stacks``: PSFs of a lens that is made, one of them a step. ``draw``: error
-        of a made lens, by step.
-        """
-        self.optics = optics
-        self.stacks = tuple(stacks)
-        self.draw = draw
-        self.refresh = refresh
-        self.draws = draws
-        self.seed = seed
+    optics: OpticsConfig
+    stacks: Sequence[PixelPsfStack]
+    _: KW_ONLY
+    refresh: int
+    draws: int
+    seed: int
+    draw: Draw
+
+    def __post_init__(self) -> None:
         self.imaged_step = -1
         self.imaged_rad = torch.zeros(0, dtype=torch.float64)
         # of images and losses: see :func:`codesign.train.place_on_device`

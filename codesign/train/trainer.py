@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -319,52 +319,39 @@ class LogRecord:
     skipped: int
 
 
+@dataclass(eq=False)
 class Trainer:
     """The loop with its optimisers; ``state`` and ``restore`` keep everything that a
     resume needs.
+
+    inner: settings of the loop. optics: of the lens and its image. sensor: its pixels
+    and noise. scenes: frames by step number. model: network, lens and pitch to train.
+    architecture: the only member that is trained; None trains sampled members.
+    stacks: PSFs of a fabricated lens; every step draws one of them, and no optics move.
+    budgets_mmacs: one a step, in turn, where ``inner`` names none.
+    largest_only: train the largest member alone.
+    triplets: scenes that the triplets of Eq. 6 are drawn from.
     """
 
-    def __init__(
-        self,
-        inner: InnerConfig,
-        optics: OpticsConfig,
-        sensor: Sensor,
-        scenes: SceneSource,
-        model: TrainedModel,
-        *,
-        architecture: Architecture | None = None,
-        stacks: Sequence[PixelPsfStack] = (),
-        budgets_mmacs: Sequence[float] = (),
-        largest_only: bool = False,
-        triplets: EyeScenes | None = None,
-    ) -> None:
-        """One training.
+    inner: InnerConfig
+    optics: OpticsConfig
+    sensor: Sensor
+    scenes: SceneSource
+    model: TrainedModel
+    _: KW_ONLY
+    architecture: Architecture | None = None
+    stacks: Sequence[PixelPsfStack] = ()
+    budgets_mmacs: Sequence[float] = ()
+    largest_only: bool = False
+    triplets: EyeScenes | None = None
 
-        Args:
-            inner: settings of the loop. optics: of the lens and its image.
-            sensor: its pixels and noise. scenes: frames by step number.
-            model: network, lens and pitch to train.
-            architecture: the only member that is trained; None trains sampled members.
-            stacks: PSFs of a fabricated lens; every step draws one of them, and no
-                optics move.
-            budgets_mmacs: one a step, in turn, where ``inner`` names none.
-            largest_only: train the largest member alone.
-            triplets: scenes that the triplets of Eq. 6 are drawn from.
-        """
-        self.largest_only = largest_only
-        self.triplets = triplets
-        self.budgets_mmacs = (
-            (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
-        )
-        self.inner = inner
-        self.optics = optics
-        self.sensor = sensor
-        self.scenes = scenes
-        self.model = model
-        self.architecture = architecture
+    def __post_init__(self) -> None:
+        inner, model = self.inner, self.model
+        if inner.budget_mmacs:
+            self.budgets_mmacs = (inner.budget_mmacs,)
         self.light = StepImaging(
-            optics,
-            stacks,
+            self.optics,
+            self.stacks,
             refresh=inner.refresh,
             draws=inner.draws,
             seed=inner.seed,

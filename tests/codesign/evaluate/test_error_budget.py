@@ -14,6 +14,7 @@ from codesign.commands import budget as command
 from codesign.evaluate import error_budget, gaze_experiment
 from codesign.evaluate.error_budget import TOTAL, BudgetEntry, BudgetInputs, ErrorBudget
 from codesign.optics import MadeLens, OpticsConfig
+from codesign.optics.stack import lens_settings
 from codesign.settings import ExperimentConfig
 from metalens import design, lens
 from metalens.cell import Cell, Film, Index
@@ -64,7 +65,7 @@ def test_the_phase_of_a_process_is_that_of_the_slope_of_the_pillars():
     """A gradient of g from edge to edge turns a pillar at u of the radius by slope g u /
     2, and u has the deviation 1/2 over a disc; a common bias turns all alike.
     """
-    made = MadeLens(small(), error_budget.settings_of(small(), 0.0))
+    made = MadeLens(small(), lens_settings(small(), 0.0))
     want = SLOPE * 1.7e-3 / 4
     spread = Spread.only(gradient_nm=1.7)
     got = scatter(made, [d.state() for d in draw_lenses(spread, 400, seed=2)])
