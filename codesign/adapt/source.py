@@ -171,10 +171,9 @@ def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
     lenses = design, result.design
     shapes = [(d.diameter_um.shape, d.pitch_um) for d in (a.diameters for a in lenses)]
     distances_um = [lens.sensor_distance_um for lens in lenses]
+    own_um, other_um = (lens.diameters.diameter_um for lens in lenses)
     same = shapes[0] == shapes[1] and distances_um[0] == distances_um[1]
-    if not same or not np.allclose(
-        *(lens.diameters.diameter_um for lens in lenses), rtol=0, atol=1e-6
-    ):
+    if not same or np.abs(own_um - other_um).max() > 1e-6:
         raise FitError(
             "the as-built record is of another lens: shapes and pitches of the run's lens and of the record are "
             f"{shapes}, sensor distances {distances_um} um, or diameters differ; fit captures of the run's own lens.h5"

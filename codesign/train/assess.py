@@ -241,7 +241,8 @@ def predict_frames(
     net.eval()
     device = next(net.parameters()).device
     predictions = [
-        net(part.to(device), architecture) for part in frames.frames.split(frames.batch)
+        net(part.to(device), architecture)
+        for part in torch.split(frames.frames, frames.batch)
     ]
     net.train(was_training)
     slip, centre, mask, log_sd, depth, axis = (
@@ -273,7 +274,7 @@ def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
     stacks = trainer.light.stacks
     if not stacks:
         frames = sensor_frames(trainer, trainer.scenes, batches)
-        return list(frames.frames.split(frames.batch))
+        return list(torch.split(frames.frames, frames.batch))
     return [
         sensor_frames(trainer, trainer.scenes, 1, stack=made, first=number).frames
         for number, made in zip(range(batches), itertools.cycle(stacks), strict=False)
