@@ -13,13 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from codesign.eye.population import CameraRig, EyeStates
-from codesign.eye.renderer import (
-    FrameLabels,
-    PinholeCamera,
-    RenderedFrames,
-    mask_centroid,
-    render,
-)
+from codesign.eye.renderer import PinholeCamera, RenderedFrames, render
 from metalens.core.arrays import Array
 from metalens.image import Frames
 
@@ -144,11 +138,11 @@ def apply_augmentations(
         for name, paint in PAINTERS.items():
             if size := float(worn.size[name][i]):
                 paint(canvas, size, worn.draws[name][i])
-    return RenderedFrames(
-        Frames(light, cover, depth),
-        pupil,
-        _updated_labels(rendered.labels, rendered.pupil, pupil),
-    )
+    before, after = (mask.sum((1, 2)).double() for mask in (rendered.pupil, pupil))
+    share = torch.where(before > 1e-6, after / before.clamp_min(1e-9), 1.0)
+    visible = (rendered.labels.visible * share).clamp(max=1.0)
+    labels = replace(rendered.labels, visible=visible)
+    return RenderedFrames(Frames(light, cover, depth), pupil, labels)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -357,15 +351,3 @@ def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     )
     kernel = rows.T @ columns
     return torch.from_numpy(kernel / kernel.sum()).float()
-
-
-def _updated_labels(labels: FrameLabels, before: Tensor, after: Tensor) -> FrameLabels:
-    """Labels with centroid and visible share of the pupil recomputed for its new mask.
-
-    before, after: (n, y, x) masks. An empty mask has the centroid ``pupil_px``.
-    """
-    area_before, _ = mask_centroid(before, labels.pupil_px)
-    area, centroid = mask_centroid(after, labels.pupil_px)
-    share = torch.where(area_before > 1e-6, area / area_before.clamp_min(1e-9), 1.0)
-    visible = (labels.visible * share).clamp(max=1.0)
-    return replace(labels, visible=visible, centroid_px=centroid)

@@ -72,7 +72,6 @@ class FrameLabels:
     optic_axis, visual_axis: (n, 3) unit vectors, pointing out of the eye.
     centre_um, pupil_um: (n, 3) centre of rotation and of the pupil.
     pupil_px: (n, 2) where the refracted centre of the pupil lands (x, y).
-    centroid_px: (n, 2) centroid of the visible pupil; ``pupil_px`` where none is seen.
     visible: (n,) seen share of the pupil's area, 0 where it is hidden or out of the
     frame.
     landmarks_px: (n, len(landmarks.NAMES), 2).
@@ -85,7 +84,6 @@ class FrameLabels:
     centre_um: Tensor
     pupil_um: Tensor
     pupil_px: Tensor
-    centroid_px: Tensor
     visible: Tensor
     landmarks_px: Tensor
 
@@ -118,7 +116,6 @@ def render(
     *,
     rig: CameraRig | None = None,
     camera: PinholeCamera | None = None,
-    texture_seed: int = 0,
     exposed: EyeStates | None = None,
 ) -> RenderedFrames:
     """Render states with labels, pupil masks and depth, float32, on all threads of
@@ -126,7 +123,7 @@ def render(
 
     Args:
         states: subjects with gaze and slippage. rig: pose of camera and lamps.
-        camera: pixel grid; the defaults without both. texture_seed: of the textures.
+        camera: pixel grid; the defaults without both.
         exposed: states that the automatic exposure was set at; by default these.
 
     Raises:
@@ -137,7 +134,7 @@ def render(
         states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed
     )
     rays = camera.tangents(rig).astype(np.float32)
-    bank = textures.packed_bank(texture_seed)
+    bank = textures.packed_bank()
     columns = [p[name] for name in kernel.VECTORS + kernel.NUMBERS]
     rows = torch.cat([c.reshape(len(c), -1) for c in columns], 1).float().numpy()
     planes = torch.from_numpy(kernel.render_frames(rows, bank, rays))
@@ -180,7 +177,7 @@ def _labels(
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
-    visible_area, centroid = mask_centroid(mask, middle)
+    visible_area = mask.sum((1, 2)).double()
     return FrameLabels(
         slip_um=scale * (nominal + states.slip_um) - nominal,
         shift_um=scale * (unslipped + states.slip_um) - nominal,
@@ -189,20 +186,6 @@ def _labels(
         centre_um=scale * centre,
         pupil_um=scale * pupil,
         pupil_px=middle,
-        centroid_px=centroid,
         visible=(visible_area / area.clamp_min(1e-6)).clamp(0, 1),
         landmarks_px=camera.position_px(landmark_points(p), rig),
     )
-
-
-def mask_centroid(mask: Tensor, default: Tensor) -> tuple[Tensor, Tensor]:
-    """(n,) area of masks in pixels, and (n, 2) their centroid x, y.
-
-    Args:
-        mask: (n, y, x) coverage. default: (n, 2) centroid of an empty mask.
-    """
-    area = mask.sum((1, 2)).double()
-    index = torch.arange(mask.shape[-1], dtype=torch.float64)
-    sums = torch.stack([(mask.sum(k).double() * index).sum(1) for k in (1, 2)], 1)
-    centroid = sums / area.clamp_min(1e-9)[:, None]
-    return area, torch.where(area[:, None] > 1e-6, centroid, default)

@@ -37,15 +37,12 @@ def texture_bank(seed: int = 0) -> Array:
     return out
 
 
-@functools.lru_cache(maxsize=2)
-def packed_bank(seed: int = 0) -> Array:
+@functools.lru_cache(maxsize=1)
+def packed_bank() -> Array:
     """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its
     right neighbour, flat.
-
-    Args:
-        seed: of the random generator.
     """
-    steps = np.round(texture_bank(seed) * STEPS).astype(np.int32)
+    steps = np.round(texture_bank() * STEPS).astype(np.int32)
     out = ((steps & 0xFFFF) | (np.roll(steps, -1, axis=2) << 16)).ravel()
     out.flags.writeable = False
     return out

@@ -110,15 +110,15 @@ class Architecture:
     resolution: float = 1.0
 
 
-def round_channels(channels: float, divisor: int = 8) -> int:
-    """Channels rounded to a multiple of ``divisor``, at least 0.9 of the given number
-    (MobileNet convention).
+def round_channels(channels: float) -> int:
+    """Channels rounded to a multiple of 8, at least 0.9 of the given number (MobileNet
+    convention).
 
     Args:
-        channels: number before rounding. divisor: of the result.
+        channels: number before rounding.
     """
-    rounded = max(divisor, int(channels + divisor / 2) // divisor * divisor)
-    return rounded + divisor if rounded < 0.9 * channels else rounded
+    rounded = max(8, int(channels + 4) // 8 * 8)
+    return rounded + 8 if rounded < 0.9 * channels else rounded
 
 
 def stem_channels(space: SearchSpace, architecture: Architecture) -> int:

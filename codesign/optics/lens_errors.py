@@ -123,7 +123,7 @@ def wave_front_rad(state: State, u: Tensor, v: Tensor, rates: PhaseRates) -> Ten
     return torch.from_numpy(mean_phase + state.phase_rad(x, y)).to(u.device)
 
 
-def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
+def variance_rad2(state: State, rates: PhaseRates) -> float:
     """Variance of the pillar phases about their shared wave front, rad².
 
     Mean over the aperture of r^T C r, r the bias and the other causes, C the covariance
@@ -131,11 +131,10 @@ def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
 
     Args:
         state: perturbations by the process. rates: phase rates of the unit cell.
-        rings: Gauss nodes over the radius.
     """
-    node, weight = np.polynomial.legendre.leggauss(rings)
+    node, weight = np.polynomial.legendre.leggauss(12)
     radius = np.sqrt((node[:, None] + 1) / 2)
-    angle = np.arange(2 * rings) * (math.pi / rings)
+    angle = np.arange(24) * (math.pi / 12)
     bias = state.bias_um(radius * np.cos(angle), radius * np.sin(angle))
     amounts = state.response_amounts()
     # means over the aperture of the bias and its square

@@ -77,14 +77,13 @@ class EvolutionState:
     generator: dict[str, Any] = field(default_factory=dict)
 
 
-Evaluate = Callable[[Architecture], float]
 Count = Callable[[Architecture], float]
 
 
 def evolve_population(
     space: SearchSpace,
     plan: EvolutionSettings,
-    evaluate: Evaluate,
+    evaluate: Count,
     count: Count,
     *,
     budget: float,
@@ -154,7 +153,7 @@ def evolve_population(
 def search(
     space: SearchSpace,
     plan: EvolutionSettings,
-    evaluate: Evaluate,
+    evaluate: Count,
     count: Count,
     *,
     budget: float,
@@ -215,18 +214,13 @@ def _draw_within_budget(
     return None
 
 
-def _rank(error: float) -> float:
-    """The error as a sort key: infinite where it is not finite."""
-    return error if np.isfinite(error) else np.inf
-
-
 def best_candidate(candidates: Sequence[EvaluatedCandidate]) -> EvaluatedCandidate:
     """The candidate of least error; of equals, the cheapest.
 
     Args:
         candidates: with error and cost.
     """
-    return min(candidates, key=lambda c: (_rank(c.error), c.macs))
+    return min(candidates, key=lambda c: (not np.isfinite(c.error), c.error, c.macs))
 
 
 def sample_sandwich(
