@@ -56,7 +56,11 @@ def run(options: Options) -> int:
     return options.console.judged(
         {"lines": values, "folder": str(folder)},
         f"{table}\nopen {folder / PAGE}",
-        measurement_failures(folder),
+        [
+            f"{name}: {words}"
+            for name, path in measurement_files(folder).items()
+            for words in json.loads(path.read_text("utf-8")).get("failures", [])
+        ],
     )
 
 
@@ -65,15 +69,6 @@ def measurement_files(folder: Path) -> dict[str, Path]:
     names = {"experiment": "experiment", "dim": "experiment", "optics": "optics"}
     files = {name: folder / name / f"{file}.json" for name, file in names.items()}
     return {name: path for name, path in files.items() if path.is_file()}
-
-
-def measurement_failures(folder: Path) -> list[str]:
-    """Checks that the measurements in ``folder`` failed, each with its measurement."""
-    return [
-        f"{name}: {words}"
-        for name, path in measurement_files(folder).items()
-        for words in json.loads(path.read_text("utf-8")).get("failures", [])
-    ]
 
 
 def collect_measurements(

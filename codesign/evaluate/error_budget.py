@@ -1,7 +1,8 @@
 """The error budget of a lens: each link of the chain as phase, PSF and gaze error."""
 
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from codesign.adapt.source import check_lens
 from codesign.batches import EXPERIMENT
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.eye import RenderedFrames
-from codesign.gaze import NetworkReadings, PersonCalibrator, angle_deg
+from codesign.gaze import NetworkReadings, PersonCalibrator, SphereCalibrator, angle_deg
 from codesign.optics import MadeLens, OpticsConfig, image_formation
 from codesign.optics.stack import lens_settings
 from codesign.settings import ExperimentConfig
@@ -164,7 +165,11 @@ class NetworkReading:
             settings: optics that ``image`` was formed by.
         """
         config, source = self.config, self.source
-        exact = NetworkReadings(self._true_pupil_mm(), self.trial.slip_mm)
+        camera = self.scenes.camera
+        pupil_px = torch.cat([frames.labels.pupil_px for frames in self.subjects])
+        centred_px = pupil_px.double().numpy() - (camera.pixels - 1) / 2
+        pupil_mm = centred_px * camera.pitch_um * 1e-3
+        exact = NetworkReadings(pupil_mm, self.trial.slip_mm)
         trained_imager = experiment.prepare_run(source, image="trained")
         calibrator = experiment.run_calibrator(
             source, trained_imager, config, self.sensor
@@ -173,7 +178,7 @@ class NetworkReading:
             self._read(self.subjects, trained_imager, quiet=is_quiet)
             for is_quiet in (True, False)
         )
-        sphere = experiment.sphere_calibrator(source, config)
+        sphere = SphereCalibrator(self.scenes.rig, config.hidden, config.seed)
         states = [
             ("subject and calibration", exact, sphere,
              f"true pupil and slippage; fixation scatters by {config.fixation_deg:g} deg; {config.subjects} subjects, "
@@ -218,13 +223,6 @@ class NetworkReading:
             for imager in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
-
-    def _true_pupil_mm(self) -> Array:
-        """(n, 2) true pupil on the sensor from the labels of the frames."""
-        camera = self.scenes.camera
-        pupil_px = torch.cat([frames.labels.pupil_px for frames in self.subjects])
-        centred = pupil_px.double().numpy() - (camera.pixels - 1) / 2
-        return np.asarray(centred * camera.pitch_um * 1e-3)
 
     def _error_rad(self, read: NetworkReadings, calibrator: PersonCalibrator) -> float:
         """Mean gaze error in rad under axial slippage, with calibrations from the same
@@ -322,14 +320,16 @@ class ErrorBudget:
             FitError: the as-built file is of another lens.
         """
         rows: list[BudgetEntry] = []
-        parts = (
-            self._network, self._pillar_device, self._solver,
-            self._neighbours, self._mask, self._process, self._calibration,
-        )  # fmt: skip
-        for part in parts:
-            for entry in part():
-                rows.append(entry)
-                yield entry
+        unknown = "not known: no run was given (--run)"
+        path: Iterable[BudgetEntry] = [BudgetEntry("reader", NONE, NONE, NONE, unknown)]
+        if self.reading is not None:
+            path = self.reading.path(self.smooth, self.settings)
+        for entry in itertools.chain(
+            path, self._pillar_device(), self._solver(), self._neighbours(),
+            self._mask(), self._process(), self._calibration(),
+        ):  # fmt: skip
+            rows.append(entry)
+            yield entry
         if self.reading is not None:
             method = f"virtual experiment on these {self.given.frames.frames} frames"
             gaze = self.reading.measured_rad
@@ -386,13 +386,6 @@ class ErrorBudget:
         phase_rad = scatter_rad(self._pillars(made, state, factor), self.base)
         image = image_through(optics, self.image)
         return self._entry(link, image, method, phase_rad=phase_rad)
-
-    def _network(self) -> Iterator[BudgetEntry]:
-        if self.reading is None:
-            method = "not known: no run was given (--run)"
-            yield BudgetEntry("reader", NONE, NONE, NONE, method)
-            return
-        yield from self.reading.path(self.smooth, self.settings)
 
     def _pillar_device(self) -> Iterator[BudgetEntry]:
         """Entries of discrete pillars, of the films and of both polarisations."""

@@ -466,21 +466,6 @@ def _imager_of(source: FinishedRun, settings: OpticsConfig) -> Imager:
     )
 
 
-def sphere_calibrator(
-    source: FinishedRun, config: ExperimentConfig
-) -> SphereCalibrator:
-    """Calibrator by pupil and slippage alone, without the optic axis: eye sphere and
-    regressor.
-
-    Args:
-        source: finished run: its network, lens and sensor.
-        config: subjects, stimuli, slippage and calibration.
-    """
-    return SphereCalibrator(
-        source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed
-    )
-
-
 @torch.no_grad()
 def run_calibrator(
     source: FinishedRun, imager: Imager, config: ExperimentConfig, sensor: Sensor
@@ -521,7 +506,7 @@ def run_calibrator(
         )
         stimuli_deg.append(trial.stimulus_deg[rows])
         if predictions[0].axis is None:
-            return sphere_calibrator(source, config)
+            return SphereCalibrator(scenes.rig, config.hidden, config.seed)
     person_of_frame = np.repeat(np.arange(config.people), list(map(len, stimuli_deg)))
     return shared.learn_population(
         collect_readings(predictions, source),

@@ -66,10 +66,16 @@ def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
     test frames.
     """
     settings = run.settings
+    budgets = settings.run.budgets_mmacs
+    if len(run.searches) < len(budgets):
+        raise TrainingError(
+            f"{len(run.searches)} of {len(budgets)} searches are done; resume the run"
+        )
     people = people_of(run, TEST, settings.test_batches)
     frames: _TestFrames | None = None
     results = []
-    for budget, best in _best_by_budget(run):
+    for budget, state in zip(budgets, run.searches, strict=True):
+        best = evolution.best_candidate(state.history)
         trainer = specialise_candidate(run, best.architecture, budget)
         if frames is None or settings.search.inner_steps:
             frames = _test_frames(replace(run, trainer=trainer), people)
@@ -159,24 +165,6 @@ def _evaluate_budget(
     )
     row["architecture"] = evolution.candidate_to_json(best)
     return BudgetResult(row, trainer, frames.test, predictions, half_width)
-
-
-def _best_by_budget(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
-    """(budget, best candidate of its search) of every budget.
-
-    Raises:
-        TrainingError: a search is missing.
-    """
-    settings = run.settings
-    if len(run.searches) < len(settings.run.budgets_mmacs):
-        raise TrainingError(
-            f"{len(run.searches)} of {len(settings.run.budgets_mmacs)} searches are "
-            "done; resume the run"
-        )
-    return [
-        (b, evolution.best_candidate(s.history))
-        for b, s in zip(settings.run.budgets_mmacs, run.searches, strict=True)
-    ]
 
 
 def _errors(
