@@ -168,15 +168,21 @@ def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
     Raises:
         FitError: either of the two, with what to do.
     """
-    lenses = design, result.design
-    shapes = [(d.diameter_um.shape, d.pitch_um) for d in (a.diameters for a in lenses)]
-    distances_um = [lens.sensor_distance_um for lens in lenses]
-    own_um, other_um = (lens.diameters.diameter_um for lens in lenses)
-    same = shapes[0] == shapes[1] and distances_um[0] == distances_um[1]
-    if not same or np.abs(own_um - other_um).max() > 1e-6:
+    own, other = design.diameters, result.design.diameters
+    if (
+        own.diameter_um.shape != other.diameter_um.shape
+        or own.pitch_um != other.pitch_um
+    ):
         raise FitError(
-            "the as-built record is of another lens: shapes and pitches of the run's lens and of the record are "
-            f"{shapes}, sensor distances {distances_um} um, or diameters differ; fit captures of the run's own lens.h5"
+            f"the as-built record is of another lens: {other.diameter_um.shape} pillars of pitch {other.pitch_um} um, "
+            f"the run's lens has {own.diameter_um.shape} of {own.pitch_um} um; fit captures of the run's own lens.h5"
+        )
+    gap_um = float(np.abs(own.diameter_um - other.diameter_um).max())
+    if gap_um > 1e-6 or design.sensor_distance_um != result.design.sensor_distance_um:
+        raise FitError(
+            f"the as-built record is of another lens: designed diameters differ by up to {gap_um * 1e3:.1f} nm, sensor "
+            f"distances are {design.sensor_distance_um} and {result.design.sensor_distance_um} um; "
+            "fit captures of the run's own lens.h5"
         )
     if not result.trusted and not insist:
         raise FitError(

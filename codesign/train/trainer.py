@@ -465,23 +465,6 @@ class Trainer:
             self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
         )
 
-    def _read_pixels(self, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
-        """(batch, 1, rows, columns) standardised frames of the sensor.
-
-        All readings of a step draw the same noise, so that members differ by their
-        weights alone. ``resized``: as in :func:`codesign.train.imaging.read_out`.
-        """
-        noise = seeded_generator(self.inner.seed, self.step, 1)
-        return read_out(
-            light,
-            self.optics.sample_um,
-            pitch,
-            self.sensor,
-            generator=noise,
-            exact=False,
-            resized=resized,
-        )
-
     def _losses(
         self, batch: FrameBatch, light: Tensor, *, pitch_moves: bool
     ) -> tuple[Tensor, Tensor]:
@@ -511,8 +494,17 @@ class Trainer:
             lambda a: cost.count_macs(space, a, pixels * a.resolution)
         )
         resized = {a: pitch_moves and a.resolution < 1 for a in members}
+        # all readings draw the same noise, so that members differ by their weights alone
         frames = {
-            coarser: self._read_pixels(light, pitch, coarser)
+            coarser: read_out(
+                light,
+                self.optics.sample_um,
+                pitch,
+                self.sensor,
+                generator=seeded_generator(self.inner.seed, self.step, 1),
+                exact=False,
+                resized=coarser,
+            )
             for coarser in set(resized.values())
         }
         depths = depth_um(batch.frames, margin=self.scenes.margin, device=device)
