@@ -143,20 +143,18 @@ def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float
     return _sum_in_place(results).tolist()
 
 
-def batch_norm(
-    x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5
-) -> Tensor:
+def batch_norm(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Batch normalisation with the statistics of all processes' frames; differentiable.
 
     Args:
         x: (batch, channels, y, x) features. weight: (channels,) scale.
-        bias: (channels,) offset. epsilon: added to the variance.
+        bias: (channels,) offset.
     """
     count = x.numel() // x.shape[1] * process_count()
     mean = _differentiable_sum(x.sum((0, 2, 3))) / count
     centred = x - mean[:, None, None]
     variance = _differentiable_sum(centred.square().sum((0, 2, 3))) / count
-    scale = weight * torch.rsqrt(variance + epsilon)
+    scale = weight * torch.rsqrt(variance + 1e-5)
     return centred * scale[:, None, None] + bias[:, None, None]
 
 

@@ -113,16 +113,13 @@ class SceneConfig:
         """The ranges that states are drawn from, at unit scale."""
         depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)
         wide = widen_motion(self.variety)
+        x_mm, y_mm, z_mm = self.slip_mm
         return replace(
             wide,
             population={**wide.population, "depth_um": depth},
             gaze_x_rad=math.radians(self.gaze_deg[0]),
             gaze_y_rad=math.radians(self.gaze_deg[1]),
-            slip_um=(
-                self.slip_mm[0] * 1e3,
-                self.slip_mm[1] * 1e3,
-                self.slip_mm[2] * 1e3,
-            ),
+            slip_um=(1e3 * x_mm, 1e3 * y_mm, 1e3 * z_mm),
         )
 
 

@@ -234,21 +234,10 @@ def uniform_image_error(
         frame,
         margin=margin,
     )
-    return relative_image_difference(uniform, true)
-
-
-@torch.no_grad()
-def relative_image_difference(one: Imager, true: Imager) -> float:
-    """Relative L2 difference of two images of a texture in depth, over its contrast.
-
-    |image - reference| / |reference - mean|; the reference is the ``true`` image
-    without stray light. Both are of frames of one size, with the same margin.
-    """
     frames = textured_frames(true.grid)
     reference = replace(true, stray=None)(frames)
-    return float(
-        (one(frames) - reference).norm() / (reference - reference.mean()).norm()
-    )
+    contrast = (reference - reference.mean()).norm()
+    return float((uniform(frames) - reference).norm() / contrast)
 
 
 def image_tolerance_problem(settings: OpticsConfig, imager_used: Imager) -> str:

@@ -192,9 +192,7 @@ class OpticsConfig:
         )
         width = self.window_samples * self.sample_um * 1.05
         nodes = max(64, math.ceil(width * 2 * rough.edge / rough.wavelength_um / 2) * 2)
-        return Pupil(
-            rough.radius_um, rough.sensor_distance_um, rough.wavelength_um, nodes
-        )
+        return replace(rough, nodes=nodes)
 
     @property
     def depths_um(self) -> Tensor:
@@ -628,20 +626,14 @@ def phase_at(
         x_um: x on the lens. y_um: y on the lens.
         error: assembly and process error of one lens; None for none.
     """
-    rim_um = settings.aperture_mm * 500
-    total = double_helix_phase(x_um / rim_um, y_um / rim_um, settings.zones)
+    x, y = (place_um / (settings.aperture_mm * 500) for place_um in (x_um, y_um))
+    total = double_helix_phase(x, y, settings.zones)
     if settings.polynomials:
-        mix = _orthonormal_mix(settings.pupil, settings.polynomials, settings.family)
-        weights = mix.mT @ coefficients_rad.double()
-        terms = torch.stack(
-            phase_terms(
-                x_um / rim_um, y_um / rim_um, settings.polynomials, settings.family
-            )
-        )
+        kind = settings.polynomials, settings.family
+        weights = _orthonormal_mix(settings.pupil, *kind).mT @ coefficients_rad.double()
+        terms = torch.stack(phase_terms(x, y, *kind))
         total = total + torch.einsum("n,nyx->yx", weights.to(terms.device), terms)
-    if error is None:
-        return total
-    return total + _wave_front(settings, error, x_um / rim_um, y_um / rim_um)
+    return total if error is None else total + _wave_front(settings, error, x, y)
 
 
 def _wave_front(

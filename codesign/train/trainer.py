@@ -114,15 +114,6 @@ class TrainedModel:
         self.coefficients_rad.copy_(state["coefficients_rad"])
         self.log_pitch.copy_(state["log_pitch"])
 
-    @torch.no_grad()
-    def clamp_pitch(self, finest_um: float, coarsest_um: float) -> None:
-        """Clamp the pitch to a range in place.
-
-        Args:
-            finest_um: least pitch. coarsest_um: largest pitch.
-        """
-        self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
-
 
 def make_model(
     settings: OpticsConfig,
@@ -647,7 +638,9 @@ class Trainer:
             finest = min(
                 max(self.optics.sample_um, self.model.finest_um), self._begins_um
             )
-            self.model.clamp_pitch(finest, max(self._coarsest_um, self._begins_um))
+            coarsest = max(self._coarsest_um, self._begins_um)
+            with torch.no_grad():
+                self.model.log_pitch.clamp_(math.log(finest), math.log(coarsest))
 
 
 def compute_ahead(work: Callable[[int], Made], steps: range) -> Iterator[Made]:
