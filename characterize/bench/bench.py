@@ -221,34 +221,22 @@ def _frame_groups(
     """
     distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
     films = FilmStack.of(lens.layers, lens.wavelength_um)
+    tilt, offset_um, decentre_um = (
+        np.array([x[PLACE[name.format(axis)]] for axis in "xy"])
+        for name in ("tilt_{}_deg", "source_{}_um", "decentre_{}_um")
+    )
+    chief = np.tan(angles_rad) + np.tan(np.radians(tilt))
+    sources = chief - offset_um / films.apparent_um(depth_um)[:, None]
     groups: dict[_Incidence, list[int]] = {}
-    for i, (depth, angle) in enumerate(
-        zip(depth_um.tolist(), angles_rad.tolist(), strict=True)
-    ):
-        chief = [
-            math.tan(axis_angle) + math.tan(math.radians(x[PLACE[f"tilt_{axis}_deg"]]))
-            for axis_angle, axis in zip(angle, "xy", strict=True)
-        ]
-        source = [
-            c - x[PLACE[f"source_{axis}_um"]] / films.apparent_um(depth)
-            for c, axis in zip(chief, "xy", strict=True)
-        ]
-        crossings = zip(
-            *(
-                films.chief_um(distance, (direction[0], direction[1]))
-                for direction in (chief, source)
-            ),
-            strict=True,
+    for i, (ray, source) in enumerate(zip(chief, sources, strict=True)):
+        crossings = [films.chief_um(distance, (x, y)) for x, y in (ray, source)]
+        shift = decentre_um + np.subtract(*crossings)
+        incidence = _Incidence(
+            (float(source[0]), float(source[1])),
+            (float(shift[0]), float(shift[1])),
+            incidence_rad(lens.proxy, np.arctan(source).tolist()),
         )
-        shift = [
-            c - s + x[PLACE[f"decentre_{axis}_um"]]
-            for (c, s), axis in zip(crossings, "xy", strict=True)
-        ]
-        incidence_angle = incidence_rad(lens.proxy, [math.atan(s) for s in source])
-        groups.setdefault(
-            _Incidence((source[0], source[1]), (shift[0], shift[1]), incidence_angle),
-            [],
-        ).append(i)
+        groups.setdefault(incidence, []).append(i)
     samples = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
     block_size = 1 if x[PLACE["glass_um"]] else max(1, _BLOCK_SAMPLES // samples)
     for incidence, index in groups.items():

@@ -8,7 +8,7 @@ from .frames import MIRRORED as MIRRORED
 from .frames import TURNS as TURNS
 from .frames import FrameSpectra as FrameSpectra
 from .frames import above_rim as above_rim
-from .frames import normalized_cross_correlation as normalized_cross_correlation
+from .frames import best_shift as best_shift
 from .frames import orient_frames as orient_frames
 from .frames import relative_orientation as relative_orientation
 from .frames import shift_frames as shift_frames

@@ -7,6 +7,8 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from metalens.core import reading
 from metalens.core.errors import CaptureError
 
@@ -90,19 +92,15 @@ def find_table(folder: Path, kind: str) -> Path | None:
             would read.
     """
     suffixes, other_suffixes = _TABLES[kind]
-    files = {
-        path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()
-    }
-    if table := next(
-        (files[kind + suffix] for suffix in suffixes if kind + suffix in files), None
-    ):
-        return table
-    if unread := next(
-        (files[kind + suffix] for suffix in other_suffixes if kind + suffix in files),
-        None,
-    ):
+    files = {path.name.lower(): path for path in sorted(folder.iterdir())}
+    for suffix in suffixes + other_suffixes:
+        table = files.get(kind + suffix)
+        if table is None or not table.is_file():
+            continue
+        if suffix in suffixes:
+            return table
         raise CaptureError(
-            f"{unread}: not read, and nothing else says what it may say; save it as "
+            f"{table}: not read, and nothing else says what it may say; save it as "
             f"{kind}{suffixes[0]}"
         )
     return None
@@ -151,25 +149,13 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
     parts = [_name_parts(path.stem) for path in files]
     if len({tuple(word for word, _ in name_parts) for name_parts in parts}) != 1:
         return
-    sequences = [
-        numbers
-        for numbers in zip(
-            *([number for _, number in name_parts] for name_parts in parts), strict=True
-        )
-        if len(set(numbers)) > 1
-    ]
-    if len(sequences) != 1:
-        return
-    steps = [
-        after - before
-        for before, after in zip(sequences[0], sequences[0][1:], strict=False)
-    ]
-    smallest = min(steps)
-    if max(steps) > smallest:
-        gap = steps.index(max(steps))
+    numbers = np.array([[number for _, number in name_parts] for name_parts in parts])
+    steps = np.diff(numbers[:, np.ptp(numbers, axis=0) > 0], axis=0)
+    if steps.shape[1] == 1 and steps.max() > steps.min():
+        gap = int(steps.argmax())
         raise CaptureError(
-            f"{folder}: {files[gap + 1].name} is {steps[gap]} numbers after "
-            f"{files[gap].name}, others {smallest}: is a "
+            f"{folder}: {files[gap + 1].name} is {steps[gap, 0]} numbers after "
+            f"{files[gap].name}, others {steps.min()}: is a "
             "frame missing? step_um would give the next one its place; list frames and "
             "depths in stage.csv"
         )
@@ -182,17 +168,9 @@ def similar_name_hint(name: str, there: Collection[str]) -> str:
         name: name of the missing file.
         there: names of the files that exist.
     """
-    similar = difflib.get_close_matches(
-        name.lower(), [other.lower() for other in there], n=1
-    )
-    return next(
-        (
-            f"; did you mean {other!r}?"
-            for other in there
-            if similar and other.lower() == similar[0]
-        ),
-        "",
-    )
+    lower = {other.lower(): other for other in there}
+    similar = difflib.get_close_matches(name.lower(), lower, n=1)
+    return f"; did you mean {lower[similar[0]]!r}?" if similar else ""
 
 
 def _name_parts(name: str) -> list[tuple[str, int]]:

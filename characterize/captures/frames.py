@@ -52,17 +52,15 @@ def above_rim(frames: Array) -> Array:
     Args:
         frames: (n, y, x) frames.
     """
-    result = np.empty(frames.shape)
     ny, nx = frames.shape[1:]
-    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
+    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j].reshape(2, -1)
+    design = np.stack([np.ones_like(x), x, y], 1)
     rim = np.ones((ny, nx), bool)
     rim[2:-2, 2:-2] = False
-    for i, frame in enumerate(frames):
-        filled = np.where(np.isfinite(frame), frame, np.nanmedian(frame))
-        design = np.stack([np.ones(rim.sum()), x[rim], y[rim]], 1)
-        plane = np.linalg.lstsq(design, filled[rim], rcond=None)[0]
-        result[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
-    return result
+    median = np.nanmedian(frames, axis=(1, 2), keepdims=True)
+    filled = np.where(np.isfinite(frames), frames, median)
+    planes = np.linalg.lstsq(design[rim.ravel()], filled[:, rim].T, rcond=None)[0]
+    return np.asarray(filled - (design @ planes).T.reshape(frames.shape))
 
 
 def _norm(frames: Array, noise: Array | float) -> Array:
@@ -71,31 +69,19 @@ def _norm(frames: Array, noise: Array | float) -> Array:
     return np.asarray(np.sqrt(np.maximum(power - noise**2, 0.1 * power)))
 
 
-def normalized_cross_correlation(
-    a: Array, b: Array, noise: float
-) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation over all shifts, and that shift (y, x) of a
-    against b in pixels.
-
-    The norm of ``a`` is reduced by that of its noise, so that weak light does not lower
-    the correlation.
+def best_shift(a: Array, b: Array) -> tuple[int, int]:
+    """Shift (y, x) of ``a`` against ``b`` in whole pixels, of the largest
+    cross-correlation.
 
     Args:
         a: (y, x) measured frame.
         b: (y, x) expected frame.
-        noise: norm of the noise of ``a``.
     """
-    norm = float(_norm(a, noise)) * float(np.linalg.norm(b))
-    if norm == 0:
-        return 0.0, (0.0, 0.0)
-    shape = [2 * size for size in a.shape]
-    correlation = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
-    row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
-    shift = [
-        int(index) - size if index >= size // 2 else int(index)
-        for index, size in ((row, shape[0]), (column, shape[1]))
-    ]
-    return min(float(correlation.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
+    sides = 2 * a.shape[0], 2 * a.shape[1]
+    spectrum = fft.rfft2(a, sides) * np.conj(fft.rfft2(b, sides))
+    correlation = fft.fftshift(fft.irfft2(spectrum, sides))
+    row, column = np.unravel_index(int(correlation.argmax()), sides)
+    return int(row) - a.shape[0], int(column) - a.shape[1]
 
 
 def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
@@ -116,9 +102,8 @@ def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameSpectra:
-    """Frames as :func:`normalized_cross_correlation` correlates them: spectra (n, u, v)
-    of twice the side,
-    norms (n,) freed of noise.
+    """Frames for cross-correlation: spectra (n, u, v) of twice the side, and norms (n,)
+    less those of the noise, so that weak light does not lower the correlation.
     """
 
     spectrum: Array

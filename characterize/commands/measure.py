@@ -117,7 +117,7 @@ def _frames(options: Options, folder: Path) -> Outcome:
         ]
     values["notes"] = list(quality.notes)
     _write_tables(folder, "frames.csv", rows, values)
-    measure_page.frames_page(folder / "measure.html", quality)
+    measure_page.frames_page(folder / "measure.html", quality, rows)
     lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
         f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, "

@@ -2,7 +2,7 @@
 pillar drawn on it.
 """
 
-from operator import attrgetter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,39 +11,27 @@ from characterize.measure import frames, metrics, overlay, sem
 from metalens.core import report
 from metalens.core.arrays import Array
 
-COLUMNS = {  # attribute of a frame's record: heading on the page
-    "name": "frame",
-    "depth_um": "depth / µm",
-    "angle_deg": "angle along x / deg",
-    "angle_y_deg": "angle along y / deg",
-    "spot.fwhm_um": "width at half maximum / µm",
-    "spot.ee80_um": "radius of 80 % of the light / µm",
-    "mtf50_x_per_um": "MTF is one half, x / (1/µm)",
-    "mtf50_y_per_um": "MTF is one half, y / (1/µm)",
-    "strehl": "Strehl ratio",
-    "efficiency": "focusing efficiency",
-}
 CURVES = "Modulation transfer along x up to the pixel's Nyquist frequency, and light within a radius; one line a frame."
 _NAMED = 8  # lines that a legend holds
 
 
-def frames_page(path: Path, quality: frames.CaptureQuality) -> None:
+def frames_page(
+    path: Path, quality: frames.CaptureQuality, rows: Sequence[Mapping[str, object]]
+) -> None:
     """Write the page of captures: numbers of every frame, curves of MTF and encircled
     energy, field curvature, distortion.
 
     Args:
         path: the page to write.
         quality: quality of the frames.
+        rows: numbers of every frame; columns without one are left out.
     """
-    columns = {
-        words: [attrgetter(name)(row) for row in quality.frames]
-        for name, words in COLUMNS.items()
-    }
+    columns = {key: [row[key] for row in rows] for key in rows[0]}
     stated = {
-        words: column
-        for words, column in columns.items()
-        if any(value == value for value in column)
-    }  # not nan
+        report.in_words(key): column
+        for key, column in columns.items()
+        if any(value == value for value in column)  # not nan
+    }
     sections = [
         report.Section(
             "Frames",

@@ -13,7 +13,7 @@ from characterize.captures import (
     TURNS,
     FrameSpectra,
     above_rim,
-    normalized_cross_correlation,
+    best_shift,
     orient_frames,
     relative_orientation,
     shift_frames,
@@ -236,8 +236,8 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     symmetric = {
         k for k in _EVERY if _chi_square_of_turn(k, expected, light, noise) < _DISTINCT
     }
-    pairs = zip(orient_frames(light, chosen), expected, noise.tolist(), strict=True)
-    shifts = [normalized_cross_correlation(a, b, s)[1] for a, b, s in pairs]
+    pairs = zip(orient_frames(light, chosen), expected, strict=True)
+    shifts = [best_shift(a, b) for a, b in pairs]
     most = _ASIDE_UM * wavelength_scale(frames.model.lens.wavelength_um)
     y_um, x_um = -np.median(shifts, axis=0) * frames.model.setting.pixel_um
     return FrameArrangement(
@@ -318,8 +318,7 @@ def _brightness(light: Array, expected: Array, noise: Array) -> float:
 
 def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift of highest correlation."""
-    _, (dy, dx) = normalized_cross_correlation(a, b, 0.0)
-    return float(((a - shift_frames(b, (int(dy), int(dx)))) ** 2).sum())
+    return float(((a - shift_frames(b, best_shift(a, b))) ** 2).sum())
 
 
 def _plainest_turn(scores: Array) -> int:
