@@ -166,16 +166,16 @@ class DesignSettings:
             (self.wavelength_nm or _WAVELENGTH_NM) * 1e-3, *distances, self.layers
         )
 
-    def at(self, held_um: Iterable[float]) -> "DesignSettings":
-        """Settings with the wavelength filled in from those that the library holds.
+    def at(self, library_um: Iterable[float]) -> "DesignSettings":
+        """Settings with the wavelength filled in from those of the library.
 
         That of a library of one wavelength, else 850 nm; a stated wavelength stays.
 
         Args:
-            held_um: wavelengths of the library, um.
+            library_um: wavelengths of the library, um.
         """
-        held_nm = {round(1e3 * wave, 6) for wave in held_um}
-        default = held_nm.pop() if len(held_nm) == 1 else _WAVELENGTH_NM
+        library_nm = {round(1e3 * wave, 6) for wave in library_um}
+        default = library_nm.pop() if len(library_nm) == 1 else _WAVELENGTH_NM
         return replace(self, wavelength_nm=self.wavelength_nm or default)
 
     def phase(self, folder: Path) -> PhaseOf:

@@ -161,7 +161,7 @@ def node_psfs(
     )
     light = light.reshape(*computed, *light.shape[1:])
     if folds:
-        light = _unfolded(light, count)
+        light = _mirror_quarter(light, count)
     return normalise_psfs(light, optics, plan)
 
 
@@ -202,7 +202,7 @@ def _cosine4(
     return torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)) ** 2)
 
 
-def _unfolded(quarter: Tensor, count: Sequence[int]) -> Tensor:
+def _mirror_quarter(quarter: Tensor, count: Sequence[int]) -> Tensor:
     """(rows, columns, depths, h, w) PSFs of a round lens from those of one quarter.
 
     Args:

@@ -97,7 +97,7 @@ class Imager(DeviceRecord):
         Raises:
             SceneError: frames of another size than the grid's with its margin.
         """
-        if not self.light.uniform and _far_alone(frames):
+        if not self.light.uniform and _is_near_sheet_empty(frames):
             return self.surface(frames.radiance[:, 1], frames.depth_um[:, 1])
         near = frames.coverage[:, 0]
         depth_um = torch.stack([frames.depth_um[:, 0], continue_depth(frames)], 1)
@@ -333,7 +333,7 @@ def _filled(value: Tensor, known: Tensor) -> Tensor:
     return torch.where(known, value, coarse)
 
 
-def _far_alone(frames: Frames) -> bool:
+def _is_near_sheet_empty(frames: Frames) -> bool:
     """Whether the near sheet is empty.
 
     False where coverage or radiance carries a gradient.

@@ -32,7 +32,7 @@ class JudgedPsfs:
     at: tuple[Tensor, Tensor]
 
     @functools.cached_property
-    def shown(self) -> Tensor:
+    def window_psfs(self) -> Tensor:
         """(field points, depths, h, w) PSFs of the window, with their light; cached."""
         return self.compute_psfs()
 
@@ -65,7 +65,7 @@ def transform_error(judged: JudgedPsfs) -> float:
     Args:
         judged: PSFs by which the error is judged.
     """
-    psf = judged.shown
+    psf = judged.window_psfs
     step_um = judged.window.step_um
     light = psf.sum((-1, -2))
     # root mean square distance of the light of a disc of this blur
@@ -84,7 +84,7 @@ def folding_error(judged: JudgedPsfs) -> float:
     """
     reference = judged.compute_psfs(period=2 * judged.window.period)
     return weigh_by_light(
-        texture_error(judged.shown, reference), reference.sum((-1, -2))
+        texture_error(judged.window_psfs, reference), reference.sum((-1, -2))
     )
 
 
@@ -134,7 +134,7 @@ def polarisation_error(judged: JudgedPsfs, whole: Tensor | None = None) -> float
         return 0.0
     if whole is None:
         whole = judged.compute_psfs(components=window.whole)
-    few = judged.shown
+    few = judged.window_psfs
     light = whole.sum((-1, -2))
     errors = texture_error(
         few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]
@@ -161,11 +161,11 @@ def gathering_error(
     if not isinstance(wave, PillarWave):
         return 0.0
     grid = pupil_sampling(optics, window, wavelength_um)
-    # points per sample, at half of Nyquist's step: its triangle is then summed to
-    # 2e-3 of fine detail, at Nyquist's step to 5e-3
-    per_sample = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
+    # points at half of Nyquist's step sum a triangle to 2e-3 of fine detail, where a
+    # window of them fits; at Nyquist's step to 5e-3
+    nyquist = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
     most = 256  # points along an axis
-    per_sample *= 2 if (window.samples + 2) * 2 * per_sample <= most else 1
+    per_sample = nyquist * (1 + ((window.samples + 2) * 2 * nyquist <= most))
     count = min(window.samples, max(most // per_sample - 2, 3) | 1)
     weights = _triangles(count, per_sample)
     edge = (window.samples - count) // 2

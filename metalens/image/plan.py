@@ -153,7 +153,7 @@ def plan_nodes(
     waves = waves_of(optics, grid, source, middle_um, half, share)
     coarse = waves if isinstance(source, SpectralNodes) else _coarse(optics, source, 2)
     three_depths = depth_nodes(grid, 3)
-    window = _unfolded(
+    window = _suppress_aliasing(
         optics,
         coarse,
         Window(grid.window, grid.step_um),
@@ -263,7 +263,7 @@ def sum_over_spectrum(
     return torch.cat(images)
 
 
-def _unfolded(
+def _suppress_aliasing(
     optics: Optics,
     waves: SpectralNodes,
     window: Window,

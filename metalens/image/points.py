@@ -93,7 +93,7 @@ class PupilSampling:
     beyond: share of the light that a sharp round rim at p diffracts beyond the period (half
     of it, less the spare, is h),
         4√2 / (π² k p h); the transform folds it back.
-    dimmed: share that a window lacks and is given back: nodes are the mean of their
+    dimmed: share that a window lacks and is lens_light back: nodes are the mean of their
     width at the rim, whose light at X
         is so times sinc²(X / period): ∫ (1 - sinc²) d(4√2 / (π² k p X)) over the
         window, to second order.
@@ -308,14 +308,14 @@ def _pupil_fields(
     factor = wave.factor(bundle.x_um, bundle.y_um, wavelength_um, tilt)
     if factor is not None:
         light = light * factor.to(torch.complex64)
-    given = float((bundle.whole * bundle.width_um).sum()) / grid.step
-    taken = torch.ones(len(depths_um), device=light.device)
+    lens_light = float((bundle.whole * bundle.width_um).sum()) / grid.step
+    stop_share = torch.ones(len(depths_um), device=light.device)
     if layers.stop is not None:
         light = light * through_stop(layers, tangents, bundle, depths_um, wavelength_um)
         # light on the stop over that on the whole lens, of sources on the axis
         footprints = [layers.footprint_um(d, wavelength_um) for d in depths_um.tolist()]
-        taken = (torch.tensor(footprints).to(taken) / wave.radius_um) ** 2
-    total = given * grid.size**2 * (1 - grid.dimmed) * taken
+        stop_share = (torch.tensor(footprints).to(stop_share) / wave.radius_um) ** 2
+    total = lens_light * grid.size**2 * (1 - grid.dimmed) * stop_share
     return bundle, light, total[:, None, None]
 
 

@@ -97,7 +97,7 @@ def stray_of(
         discs = discs.sum(0, keepdim=True)
         return StrayLight(shares, discs, shape, footprint.illumination)
     rows, columns = (
-        torch.stack([_moved(place * scale / grid.step_um) for scale in scales])
+        torch.stack([_shift_matrix(place * scale / grid.step_um) for scale in scales])
         for place in footprint.middle_um
     )
     return StrayLight(shares, discs, shape, footprint.illumination, rows, columns)
@@ -113,7 +113,7 @@ def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
     return np.asarray(inside * step_um**2 / (math.pi * radius_um**2))
 
 
-def _moved(samples: Array) -> Tensor:
+def _shift_matrix(samples: Array) -> Tensor:
     """(n, n) matrix that moves the light of each sample, by linear interpolation.
 
     Args:
@@ -171,21 +171,21 @@ def _behind_stop(
     light = np.stack(shares).reshape(count, count, -1)
     area = light.sum(-1) * cell**2
     middles = (
-        _middle(light[:, count // 2], y, grid.frame[0]),
-        _middle(light[count // 2], x, grid.frame[1]),
+        _light_centroids(light[:, count // 2], y, grid.frame[0]),
+        _light_centroids(light[count // 2], x, grid.frame[1]),
     )
     slope2 = (layers.through_middle(tangents, depth_um, wavelength_um) ** 2).sum(-1)
     stop_area = math.pi * layers.footprint_um(depth_um, wavelength_um) ** 2
-    taken = torch.from_numpy(area / stop_area / (1 + slope2) ** 2)[None, None]
+    throughput = torch.from_numpy(area / stop_area / (1 + slope2) ** 2)[None, None]
     illumination = torch.nn.functional.interpolate(
-        taken, size=grid.frame, mode="bilinear", align_corners=True
+        throughput, size=grid.frame, mode="bilinear", align_corners=True
     )
     return _Footprint(
         math.sqrt(area.max() / math.pi), middles, illumination[0, 0].float()
     )
 
 
-def _middle(light: Array, place_um: Array, count: int) -> Array:
+def _light_centroids(light: Array, place_um: Array, count: int) -> Array:
     """(count,) centroid of the light on the lens, um, over directions at equal steps.
 
     Dark directions are interpolated from the others; 0 where all are dark.
