@@ -212,7 +212,7 @@ def _words(lens: AsBuilt) -> list[tuple[str, str]]:
     rows += [("problem", text) for text in lens.problems] + [
         ("caution", text) for text in lens.cautions
     ]
-    rows += [("cannot be told apart", text) for text in lens.degeneracies]
+    rows += [("not identifiable", text) for text in lens.degeneracies]
     return [
         *rows,
         ("chi² per degree of freedom", f"{lens.chi2_per_dof:.3f}"),

@@ -187,7 +187,7 @@ def _with_likely_causes(
     for _ in range(4 if gain.known else 0):  # causes, one after the other
         if not ends[0].converged:
             break
-        falls = _falls(task, ends[0], tests)
+        falls = _misfit_falls(task, ends[0], tests)
         cause = next((test for _, test in falls if not test.effect.stated), None)
         if cause is None:
             break
@@ -202,13 +202,13 @@ def _with_likely_causes(
             f"{cause.effect.cause} explains the frames better (chi-square falls by "
             f"{fall:.0f}): {', '.join(frees)} fitted too"
         )
-        doubts += _contradicted(cause, falls)
+        doubts += _contradicted_statements(cause, falls)
         task, ends = extended, wider
         tests, shifts = unmodelled_effects.run_score_tests(task, ends[0])
     return task, ends, (tests, shifts, doubts)
 
 
-def _falls(
+def _misfit_falls(
     task: SearchTask, best: FitSolution, score_tests: list[ScoreTest]
 ) -> list[tuple[float, ScoreTest]]:
     """(fall of the misfit, cause) of causes whose parameters explain the frames better.
@@ -225,7 +225,7 @@ def _falls(
     return sorted(falls, key=lambda pair: -pair[0])
 
 
-def _contradicted(
+def _contradicted_statements(
     fitted: ScoreTest, falls: list[tuple[float, ScoreTest]]
 ) -> list[ResidualFinding]:
     """Statements without an error that contradict the frames.
@@ -311,7 +311,7 @@ def _result(
         cautions=tuple(cautions),
         problems=(
             *_problems(task, solution, gain),
-            *verdict.held_back(names, solution, task.prior),
+            *verdict.bounds_text(names, solution, task.prior),
             *(finding.words for finding in findings if finding.sigma > _DECISIVE),
         ),
         low=low,

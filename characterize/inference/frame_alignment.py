@@ -25,16 +25,16 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitRefused
 from metalens.fabrication import wavelength_scale
 
-_EVERY = range(8)  # orientation
+_ORIENTATIONS = range(8)
 _ASIDE_UM = 50.0  # largest offset of a window
-# likeness by which a lens at another distance must be better
+# correlation by which a lens at another distance must be better
 _CLEARER = 0.05
-# likeness within which orientations cannot be distinguished: ten times what errors of
+# correlation within which orientations cannot be distinguished: ten times what errors of
 # an as-built lens were observed to exchange
 _NEAR = 0.02
 _DISTINCT = 40.0  # chi-square between two orientations that a fit can distinguish
-_SURE = 0.9  # likeness above which the nominal lens explains the frames
-_LIKENESS = 0.45  # below which the frames show no image of it
+_SURE = 0.9  # correlation above which the nominal lens explains the frames
+_RESEMBLES = 0.45  # below which the frames show no image of it
 _ZEROS = 17  # stage zeros of a scan
 # distances of a scan: steps of 25 um over two prior sigma, a tenth of a wave of defocus
 # at NA 0.25
@@ -47,8 +47,8 @@ class FrameArrangement:
 
     stage_zero_um, distance_um: best of the scan; middle_um: (x, y) of the
     window's middle from the chief ray, by the light in the frames.
-    likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage
-    zero.
+    correlation: highest normalised correlation, mean over frames, 0 to 1, at that
+    stage zero.
     order: (n,) frame that fits the i-th stated depth best, where it clearly differs
     from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
@@ -60,7 +60,7 @@ class FrameArrangement:
     stage_zero_um: float
     distance_um: float
     middle_um: tuple[float, float]
-    likeness: float
+    correlation: float
     order: Array | None
     order_seen: bool
     orientation: int
@@ -116,15 +116,15 @@ def find_arrangement(
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     stated_um = start[PLACE["distance_um"], None]
     best = _arrange(frames, *frames.scanned(start, zeros, stated_um))
-    if reach_um > 0 and (any(_is_unusual(best)) or best.likeness < _SURE):
+    if reach_um > 0 and (any(_is_unusual(best)) or best.correlation < _SURE):
         distances = stated_um + reach_um * np.linspace(-1, 1, _DISTANCES)
         few = frames.some(few_frames(model.setting))
         place, _ = few.scanned(start, zeros[:: _ZEROS // 4], distances)
-        place, likeness = frames.scanned(
+        place, correlation = frames.scanned(
             place, zeros, place[PLACE["distance_um"], None]
         )
-        moved = _arrange(frames, place, likeness)
-        gain = likeness - best.likeness
+        moved = _arrange(frames, place, correlation)
+        gain = correlation - best.correlation
         clearer = gain > _CLEARER and moved.order is None
         if gain >= 0 and (_is_unusual(moved) < _is_unusual(best) or clearer):
             best = moved
@@ -133,10 +133,10 @@ def find_arrangement(
             "fit refused: frames fit the stated depths only in the order "
             f"{best.order.tolist()}: correct the depths in stage.csv"
         )
-    if best.likeness < _LIKENESS:
+    if best.correlation < _RESEMBLES:
         raise FitRefused(
             "fit refused: the frames look like no image of this lens (best correlation "
-            f"{best.likeness:.2f}); they are of another lens than this "
+            f"{best.correlation:.2f}); they are of another lens than this "
             f"{model.lens.profile} one, far from the stated depths, or dark"
         )
     return best
@@ -174,7 +174,7 @@ class _Frames:
     def scanned(
         self, start: Array, zeros: Array, distances: Array
     ) -> tuple[Array, float]:
-        """Best parameters of a scan of stage zero and distance, and their likeness.
+        """Best parameters of a scan of stage zero and distance, and their correlation.
 
         The orientation counts that is best at its own best place: images that twist
         with depth equal mirrored ones at another depth.
@@ -196,12 +196,13 @@ class _Frames:
     def spectra(self) -> list[FrameSpectra]:
         """Of the frames in every orientation."""
         return [
-            FrameSpectra.of(orient_frames(self.light, k), self.noise) for k in _EVERY
+            FrameSpectra.of(orient_frames(self.light, k), self.noise)
+            for k in _ORIENTATIONS
         ]
 
 
 def _scores(turned: list[FrameSpectra], expected: Array) -> Array:
-    """(orientations,) mean likeness of the frames to the ``expected`` ones.
+    """(orientations,) mean correlation of the frames to the ``expected`` ones.
 
     Args:
         turned: spectra of the frames in every orientation.
@@ -210,14 +211,14 @@ def _scores(turned: list[FrameSpectra], expected: Array) -> Array:
     return np.array([one.mean_correlation(goal) for one in turned])
 
 
-def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
+def _arrange(frames: _Frames, x: Array, correlation: float) -> FrameArrangement:
     """Arrangement of the frames: their order and orientation at parameters ``x``.
 
     Images that twist with depth look mirrored when reversed: frames that seem both are
     out of order.
 
     Args:
-        likeness: mean correlation at ``x``.
+        correlation: mean correlation at ``x``.
     """
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
@@ -230,11 +231,13 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
             order = None
     near = {
         relative_orientation(chosen, k)
-        for k in _EVERY
+        for k in _ORIENTATIONS
         if score[k] > score[chosen] - _NEAR
     }
     symmetric = {
-        k for k in _EVERY if _chi_square_of_turn(k, expected, light, noise) < _DISTINCT
+        k
+        for k in _ORIENTATIONS
+        if _chi_square_of_turn(k, expected, light, noise) < _DISTINCT
     }
     pairs = zip(orient_frames(light, chosen), expected, strict=True)
     shifts = [best_shift(a, b) for a, b in pairs]
@@ -247,7 +250,7 @@ def _arrange(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
             float(np.clip(x_um, -most, most)),
             float(np.clip(y_um, -most, most)),
         ),
-        likeness=likeness,
+        correlation=correlation,
         order=order,
         order_seen=order_seen,
         orientation=chosen,
@@ -322,10 +325,10 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _plainest_turn(scores: Array) -> int:
-    """The simplest orientation of best likeness; 0 unless it clearly beats that.
+    """The simplest orientation of highest correlation; 0 unless it clearly beats that.
 
-    Within 2e-3 the first of equals is taken. Clearly: half of the missing likeness and
-    0.02 better than the frames as stated.
+    Within 2e-3 the first of equals is taken. Clearly: half of the missing
+    correlation and 0.02 better than the frames as stated.
     """
     best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
     halved = (1 - scores[best]) < 0.5 * (1 - scores[0])

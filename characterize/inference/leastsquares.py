@@ -15,10 +15,10 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 
 # sigma of the least step that updates slopes: images are rounded to about 1e-3 sigma
-_TELLING = 0.03
+_LEAST_UPDATE = 0.03
 # relative error of the predicted change of the images above which the Jacobian is
 # computed anew
-_MISSED = 0.6
+_RENEWED_ABOVE = 0.6
 HUBER = 6.0  # sigma beyond which a residual counts linearly
 _NODES, _WEIGHTS = special.roots_jacobi(4, 1.0, 0.0)
 _JACOBI = (_NODES + 1) / 2, _WEIGHTS / 4  # of (1 - s) f(s) over s from 0 to 1
@@ -275,10 +275,10 @@ class FitProblem:
         self, state: _State, step: Array, image: Array, *, final: bool
     ) -> _State:
         """The problem after a step, with the Jacobian updated by the images (Broyden),
-        or computed anew where it missed ``_MISSED`` of their change.
+        or computed anew where it missed ``_RENEWED_ABOVE`` of their change.
 
         J + (dI - J s) sᵀC / (sᵀC s), with the curvature C as the metric: the least
-        change that explains dI. After a step of less than ``_TELLING`` sigma the
+        change that explains dI. After a step of less than ``_LEAST_UPDATE`` sigma the
         Jacobian stays: rounding of the images (float32) over so short a step would be
         mistaken for slopes. Covariance and corrected fast models depend on these.
         """
@@ -288,12 +288,12 @@ class FitProblem:
         missed = change - np.tensordot(step, jacobian, 1)
         root = np.sqrt(state.weight) / state.noise
         size = max(float(np.linalg.norm(change * root)), 1e-300)
-        if not final and float(np.linalg.norm(missed * root)) > _MISSED * size:
+        if not final and float(np.linalg.norm(missed * root)) > _RENEWED_ABOVE * size:
             return self._linearise(x)
         measure = state.curvature @ step
         square = max(float(step @ measure), 1e-300)
         moved = math.sqrt(square)
-        if moved >= _TELLING:
+        if moved >= _LEAST_UPDATE:
             jacobian = jacobian + np.multiply.outer(measure / square, missed)
         return self._state(x, image, jacobian, state.travel + moved)
 

@@ -171,8 +171,9 @@ def check_enough(data: FitImages, names: Sequence[str]) -> None:
     pixels = int((data.usable & ~data.saturated).sum())
     if frames < 2 and len(lens) > MOST_OF_ONE_FRAME:
         raise CaptureError(
-            f"one frame for {len(names)} parameters: defocus, wave front and bias look alike in one image; need frames "
-            "at two depths or more (five on both sides of focus are good), or hold all but "
+            f"one frame for {len(names)} parameters: defocus, wave front and bias "
+            "cannot be distinguished in one image; need frames at two depths or more "
+            "(five on both sides of focus are good), or hold all but "
             f"{MOST_OF_ONE_FRAME} parameters with [[known]] (sigma = 0)"
         )
     if pixels < 3 * len(names):

@@ -220,12 +220,11 @@ def mode_probabilities(modes: Sequence[FitSolution], spread: float = 1.0) -> Arr
         modes: fits at the modes, best first.
         spread: factor of all variances.
     """
-    log = np.array([_log_mass(mode.merit, mode.covariance, spread) for mode in modes])
-    return np.asarray(special.softmax(log))
-
-
-def _log_mass(merit: float, covariance: Array, spread: float) -> float:
-    return float(np.linalg.slogdet(covariance)[1]) / 2 - merit / (2 * spread)
+    log_mass = [
+        np.linalg.slogdet(mode.covariance)[1] / 2 - mode.merit / (2 * spread)
+        for mode in modes
+    ]
+    return np.asarray(special.softmax(log_mass))
 
 
 def draw_posterior(
@@ -348,7 +347,7 @@ def posterior_text(names: Sequence[str], posterior: FitPosterior) -> list[str]:
     for i, name in enumerate(names):
         if not posterior.parabolic[i]:
             out.append(
-                f"{name} is bent: 95 % within {posterior.low[i]:.3g} to "
+                f"{name} has a skewed posterior: 95 % within {posterior.low[i]:.3g} to "
                 f"{posterior.high[i]:.3g} about {posterior.best.value[i]:.3g}, not the same "
                 "on both sides; take draws, not value and sigma"
             )

@@ -389,7 +389,7 @@ def systematic_effects(
     light = image - background_planes(x, model.setting)
     yield SystematicEffect("vibration or blur along one direction", _along_one(light))
     yield SystematicEffect(
-        "pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)",
+        "pixels of 2 x 2 with different shares of the light (a raw colour mosaic)",
         _of_mosaic(light),
     )
     yield SystematicEffect(

@@ -59,7 +59,7 @@ def fit_problems(
     names: tuple[str, ...], solution: FitSolution, gain: SensorNoise
 ) -> list[str]:
     """Checks of a finished fit, each with the cause it points to; bounds are judged by
-    :func:`held_back`.
+    :func:`bounds_text`.
 
     Args:
         names: (p,) names of the fitted parameters.
@@ -70,7 +70,8 @@ def fit_problems(
     if gain.coarse:
         words.append(
             f"counts are {gain.gain_e:.3g} electrons apart and noise in the dark is {gain.read_noise_e:.2g}: rounding "
-            "is no noise there, but one error wherever light is alike; save more bits, or raise the camera's gain"
+            "is no noise there, but one error of all pixels of equal light; save more "
+            "bits, or raise the camera's gain"
         )
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
@@ -101,7 +102,7 @@ def fit_problems(
     return words
 
 
-def held_back(
+def bounds_text(
     names: tuple[str, ...], solution: FitSolution, prior: GaussianPrior
 ) -> list[str]:
     """:func:`at_bounds` in words.
@@ -182,7 +183,7 @@ def correlated_residuals_text(
             noise.
     """
     r = np.clip(residual_sigma, -6, 6) / np.sqrt(1 + np.square(flat_sigma))
-    found = []
+    findings = []
     sides = np.array(
         [
             neighbour_correlation(r[:, :, 1:], r[:, :, :-1]),
@@ -196,7 +197,7 @@ def correlated_residuals_text(
             f"({sides.max():.1f} sigma): more is there than the parameters describe; "
             "see the residual map"
         )
-        found.append(ResidualFinding(words, float(sides.max())))
+        findings.append(ResidualFinding(words, float(sides.max())))
     levels = np.abs(r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1)))
     at = int(np.argmax(levels))
     if levels[at] > _STRUCTURE + 0.5:
@@ -204,8 +205,8 @@ def correlated_residuals_text(
             f"frame {at} is brighter or darker than the model by "
             f"{levels[at]:.1f} sigma: exposure or lamp"
         )
-        found.append(ResidualFinding(words, float(levels[at])))
-    return found
+        findings.append(ResidualFinding(words, float(levels[at])))
+    return findings
 
 
 def neighbour_correlation(first: Array, second: Array) -> Array:

@@ -26,9 +26,9 @@ _EVEN_ENOUGH = 1e-4
 _TRIAL = 96  # nodes at which the remainder of the kernel is sampled, most it needs
 _CELL = 0.005  # relative width of the cells of distance, each with its coupling terms
 _STEP = 1e-3  # relative step of the distance for derivatives of the terms
-_MIXED = 0.1  # share of the tolerance for the functions of p in the terms
+_SHARE_OF_P = 0.1  # share of the tolerance for the functions of p in the terms
 # the same where terms are left out too: it adds an eighth to their error
-_MIXED_FEW = 0.5
+_SHARE_OF_P_CUT = 0.5
 _OFF_LENS = 0.1  # weight of directions off the lens in the low-rank terms
 Samples = tuple[int, float, float]  # number, first and last place of an axis, um
 _KEPT = 24  # sets of coupling terms: for the windows and distances of several fits
@@ -170,7 +170,7 @@ class CouplingTerms:
     kernel: of the middle of the cell. axes_um: (y, x) coarse nodes of the window.
     fine: interpolation from them to the window's samples along y and x, real: fields
     are less the phase of the middle node, which no intensity depends on.
-    left: (r,) relative size of the terms from each on; mixed: (b,) the same of the
+    tails: (r,) relative size of the terms from each on; tails_p: (b,) the same of the
     functions of p.
     """
 
@@ -180,8 +180,8 @@ class CouplingTerms:
     across: Array
     amounts: Array
     window: Array
-    left: Array
-    mixed: Array
+    tails: Array
+    tails_p: Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -204,8 +204,8 @@ class WindowOperators:
         Terms below the relative ``tolerance`` are left out.
         """
         terms = self.terms
-        r = max(1, int((terms.left > tolerance).sum()))
-        b = max(1, int((terms.mixed > _MIXED_FEW * tolerance).sum()))
+        r = max(1, int((terms.tails > tolerance).sum()))
+        b = max(1, int((terms.tails_p > _SHARE_OF_P_CUT * tolerance).sum()))
         amounts, window = terms.amounts[:, :r, :b], self.window[:, :r]
         ny, nx = len(self.y), self.x.shape[1]
         # g_b(p) x(p, X) as a matrix (p, b X)
@@ -561,16 +561,16 @@ class CompressedLens:
         slope = (tabulate(1 + _STEP) - tabulate(1 - _STEP)) * (_CELL / 4 / _STEP)
         table = np.concatenate([tabulate(1.0), slope])
         u, size, v = np.linalg.svd(table, full_matrices=False)
-        left = relative_tails(size)
+        tails = relative_tails(size)
         # the symmetry of a square window makes pairs of equal size: none is split
-        r = int((size > 0.999 * size[left > self.tolerance][-1]).sum())
-        terms, v, left = u[:, :r] * size[:r], v[:r], left[:r]
+        r = int((size > 0.999 * size[tails > self.tolerance][-1]).sum())
+        terms, v, tails = u[:, :r] * size[:r], v[:r], tails[:r]
         # functions of p in these: one more singular value decomposition
         mixing, size, across = np.linalg.svd(
             (v.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
         )
-        mixed = relative_tails(size)
-        count = int((mixed > _MIXED * self.tolerance).sum())
+        tails_p = relative_tails(size)
+        count = int((tails_p > _SHARE_OF_P * self.tolerance).sum())
         amounts = (mixing * size)[:, :count].reshape(-1, m, count).transpose(1, 0, 2)
         to_q, to_p = (
             legendre.interpolation_matrix(m, (2 * t - low - high) / (high - low))
@@ -593,8 +593,8 @@ class CompressedLens:
             (across[:count] @ to_p.T).astype(np.complex64),
             (np.tensordot(to_q, amounts, 1) * self.site_um2).astype(np.complex64),
             window,
-            left,
-            mixed[:count],
+            tails,
+            tails_p[:count],
         )
 
     def _counts(

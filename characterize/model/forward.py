@@ -181,7 +181,7 @@ class ForwardModel:
         return part
 
     def with_pixel_pitch(self, ratio: float) -> "ForwardModel":
-        """The same model with pixels ``ratio`` times as far apart and as wide."""
+        """The same model with pixels of ``ratio`` times the pitch and the width."""
         part = copy.copy(self)
         pixel_um = self.setting.pixel_um * ratio
         part.setting = dataclasses.replace(self.setting, pixel_um=pixel_um)
@@ -351,14 +351,12 @@ class ForwardModel:
         for offset_nm, weight in self.spectrum.colours(bandwidth_nm, like_nm):
             at = x.copy()
             at[PLACE["wavelength_nm"]] += offset_nm
-            for group in (
-                part for whole in self.groups for part in whole.illuminated_parts
-            ):
+            for group in (g for whole in self.groups for g in whole.illuminated_parts):
                 intensity, changes = self._intensity(at, group, acting)
                 light[group.index] += weight * intensity
                 for name, change in changes:
-                    seen = self.grid.sample(change, response[group.index])
-                    slopes[name][group.index] += weight * seen
+                    sampled = self.grid.sample(change, response[group.index])
+                    slopes[name][group.index] += weight * sampled
         if "bandwidth_nm" in wanted:
             widened = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
             wider = self._light(widened, (), response, bandwidth_nm)[0]

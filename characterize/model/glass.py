@@ -186,9 +186,8 @@ def extra_path(
 ) -> Array:
     """(*shape) path added by the plate of glass for (x, y) on the lens, um.
 
-    Less that added at the lens centre. The ray crosses the plate and the air beside it
-    as plane-parallel media along the plate's normal, along which the source lies
-    ``along`` away.
+    Less that added at the lens centre. The ray crosses plate and air as plane-parallel
+    media, whose thicknesses along the plate's normal add up to the source's distance.
 
     Args:
         x_um: places on the lens along x.
