@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft, ndimage, stats
 
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
@@ -98,28 +98,20 @@ def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> EdgeMt
     pixels = np.asarray(image, float)
     gy, gx = np.gradient(pixels)
     pixels = pixels if np.abs(gx).sum() >= np.abs(gy).sum() else pixels.T
-    rows = np.arange(len(pixels))
-    slope, offset = _edge_line(pixels, rows)
-    angle = math.degrees(math.atan(abs(slope)))
-    if not 1.5 <= angle <= 25:
+    slope, offset = _edge_line(pixels)
+    angle = math.atan(slope)
+    if not 1.5 <= math.degrees(abs(angle)) <= 25:
         raise CaptureError(
-            f"edge tilted by {angle:.1f} degrees; need 2 to 20 to sample between the pixels"
+            f"edge tilted by {math.degrees(abs(angle)):.1f} degrees; need 2 to 20 to "
+            "sample between the pixels"
         )
-    distance = (
-        np.arange(pixels.shape[1])[None] - (slope * rows + offset)[:, None]
-    ) * math.cos(math.atan(slope))
-    reach = int(min(distance.max(), -distance.min()))
-    bin_number = np.round(distance * oversample).astype(int) + reach * oversample
-    inside = (bin_number >= 0) & (bin_number <= 2 * reach * oversample)
-    samples = np.bincount(bin_number[inside], minlength=2 * reach * oversample + 1)
-    sums = np.bincount(
-        bin_number[inside], pixels[inside], minlength=2 * reach * oversample + 1
-    )
-    profile = np.interp(
-        np.arange(len(samples)),
-        np.flatnonzero(samples),
-        sums[samples > 0] / samples[samples > 0],
-    )
+    row, column = np.indices(pixels.shape)
+    distance = (column - slope * row - offset) * math.cos(angle)
+    reach = int(min(distance.max(), -distance.min())) * oversample
+    edges = (np.arange(-reach, reach + 2) - 0.5) / oversample
+    profile = stats.binned_statistic(distance.ravel(), pixels.ravel(), bins=edges)[0]
+    hit = np.flatnonzero(np.isfinite(profile))
+    profile = np.interp(np.arange(len(profile)), hit, profile[hit])
     line_spread = np.diff(profile)
     peak = int(np.argmax(np.abs(ndimage.gaussian_filter1d(line_spread, oversample))))
     half_width = min(peak, len(line_spread) - 1 - peak)
@@ -261,27 +253,23 @@ def _encircled_radius(light: Array, place: tuple[float, float], share: float) ->
     return float(np.interp(target, power[k - 1 : k + 1], radii[k - 1 : k + 1]))
 
 
-def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:
+def _edge_line(pixels: Array) -> tuple[float, float]:
     """Slope and offset of an edge, column = slope * row + offset, in pixels.
 
     A line through the centroid of each row's squared derivative, fitted four times;
     later fits weight pixels by a Gaussian about the line before.
     """
-    slope = 0.0
-    offset = pixels.shape[1] / 2
+    slope, offset = 0.0, pixels.shape[1] / 2
     derivative = np.abs(ndimage.gaussian_filter1d(pixels, 1.0, axis=1, order=1))
-    columns = np.arange(pixels.shape[1])
-    proximity = np.ones_like(derivative)
-    for width in (None, 12.0, 8.0, 6.0):
-        if width is not None:
-            proximity = np.exp(
-                -0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / width) ** 2
-            )
-        weight = proximity * np.maximum(derivative - np.median(derivative), 0) ** 2
+    steepness = np.maximum(derivative - np.median(derivative), 0) ** 2
+    row, column = np.indices(pixels.shape)
+    for width in (math.inf, 12.0, 8.0, 6.0):
+        distance = column - slope * row - offset
+        weight = steepness * np.exp(-0.5 * (distance / width) ** 2)
         total = weight.sum(1)
         if not total.max() > 0:
             raise CaptureError("no edge in the image")
         strong = total > 0.1 * np.median(total)
-        center = (weight * columns).sum(1)[strong] / total[strong]
-        slope, offset = (float(value) for value in np.polyfit(rows[strong], center, 1))
+        centre = (weight * column).sum(1)[strong] / total[strong]
+        slope, offset = np.polyfit(np.flatnonzero(strong), centre, 1).tolist()
     return slope, offset
