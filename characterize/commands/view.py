@@ -2,6 +2,7 @@
 parameters; PSFs.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -23,23 +24,16 @@ def capture_panels(path: Path) -> list[Panel]:
         path: the file.
     """
     capture = captures.load(path)
-    frames = np.asarray(capture.frames, float)
     step = capture.pixel_um if np.isfinite(capture.pixel_um) else 1.0
+    columns = (
+        capture.position_um,
+        *np.degrees(capture.angle_rad).T,
+        capture.exposure_s,
+    )
+    numbers = np.stack(columns, 1).round(6).tolist()
     rows = [
-        (
-            name,
-            *(
-                round(float(v), 6) if np.isfinite(v) else "not stated"
-                for v in (position, *np.degrees(angle), exposure)
-            ),
-        )
-        for name, position, angle, exposure in zip(
-            capture.names,
-            capture.position_um,
-            capture.angle_rad,
-            capture.exposure_s,
-            strict=True,
-        )
+        (name, *("not stated" if math.isnan(v) else v for v in values))
+        for name, values in zip(capture.names, numbers, strict=True)
     ]
     description: list[tuple[str, object]] = [
         ("converter / bits", capture.bits),
@@ -52,7 +46,11 @@ def capture_panels(path: Path) -> list[Panel]:
     description += [("put right", text) for text in capture.corrections]
     return [
         ImagePanel(
-            "Frames", frames, [SliderAxis("frame", list(capture.names))], step, "counts"
+            "Frames",
+            np.asarray(capture.frames, float),
+            [SliderAxis("frame", list(capture.names))],
+            step,
+            "counts",
         ),
         TablePanel(
             "Stage",
