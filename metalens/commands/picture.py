@@ -125,7 +125,7 @@ def run(options: PictureOptions, lens_file: Path | None, target: Path) -> int:
 
 
 def _half_width_um(device: Lens, depth_um: float, width_um: float) -> float:
-    """Half width of the picture's image on the sensor, um; see :class:`PictureOptions`."""
+    """Half width of the picture's image on the sensor, um."""
     if width_um:
         before = device.layers.before(depth_um, device.wavelength_um)
         return width_um / 2 / before.reduced_um * device.reduced_um

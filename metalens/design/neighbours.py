@@ -94,9 +94,8 @@ def _mean(
             gap="nearest",
         )
         rows.append(_blazed(lens, np.asarray(diameters), harmonics, diagonal))
-    return np.mean([ratio for ratio, _ in rows], axis=0), float(
-        np.mean([lost for _, lost in rows])
-    )
+    ratios, lost = zip(*rows, strict=True)
+    return np.mean(ratios, axis=0), float(np.mean(lost))
 
 
 def _blazed(

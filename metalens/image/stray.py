@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
 import torch
 from torch import Tensor
 
 from metalens.core.arrays import Array
+from metalens.image.low_rank import fast_shape
 from metalens.image.plan import Grid
 from metalens.image.points import Optics
 from metalens.image.scene import DeviceRecord
@@ -78,10 +78,7 @@ def stray_of(
         for z in (depth_um, focus.source_distance_um)
     )
     shares = wave.orders(focus.wavelength_um, ORDERS)
-    shape = (
-        scipy.fft.next_fast_len(2 * frame[0], real=True),
-        scipy.fft.next_fast_len(2 * frame[1], real=True),
-    )
+    shape = fast_shape((2 * frame[0], 2 * frame[1]))
     if optics.layers.stop is None:
         footprint = _whole_lens(wave.radius_um, grid, d, middle_um)
     else:

@@ -152,8 +152,8 @@ def read_measured_spectrum(
 
     Args:
         curves: each a file, a name among colour-science's spectral distributions
-            (``SDS_ILLUMINANTS``, ``SDS_LIGHT_SOURCES``, ``SDS_FILTERS``, ``SDS_LENSES``,
-            ``SDS_LEFS``), or such a distribution.
+            (``SDS_ILLUMINANTS``, ``SDS_LIGHT_SOURCES``, ``SDS_FILTERS``,
+            ``SDS_LENSES``, ``SDS_LEFS``), or such a distribution.
         within_um: (least, largest) wavelength of the pillars' library, um; equal for a
             single wavelength, which cuts nothing off.
 
@@ -264,8 +264,9 @@ def _read_curve(file: Path) -> Array:
             nm = value = math.nan
         if not (100 <= nm < np.inf and 0 <= value < np.inf):
             raise PropagationError(
-                f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 or more) and a value of 0 or "
-                "more: name a column of micrometres wavelength_um, and set what noise left below 0 to 0"
+                f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 "
+                "or more) and a value of 0 or more: name a column of micrometres "
+                "wavelength_um, and set what noise left below 0 to 0"
             )
         rows.append([nm, value])
     if len(rows) < 2:

@@ -28,7 +28,6 @@ NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 SMOOTH = 11  # iterations per iteration on the spline
 CHECKS = 20  # iterations between two evaluations of the deterministic figures
 CLIMB_IMAGES = 4  # images of a gradient step, at least two for every field angle
-DIRECTIONS = 4  # azimuths of the field from which the steps draw
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -74,11 +73,8 @@ def axial_loss(
         count, generator=generator
     )
     depths = low + (high - low) / count * strata.double()
-    turns = torch.randint(0, DIRECTIONS, (count,), generator=generator).tolist()
-    fields = [
-        _field(angles[i % len(angles)], turn / DIRECTIONS)
-        for i, turn in enumerate(turns)
-    ]
+    turns = torch.randint(0, 4, (count,), generator=generator).tolist()
+    fields = [_field(angles[i % len(angles)], t / 4) for i, t in enumerate(turns)]
     positions = torch.rand(2, 2, generator=generator) - 0.5  # in pixels
     width = settings.climb_window_um
     near, far = _stacks(phase_rad, pupil, focus_um, depths, fields, settings, width)
@@ -140,8 +136,12 @@ def score_phase(
 
 def _information_options(settings: ResolvedFisherSettings) -> dict[str, Any]:
     """Arguments of the information of Eq. 11: lengths in um, and the normalisation."""
-    return {"step_um": settings.step_um, "sample_um": settings.sample_um, "pixel_um": settings.pixel_um,
-            "normalisation": settings.normalisation}  # fmt: skip
+    return {
+        "step_um": settings.step_um,
+        "sample_um": settings.sample_um,
+        "pixel_um": settings.pixel_um,
+        "normalisation": settings.normalisation,
+    }
 
 
 def _field(angle_deg: float, turn: float) -> Field:
@@ -172,8 +172,15 @@ def _stacks(
     sample = settings.sample_um
     samples = int(min(window_um, pupil.period_um) / sample)
     both = torch.cat([depths_um, depths_um + settings.step_um])
-    stack = pupils.psf(phase_rad, pupil, depths_um=both, fields=fields * 2, focus_um=focus_um, sample_um=sample,
-                       samples=samples)  # fmt: skip
+    stack = pupils.psf(
+        phase_rad,
+        pupil,
+        depths_um=both,
+        fields=fields * 2,
+        focus_um=focus_um,
+        sample_um=sample,
+        samples=samples,
+    )
     return stack[: len(depths_um)], stack[len(depths_um) :]
 
 
