@@ -413,10 +413,7 @@ def _read_hdf5(path: Path) -> Array:
     try:
         with h5py.File(path, "r") as file:
             frames = file.get("frames")
-            link = file.get("frames", getlink=True)
-            if not isinstance(frames, h5py.Dataset) or not isinstance(
-                link, h5py.HardLink
-            ):
+            if not isinstance(frames, h5py.Dataset):
                 raise CaptureError(
                     f"{path}: 'frames' is no data set (n, y, x) of this file; found "
                     f"{', '.join(sorted(file)) or 'nothing'}"

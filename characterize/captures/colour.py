@@ -80,8 +80,17 @@ class ColourChannels:
                 channel of grey images where they
                 cannot be.
         """
+        if images.ndim == 3 and self.mosaic:
+            row, column = divmod(self.mosaic.index(str(self.channel)[0].upper()), 2)
+            return images[:, row::2, column::2]
+        if images.ndim == 3 and (grey or self.channel is None):
+            return images
         if images.ndim == 3:
-            return self._grey(images, path, grey=grey)
+            raise CaptureError(
+                f"{path}: grey images, the capture's description says channel = "
+                f"{self.channel!r}; leave it out for a sensor without colours, and of "
+                'a raw Bayer mosaic say how its pixels lie: mosaic = "RGGB"'
+            )
         if images.ndim != 4 or images.shape[-1] not in (3, 4):
             raise CaptureError(
                 f"{path}: images of shape {images.shape}; need grey frames (n, y, x), "
@@ -90,29 +99,16 @@ class ColourChannels:
         if self.mosaic:
             raise CaptureError(
                 f"{path}: colour images of shape {images.shape[1:]}, the capture's "
-                "description says mosaic = "
-                f"{self.mosaic!r}: their colours were put together already; leave "
-                "mosaic out, or save raw frames"
+                f"description says mosaic = {self.mosaic!r}: their colours were put "
+                "together already; leave mosaic out, or save raw frames"
             )
         if self.channel is None:
             raise CaptureError(
                 f"{path}: colour images of shape {images.shape[1:]}; grey frames "
-                "straight from the sensor are best, "
-                'else say which of them is lit: channel = "green" (or "red", "blue") in capture.toml'
+                "straight from the sensor are best, else say which of them is lit: "
+                'channel = "green" (or "red", "blue") in capture.toml'
             )
         return images[..., CHANNELS.index(self.channel)]
-
-    def _grey(self, images: Array, path: Path, *, grey: bool) -> Array:
-        if self.mosaic:
-            row, column = divmod(self.mosaic.index(str(self.channel)[0].upper()), 2)
-            return images[:, row::2, column::2]
-        if self.channel is not None and not grey:
-            raise CaptureError(
-                f"{path}: grey images, the capture's description says channel = "
-                f"{self.channel!r}; leave it out for a "
-                'sensor without colours, and of a raw Bayer mosaic say how its pixels lie: mosaic = "RGGB"'
-            )
-        return images
 
     def notes(self) -> list[str]:
         """Notes on the use of one colour channel; empty for grey frames."""

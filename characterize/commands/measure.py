@@ -105,7 +105,7 @@ def _frames(options: Options, folder: Path) -> Outcome:
     quality = frames.measure_frames(
         capture, design=design, reference_e=options.reference_e
     )
-    rows = [_frame_row(row) for row in quality.frames]
+    rows = [dataclasses.asdict(row) for row in quality.frames]
     values: dict[str, object] = {"frames": rows}
     for key, name, column in (
         ("best_depth", "depth_um", quality.best_depth_um),
@@ -120,7 +120,7 @@ def _frames(options: Options, folder: Path) -> Outcome:
     measure_page.frames_page(folder / "measure.html", quality, rows)
     lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
-        f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, "
+        f"  {r.name}: FWHM {r.fwhm_um:.3g} um, EE80 {r.ee80_um:.3g} um, "
         f"MTF50 {r.mtf50_x_per_um:.3g} / {r.mtf50_y_per_um:.3g} per um, "
         f"Strehl {r.strehl:.3f}"
         for r in quality.frames
@@ -276,18 +276,6 @@ def _pillars(
         }
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return [dict(zip(columns, row, strict=True)) for row in rows]
-
-
-def _frame_row(row: frames.FrameMetrics) -> dict[str, object]:
-    """Metrics of a frame as one flat record."""
-    values: dict[str, object] = dataclasses.asdict(row)
-    values.pop("spot")
-    spot: dict[str, object] = dataclasses.asdict(row.spot)
-    for name, parts in (("d4sigma", ("major", "minor")), ("centroid", "xy")):
-        pair = getattr(row.spot, f"{name}_um")
-        spot |= {f"{name}_{part}_um": v for part, v in zip(parts, pair, strict=True)}
-        del spot[f"{name}_um"]
-    return values | spot
 
 
 def _write_tables(

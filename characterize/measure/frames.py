@@ -10,7 +10,6 @@ from scipy import ndimage, special
 
 from characterize.captures import Capture, to_electrons
 from characterize.measure import metrics
-from characterize.measure.metrics import SpotMetrics
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 from metalens.lens import Lens
@@ -29,7 +28,7 @@ class FrameMetrics:
     """Image quality of one frame.
 
     name, depth_um: of the frame. angle_deg, angle_y_deg: field angles along x and y.
-    spot: widths of the spot.
+    fwhm_um, ee80_um, d4sigma, centroid: as :class:`metrics.SpotMetrics`.
     mtf50_x_per_um, mtf50_y_per_um: frequencies of half modulation, pixel included.
     strehl: against the Airy pattern of the lens's aperture, nan without a design.
     circle_um: diameter of the efficiency's circle, three times the FWHM.
@@ -41,7 +40,12 @@ class FrameMetrics:
     depth_um: float
     angle_deg: float
     angle_y_deg: float
-    spot: SpotMetrics
+    fwhm_um: float
+    ee80_um: float
+    d4sigma_major_um: float
+    d4sigma_minor_um: float
+    centroid_x_um: float
+    centroid_y_um: float
     mtf50_x_per_um: float
     mtf50_y_per_um: float
     strehl: float
@@ -147,7 +151,10 @@ def _metrics_row(
         float(capture.position_um[i]),
         float(np.degrees(capture.angle_rad[i, 0])),
         float(np.degrees(capture.angle_rad[i, 1])),
-        spot,
+        spot.fwhm_um,
+        spot.ee80_um,
+        *spot.d4sigma_um,
+        *spot.centroid_um,
         metrics.mtf_of_psf(image, step_um=step, axis="x").mtf50_per_um,
         metrics.mtf_of_psf(image, step_um=step, axis="y").mtf50_per_um,
         math.nan if design is None else _strehl(image, design, capture),
@@ -291,7 +298,7 @@ def _sharpest_depths(rows: list[FrameMetrics], notes: list[str]) -> dict[Field, 
         if len(order) < 3 or not np.isfinite(inverse_depth).all():
             continue
         inverse_depth = inverse_depth[order]
-        sharpness = np.array([row.spot.ee80_um**-2 for row in of_field])[order]
+        sharpness = np.array([row.ee80_um**-2 for row in of_field])[order]
         best = int(sharpness.argmax())
         k = min(max(best, 1), len(order) - 2)
         a, b, _ = np.polyfit(inverse_depth[k - 1 : k + 2], sharpness[k - 1 : k + 2], 2)
@@ -318,7 +325,8 @@ def _distortion(
         return {}
     places: dict[Field, list[Field]] = {}
     for row in rows:
-        places.setdefault(row.field, []).append(row.spot.centroid_um)
+        place = row.centroid_x_um, row.centroid_y_um
+        places.setdefault(row.field, []).append(place)
     axis_place = np.mean(places.get((0.0, 0.0), [(0.0, 0.0)]), axis=0)
     ratio = {}
     for field in sorted(places, key=lambda angles: math.hypot(*angles)):
