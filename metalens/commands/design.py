@@ -589,7 +589,7 @@ def _judge(
     wanted: bool,
     expected: float = 1.0,
 ) -> tuple[dict[str, Any], str]:
-    """DesignMetrics of a lens and of the PSF of its design source for JSON, and its failure.
+    """Figures of a lens and of the PSF of its design source, and its failure.
 
     The PSF is left out of a phase without a focus, of a lens of more pillars than fit
     in memory at once, and where torch is not installed. The failure is empty where the

@@ -35,7 +35,7 @@ _Choice = Callable[
 
 @dataclass(frozen=True, slots=True)
 class DesignMetrics:
-    """DesignMetrics of the assigned pillars at the design wavelength.
+    """Figures of the assigned pillars at the design wavelength.
 
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
@@ -109,7 +109,7 @@ class WavelengthTarget:
 
 @dataclass(frozen=True, slots=True)
 class PolarizationMetrics:
-    """DesignMetrics of a lens of two-size pillars for light along x and along y.
+    """Figures of a lens of two-size pillars for light along x and along y.
 
     x, y: quality for either; ``wavefront_efficiency`` is the share of that light.
     wavefront_efficiency_error: its error for x and y, from the library's error bars.
@@ -537,7 +537,7 @@ class _MetricSums:
     def quality(
         self, focus: Focus, place: LatticeSites, cell: Cell, turns: float
     ) -> DesignMetrics:
-        """DesignMetrics of all added pillars from the running sums.
+        """Figures of all added pillars from the running sums.
 
         With N pillars, F = sum T exp(i error) and L = sum T: wave-front efficiency
         |F|² / N², Strehl ratio |F|² / L².

@@ -284,8 +284,8 @@ def low_rank_psfs(
     values = values * torch.stack(factors, -1)[..., None].to(values)
     to_coefficients = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", to_coefficients, values).contiguous()
-    rings = float((targets - planes).norm() / planes.norm())
-    error = math.hypot(max(errors), rings)
+    ripple = float((targets - planes).norm() / planes.norm())
+    error = math.hypot(max(errors), ripple)
     return LowRankPsfs(kernels, transfer, shape, table, vergence, error)
 
 
@@ -397,10 +397,11 @@ def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:
 
 
 def smooth_planes(planes: Tensor, nodes: torch.Size, error: float) -> Tensor:
-    """(depths, y, x) planes without rings, by least squares with the fewest splines.
+    """(depths, y, x) planes smoothed by least squares with the fewest splines.
 
-    The image of an even plane is smooth. Sums over samples and splines between nodes
-    add rings of 0.1 to 0.2 % rms. Splines are fitted where all light reaches.
+    The image of a uniformly illuminated plane is smooth, but sums over samples and
+    splines between nodes add a ripple of 0.1 to 0.2 % rms. Splines are fitted where all
+    light reaches.
 
     Args:
         planes: (depths, y, x) images of uniformly illuminated planes.
