@@ -209,14 +209,14 @@ def _missed_interval(
     expected = (
         f"{wanted.name} will be known to +- {total:.2g}, wanted +- {wanted.within:.2g}"
     )
-    if room > 0:
-        factor = within_model**2 / room
+    factor = within_model**2 / room if room > 0 else 0.0
+    if factor > 1 + 1e-9:
         return (
             f"{expected}: {factor:.1f} times the light ({math.ceil(count * factor)} "
             "such frames), other depths or angles, or an independent measurement"
-            if factor > 1 + 1e-9
-            else ""
         )
+    if room > 0:
+        return ""
     worst = np.argsort(-unstated.by_cause[:, index])[:3]
     causes = ", ".join(unstated.causes[cause] for cause in worst)
     return (

@@ -60,7 +60,7 @@ def right_align(
         depth = bits
     scaled = []
     for stack in stacks:
-        if unit < 1 < stack.max():  # counts beside shares of full scale
+        if unit < 1 < stack.max():  # counts, where the frames are shares of full scale
             scaled.append(stack)
         elif _is_whole(stack):
             scaled.append(np.rint(stack / unit).astype(stack.dtype))

@@ -104,22 +104,15 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
         )
     offset = float(np.mean(dark)) if dark is not None else 0.0
     floor = pair_variance(dark) if dark is not None and len(dark) > 1 else None
-    order = np.argsort([typical_level(frame) for frame in flat], kind="stable")
-    pairs = [
-        (flat[first], flat[second])
-        for first, second in zip(order[:-1:2], order[1::2], strict=False)
-    ]
-    mean = np.array(
-        [
-            (typical_level(first) + typical_level(second)) / 2 - offset
-            for first, second in pairs
-        ]
-    )
-    variance = np.array([pair_variance(np.stack(pair)) for pair in pairs])
+    level = np.array([typical_level(frame) for frame in flat]) - offset
+    order = np.argsort(level, kind="stable")
+    pairs = order[: len(order) // 2 * 2].reshape(-1, 2)
+    mean = level[pairs].mean(1)
+    variance = np.array([pair_variance(flat[pair]) for pair in pairs])
     if not (variance > 0).all() or not (mean > 0).all():
         raise CaptureError(
-            "photon transfer: flats without noise or light; take them anew, evenly lit "
-            "to half the well"
+            "photon transfer: flats without noise or light; take them anew, in even "
+            "light to half the well"
         )
     dark_part = floor or 0.0
     expected = (
@@ -251,7 +244,7 @@ def bad_pixels(capture: Capture) -> Array:
     Dark frames: beyond 8 robust sigma of the median. Flats: outside 0.3 to 3 of the
     median. Frames: single pixels well above their eight neighbours, and in three or
     more frames pixels that stay constant and differ from those around them, but for
-    full wells in light: those beside them are half as bright.
+    full wells in light: their neighbours are half as bright.
 
     Args:
         capture: frames in counts with their stage and camera.
@@ -351,49 +344,42 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
     stated, else from two or more dark frames, else from the photon-transfer line, else
     2 e.
     """
-    description = capture.about
-    dark = capture.dark
-    flats = 0 if capture.flat is None else len(capture.flat)
+    about, dark, flat = capture.about, capture.dark, capture.flat
     measured = None
-    if "gain_e" in description:
-        gain = float(description["gain_e"])
-        sigma = 0.0
-        has_gain = True
+    gain, sigma = 1.0, math.inf
+    if "gain_e" in about:
+        gain, sigma = float(about["gain_e"]), 0.0
         notes.append(f"gain {gain:g} e/count as stated")
-    elif capture.flat is not None and flats > 1:
-        measured = photon_transfer(capture.flat, dark)
-        gain = measured.gain_e
-        sigma = measured.gain_sigma_e
-        has_gain = True
+    elif flat is not None and len(flat) > 1:
+        measured = photon_transfer(flat, dark)
+        gain, sigma = measured.gain_e, measured.gain_sigma_e
         notes.append(
-            f"gain {gain:.3g} +- {sigma:.1g} e/count, measured in {flats} flat frames"
+            f"gain {gain:.3g} +- {sigma:.1g} e/count, measured in {len(flat)} flat "
+            "frames"
         )
     else:
-        gain = 1.0
-        sigma = math.inf
-        has_gain = False
         notes.append(
             "no flats, no stated gain: 1 e/count assumed, chi-square has no absolute "
             "meaning"
         )
-    has_read_noise = True
-    if "read_noise_e" in description:
-        read_noise_e = float(description["read_noise_e"])
+    is_read_noise_known = True
+    if "read_noise_e" in about:
+        read_noise_e = float(about["read_noise_e"])
         origin = "as stated"
     elif dark is not None and len(dark) > 1:
         read_noise_e = gain * math.sqrt(max(pair_variance(dark) - 1 / 12, 0.0))
         origin = f"measured in {len(dark)} dark frames"
-    elif measured is not None:
-        read_noise_e = measured.read_noise_e
-        origin = "from the flats' photon-transfer line"
-        has_read_noise = False
     else:
-        read_noise_e = 2.0  # of a usual sensor
-        origin = "assumed"
-        has_read_noise = False
+        is_read_noise_known = False
+        read_noise_e = measured.read_noise_e if measured else 2.0  # of a usual sensor
+        origin = "from the flats' photon-transfer line" if measured else "assumed"
     notes.append(f"read noise {read_noise_e:.2g} e, {origin}")
     return SensorNoise(
-        gain, sigma, read_noise_e, known=has_gain, read_known=has_read_noise
+        gain,
+        sigma,
+        read_noise_e,
+        known=math.isfinite(sigma),
+        read_known=is_read_noise_known,
     )
 
 

@@ -86,7 +86,7 @@ class Capture:
             if image is not None and image.shape[1:] != shape:
                 raise CaptureError(
                     f"{name} frames are {image.shape[1:]}, the frames {shape}; crop "
-                    "them alike"
+                    "them equally"
                 )
 
     @property
@@ -221,7 +221,7 @@ def _load(path: Path) -> Capture:
 
     The tags of a TIFF file count where it holds all frames and nothing else is stated.
     """
-    description, rows, files = stage.read_beside(path), None, [path]
+    description, rows, files = stage.read_sidecar(path), None, [path]
     companions: dict[str, Path] = {}
     notes: list[str] = []
     if path.is_dir():
@@ -249,7 +249,7 @@ def _load(path: Path) -> Capture:
         content = read_all(file, colours)
         tags = content if is_frame else tags
         images = _frames_first(content, file, order, notes)
-        picked = colours.pick(images, file, grey=not is_frame)
+        picked = colours.pick(images, file, allow_grey=not is_frame)
         return check_images(picked, file)
 
     if rows:
@@ -415,7 +415,7 @@ def _read_hdf5(path: Path) -> Array:
             frames = file.get("frames")
             if not isinstance(frames, h5py.Dataset):
                 raise CaptureError(
-                    f"{path}: 'frames' is no data set (n, y, x) of this file; found "
+                    f"{path}: 'frames' is no data set (n, y, x) of this file, which has "
                     f"{', '.join(sorted(file)) or 'nothing'}"
                 )
             store.check_claim(path, frames, "frames")

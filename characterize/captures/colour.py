@@ -66,24 +66,26 @@ class ColourChannels:
         """Distance of the channel's pixels, in pixels of the sensor."""
         return 2 if self.mosaic else 1
 
-    def pick(self, images: Array, path: Path, *, grey: bool = True) -> Array:
+    def pick(self, images: Array, path: Path, *, allow_grey: bool = True) -> Array:
         """One channel of (n, y, x, red green blue [alpha]) or of a raw mosaic (n, y,
         x); grey images as they are.
 
         Of two green pixels that of the upper row is used.
 
         Args:
-            grey: False where a channel can only be that of colour images.
+            images: of one file.
+            path: the file.
+            allow_grey: whether grey images stand for the stated channel, as of a dark
+                frame.
 
         Raises:
             CaptureError: colour without a channel, or where a mosaic was stated; a
-                channel of grey images where they
-                cannot be.
+                channel of grey images that are not allowed.
         """
         if images.ndim == 3 and self.mosaic:
             row, column = divmod(self.mosaic.index(str(self.channel)[0].upper()), 2)
             return images[:, row::2, column::2]
-        if images.ndim == 3 and (grey or self.channel is None):
+        if images.ndim == 3 and (allow_grey or self.channel is None):
             return images
         if images.ndim == 3:
             raise CaptureError(

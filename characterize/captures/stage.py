@@ -150,8 +150,8 @@ def read_about(folder: Path) -> dict[str, Any]:
     return _read_description(naming.find_table(folder, "capture"))
 
 
-def read_beside(path: Path) -> dict[str, Any]:
-    """Entries of the TOML or JSON file of the same name beside an image file; empty
+def read_sidecar(path: Path) -> dict[str, Any]:
+    """Entries of the TOML or JSON file with the name of an image file; empty
     where there is none.
 
     Args:

@@ -67,7 +67,7 @@ def _plan(options: Options, path: Path) -> int:
         ),
         "warnings": list(plan.warnings),
     }
-    lines = [f"{options.output}: {len(frames)} frames, the most telling first"]
+    lines = [f"{options.output}: {len(frames)} frames, the most informative first"]
     lines += [
         f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
         for z, angle, time in frames

@@ -91,7 +91,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     present_bias = next_mask.present_bias(options.process)
     provenance = _provenance(options, design)
     with options.claim(
-        target, companions=report.BESIDE + (NEXT_MASK if options.next_mask else ())
+        target, companions=report.COMPANIONS + (NEXT_MASK if options.next_mask else ())
     ) as draft:
         result = dataclasses.replace(fit(capture, lens, choice), provenance=provenance)
         result.save(draft.path)
@@ -125,7 +125,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     capture = captures.load(options.capture)
     provenance = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
-    with options.claim(target, companions=report.BESIDE) as draft:
+    with options.claim(target, companions=report.COMPANIONS) as draft:
         pupil_fit = fit_pupil(capture, spec, insist=options.insist)
         save_pupil(draft.path, pupil_fit, provenance)
         report.pupil_report(draft.path.with_suffix(".html"), pupil_fit)

@@ -50,7 +50,7 @@ class Options(CommonOptions):
         pixel_nm: size of a micrograph's pixel; by default that of the instrument's
             tag, where a TIFF of Zeiss or FEI has one.
         bar_nm: length of a micrograph's white scale bar, where the pixel is unknown.
-        pitch_nm: distance of neighbouring pillars; found in the picture without it.
+        pitch_nm: distance of neighbouring pillars; from the picture without it.
         edge_bias_nm: by which edges appear outside the true ones, from a calibration
             sample.
         crop: rows and columns of the picture to look at (top, bottom, left, right), to
@@ -181,19 +181,11 @@ def _micrograph(options: Options, folder: Path) -> Outcome:
     }
     on_mask: overlay.MaskOverlay | None = None
     table: overlay.Table = []
-    notes = []
+    notes: list[str] = []
     if options.design is not None:
-        design = lenses.load(options.design)
-        if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
-            raise CaptureError(
-                f"{options.design}: {design.cell.described}; --design takes round "
-                "pillars, whose diameter is measured"
-            )
-        on_mask = overlay.overlay_design(pillars, design.diameters)
-        scale = overlay.lattice_scale(pillars, pixel, design.diameters)
-        is_true = abs(scale - 1) < overlay.SCALE
+        on_mask, scale = _place_on_mask(options.design, pillars, pixel, notes)
         # another place or scale has other drawn diameters
-        table = overlay.bias_table(on_mask) if on_mask.clearly and is_true else []
+        table = [] if notes else overlay.bias_table(on_mask)
         pillars = dataclasses.replace(pillars, site=on_mask.site)
         values |= {
             "mask_row": on_mask.row,
@@ -202,17 +194,6 @@ def _micrograph(options: Options, folder: Path) -> Outcome:
             "outliers": int(on_mask.outlier.sum()),
             "pitch_over_design": scale,
         }
-        if not on_mask.clearly:
-            notes.append(
-                "other places on the mask fit nearly as well: no bias table; take a "
-                "wider picture"
-            )
-        if not is_true:
-            notes.append(
-                f"the lattice is {scale - 1:+.2%} off the mask's, and so are all "
-                "diameters: no bias table; if the mask was written true to scale, "
-                f"measure again with --pixel-nm {pixel / scale:.5g}"
-            )
     if not options.crop and len(image) < len(whole):
         notes.append(
             f"{len(whole) - len(image)} rows of writing below the picture left out; "
@@ -248,6 +229,34 @@ def _micrograph(options: Options, folder: Path) -> Outcome:
     elif not np.isfinite(pillars.diameter_nm).any():
         failures.append("no pillar could be measured")
     return values, [*lines, *(f"  {note}" for note in notes)], failures
+
+
+def _place_on_mask(
+    path: Path, pillars: sem.MeasuredDiameters, pixel_nm: float, notes: list[str]
+) -> tuple[overlay.MaskOverlay, float]:
+    """(pillars on the mask of a lens file, lattice constant over that of the mask);
+    appends to ``notes`` why there is no bias table.
+    """
+    design = lenses.load(path)
+    if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
+        raise CaptureError(
+            f"{path}: {design.cell.described}; --design takes round pillars, whose "
+            "diameter is measured"
+        )
+    on_mask = overlay.overlay_design(pillars, design.diameters)
+    scale = overlay.lattice_scale(pillars, pixel_nm, design.diameters)
+    if not on_mask.clearly:
+        notes.append(
+            "other places on the mask fit nearly as well: no bias table; take a wider "
+            "picture"
+        )
+    if abs(scale - 1) >= overlay.SCALE:
+        notes.append(
+            f"the lattice is {scale - 1:+.2%} off the mask's, and so are all "
+            "diameters: no bias table; if the mask was written true to scale, measure "
+            f"again with --pixel-nm {pixel_nm / scale:.5g}"
+        )
+    return on_mask, scale
 
 
 def _pillars(

@@ -145,7 +145,12 @@ def micrograph_page(
         )
     ]
     if table:
-        head = ("drawn / nm", "made less drawn / nm", "standard error / nm", "pillars")
+        head = (
+            "drawn / nm",
+            "measured less drawn / nm",
+            "standard error / nm",
+            "pillars",
+        )
         sections.append(
             report.Section(
                 "Bias table", "", [report.Table(head, [tuple(row) for row in table])]

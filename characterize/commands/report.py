@@ -13,7 +13,7 @@ from characterize.pupil import PupilFit
 from metalens.core import report, store
 from metalens.core.arrays import Array
 
-BESIDE = (
+COMPANIONS = (
     ".html",
     "_frames.png",
     "_parameters.png",
