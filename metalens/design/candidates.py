@@ -8,10 +8,6 @@ from scipy.spatial import KDTree
 
 from metalens.core.arrays import Array
 
-_STARTS = 16  # initial pistons of the alternating minimisation
-_ROUNDS = 40  # most iterations from each
-_CONVERGED_RAD = 1e-3  # pistons that move less have converged
-
 
 @dataclass(frozen=True, eq=False)
 class CandidateTable:
@@ -73,15 +69,16 @@ class CandidateTable:
         has_vertex = (best == inner) & (curvature > 0)
         return np.asarray(inner + np.where(has_vertex, offset, best - inner))
 
-    def pistons(self, phases_rad: Array) -> Array:
-        """(channels,) pistons of the least sum over sites, the best of 16 starts.
+    def pistons(self, phases_rad: Array, *, starts: int = 16) -> Array:
+        """(channels,) pistons of the least sum over sites, the best of several starts.
 
         Args:
             phases_rad: (channels, sites) wanted phases of a sample of sites.
+            starts: random initial pistons; the sum has several minima.
         """
         count = 1 if self.common_piston else len(self.t)
-        starts = np.random.default_rng(0).uniform(0, 2 * np.pi, (_STARTS, count))
-        results = [self._converged(phases_rad, start) for start in starts]
+        draw = np.random.default_rng(0).uniform(0, 2 * np.pi, (starts, count))
+        results = [self._converged(phases_rad, start) for start in draw]
         return min(results, key=lambda result: result[0])[1]
 
     def _converged(self, phases: Array, start: Array) -> tuple[float, Array]:
@@ -95,13 +92,13 @@ class CandidateTable:
             start: (channels,) or (1,) initial pistons, rad.
         """
         pistons = np.broadcast_to(start, len(self.t))
-        for _ in range(_ROUNDS):
+        for _ in range(40):
             pick = self.nearest(phases + pistons[:, None])
             peaks = self.weights * (self.t[:, pick] * np.exp(-1j * phases)).sum(1)
             peaks = peaks.sum(keepdims=True) if self.common_piston else peaks
             previous = pistons
             pistons = np.broadcast_to(np.angle(peaks), len(self.t))
             change = np.angle(np.exp(1j * (pistons - previous)))
-            if np.abs(change).max() < _CONVERGED_RAD:
+            if np.abs(change).max() < 1e-3:  # rad
                 break
         return float(self._sums(pick, phases + pistons[:, None]).sum()), pistons

@@ -16,7 +16,6 @@ RAYS = 25  # along an axis
 _SCALE = 0.98764321  # of the even ray spacing: incommensurate with a map's samples
 SPREAD = 0.2  # largest rms width of rays that meet, over their rms width on the lens
 DARK = 1e-3  # of a perfect lens's peak; a darker meeting point is a vortex
-PLACES = 121  # points across the lens at which its wave front is sampled
 
 
 def has_focus(phase: PhaseOf, focus: Focus, radius_um: float, pitch_um: float) -> bool:
@@ -213,7 +212,7 @@ def _illuminated_places(
         radius_um: radius of the aperture, um.
         tangent: of the field angle along x.
     """
-    axis = np.linspace(-radius_um, radius_um, PLACES)
+    axis = np.linspace(-radius_um, radius_um, 121)
     x, y = np.meshgrid(axis, axis)
     illuminated = np.hypot(x, y) <= radius_um * (1 + 1e-12)
     source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um

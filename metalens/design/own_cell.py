@@ -12,7 +12,6 @@ from metalens.design.profiles import lens_focus
 from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.psf import NEIGHBOURS
 
-RINGS = 48  # of a lens, over which light is summed
 # pillars in a row; zones of fewer or more pillars take the row of that length (with
 # two, rows of shifted phases separate the light to both sides)
 FEWEST = 2
@@ -122,7 +121,7 @@ def power_error(lens: Lens) -> float:
     return math.hypot(2 * t_error, coupling_loss(lens).error)
 
 
-def _rings(lens: Lens) -> tuple[Array, Array]:
+def _rings(lens: Lens, count: int = 48) -> tuple[Array, Array]:
     """(m,) sines by which rings of a lens turn light, and their shares of the area.
 
     Gauss-Legendre nodes in the squared radius; sine = NA towards the sensor plus
@@ -132,7 +131,7 @@ def _rings(lens: Lens) -> tuple[Array, Array]:
         lens: the lens.
     """
     radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
-    node, weight = np.polynomial.legendre.leggauss(RINGS)
+    node, weight = np.polynomial.legendre.leggauss(count)
     radius = radius_um * np.sqrt((node + 1) / 2)
     focus = lens_focus(lens)
     sine = np.array(

@@ -25,10 +25,6 @@ from metalens.optics import Layers
 from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
 from metalens.psf import spectrum as spectra
 
-# samples of the frame at which interpolated PSFs are compared with true ones
-HELD_OUT = 16
-FEW = 5  # of them, at which the transform and the field's components are judged
-
 
 def imager(
     lens: Lens | Wave,
@@ -243,19 +239,25 @@ def textured_frames(grid: Grid) -> Frames:
     return Frames((cover * texture)[None], cover[None], depth_um[None])
 
 
-def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
+def _error_parts(
+    optics: Optics, prepared: Imager, *, samples: int = 16, few: int = 5
+) -> dict[str, float]:
     """Relative L2 errors of an imager by cause, at places and depths between its nodes.
 
-    PSFs of ``HELD_OUT`` random samples and four depths are computed directly and
-    compared. Errors relative to the light of a place are scaled by
-    :func:`image_dimming`, as an image can be dimmer than the whole frame.
+    PSFs of random samples and four depths are computed directly and compared. Errors
+    relative to the light of a place are scaled by :func:`image_dimming`, as an image
+    can be dimmer than the whole frame.
+
+    Args:
+        samples: of the frame at which PSFs are compared.
+        few: of them, at which the transform and the field's components are judged.
 
     Returns:
         dict: error by name; see ``parts`` of :class:`Imager`.
     """
     plan = prepared.plan
     draw = np.random.default_rng(7)
-    pixels = np.floor(draw.random((HELD_OUT, 2)) * prepared.grid.frame).astype(int)
+    pixels = np.floor(draw.random((samples, 2)) * prepared.grid.frame).astype(int)
     rows, columns = (
         np.linspace(float(nodes[0]), float(nodes[-1]), n)
         for n, nodes in zip(prepared.grid.frame, (plan.y_um, plan.x_um), strict=True)
@@ -270,10 +272,10 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     used = psfs_used(prepared, torch.from_numpy(pixels), depths).cpu()
     dimmer = image_dimming(prepared)
     light = true.sum((-1, -2))
-    few = at[:FEW], depths[1:-1]
+    inner = at[:few], depths[1:-1]
     # of the brightest of few places in the image
-    share = float(light[:FEW].max() / (light**2).mean().sqrt()) * dimmer
-    judged = model_error.JudgedPsfs(optics, plan.waves, plan.window, few)
+    share = float(light[:few].max() / (light**2).mean().sqrt()) * dimmer
+    judged = model_error.JudgedPsfs(optics, plan.waves, plan.window, inner)
     wave = float(plan.waves.wavelengths_um[0])
     pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
     parts = {
@@ -287,8 +289,8 @@ def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
         "edge": pupil_sampling(optics, plan.window, wave).beyond / 2,
     }
     if optics.layers.stop is not None:
-        judged_psfs = true[:FEW, 1:-1], light[:FEW, 1:-1], light.amax(0)[1:-1]
-        shadow = _shadow_error(optics, wave, few, judged_psfs, plan.window.step_um)
+        judged_psfs = true[:few, 1:-1], light[:few, 1:-1], light.amax(0)[1:-1]
+        shadow = _shadow_error(optics, wave, inner, judged_psfs, plan.window.step_um)
         parts["stop"] = shadow * dimmer
     return parts
 

@@ -23,8 +23,6 @@ from metalens.image import (
 )
 from metalens.image import pupil as pupils
 
-RATE = 0.15  # first step of Adam, rad
-NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 SMOOTH = 11  # iterations per iteration on the spline
 CHECKS = 20  # iterations between two evaluations of the deterministic figures
 CLIMB_IMAGES = 4  # images of a gradient step, at least two for every field angle
@@ -336,7 +334,8 @@ def _climb(
     first = min(max(1, total // SMOOTH), total - 1)
     margin = 0.01  # encircled energy beyond the bound that the penalty asks for
     judged: list[FisherPhase] = []
-    stages = (True, RATE, range(first)), (False, NODE_RATE, range(first, total))
+    # smooth, first step of Adam in rad (large ones leave poor optima), iterations
+    stages = (True, 0.15, range(first)), (False, 0.5, range(first, total))
     for smooth, rate, steps in stages:
         if not smooth:
             values = ((down @ values) * across).sum(1).reshape(pupil.nodes, -1)
