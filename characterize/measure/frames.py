@@ -98,7 +98,8 @@ def measure_frames(
     """
     if math.isnan(capture.pixel_um):
         raise CaptureError(
-            "pixel_um is missing: give the sensor's pixel in capture.toml"
+            "pixel_um is missing: give the sensor's pixel in capture.toml; of a "
+            "micrograph, --pixel-nm or --bar-nm"
         )
     frames = to_electrons(capture)
     step = capture.pixel_um
@@ -287,25 +288,29 @@ def _sharpest_depths(rows: list[FrameMetrics], notes: list[str]) -> dict[Field, 
     """{field angles: depth in um of the sharpest spot}; appends to ``notes`` where it
     is the first or last of an angle.
 
-    Sharpness is 1 / EE80²; its maximum is that of a parabola in 1/z through the three
-    depths about the sharpest frame. Angles with fewer than three depths are left out.
+    Sharpness is 1 / EE80², averaged over frames of equal depth. Its maximum is that of
+    a parabola through the three depths about the sharpest: in 1/z for distances from
+    the lens, in z for a stage that passes 0. Angles with fewer than three depths are
+    left out.
     """
     depths = {}
     for field in sorted({row.field for row in rows}):
         of_field = [row for row in rows if row.field == field]
-        inverse_depth = np.array([1 / row.depth_um for row in of_field])
-        order = np.argsort(-inverse_depth)
-        if len(order) < 3 or not np.isfinite(inverse_depth).all():
+        z = np.array([row.depth_um for row in of_field])
+        are_distances = z.min() > 0
+        places, frame = np.unique(1 / z if are_distances else z, return_inverse=True)
+        if len(places) < 3 or not np.isfinite(z).all():
             continue
-        inverse_depth = inverse_depth[order]
-        sharpness = np.array([row.ee80_um**-2 for row in of_field])[order]
+        sharpness = np.bincount(frame, [row.ee80_um**-2 for row in of_field])
+        sharpness = sharpness / np.bincount(frame)
         best = int(sharpness.argmax())
-        k = min(max(best, 1), len(order) - 2)
-        a, b, _ = np.polyfit(inverse_depth[k - 1 : k + 2], sharpness[k - 1 : k + 2], 2)
-        vertex = -b / (2 * a) if a < 0 else inverse_depth[best]
-        last, first = inverse_depth[[-1, 0]]
-        depths[field] = float(1 / np.clip(vertex, last, first))
-        if not last < vertex < first:
+        k = min(max(best, 1), len(places) - 2)
+        near = slice(k - 1, k + 2)
+        a, b, _ = np.polyfit(places[near] - places[k], sharpness[near], 2)
+        vertex = places[k] - b / (2 * a) if a < 0 else places[best]
+        sharpest = float(np.clip(vertex, places[0], places[-1]))
+        depths[field] = 1 / sharpest if are_distances else sharpest
+        if not places[0] < vertex < places[-1]:
             notes.append(
                 f"sharpest at {field[0]:g}, {field[1]:g} deg at an end of the captured "
                 f"depths, {depths[field]:.5g} um: focus may lie beyond it"

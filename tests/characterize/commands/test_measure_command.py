@@ -20,7 +20,7 @@ from tests.command_line import call
 from tests.proxies import proxy_of
 
 
-def spots(folder, sigma_um, pixel_um=0.9):
+def spots(folder, sigma_um, pixel_um=0.9, depth_um=None):
     """Gaussian spots on a background, one a depth; D4 sigma is 4 sigma, FWHM 2.355
     sigma, MTF50 0.1874 / sigma.
     """
@@ -36,7 +36,7 @@ def spots(folder, sigma_um, pixel_um=0.9):
             np.uint16
         )
         tifffile.imwrite(folder / f"f{i}.tif", counts)
-        lines.append(f"f{i}.tif,{500 + 100 * i}")
+        lines.append(f"f{i}.tif,{depth_um[i] if depth_um else 500 + 100 * i}")
     (folder / "stage.csv").write_text("\n".join(lines) + "\n")
     (folder / "capture.toml").write_text(
         f"pixel_um = {pixel_um}\nwavelength_um = 0.85\nbits = 16\n"
@@ -90,6 +90,18 @@ def test_a_sharpest_depth_that_is_the_first_or_last_is_told(
     words = f"note: sharpest at 0, 0 deg at an end of the captured depths, {end} um: focus may lie beyond it"
     assert (words in said) == (end is not None)
     assert ("focus may lie beyond" in said) == (end is not None)
+
+
+def test_the_sharpest_place_of_a_stage_about_zero_with_a_repeated_frame(tmp_path):
+    """Widths 2.5 sqrt(1 + ((z - 20) / 150)²): a parabola of 1 / (1 + u²) through
+    -100, 0 and 100 has its top at 14.6; noise adds some um.
+    """
+    z = (-200, -100, 0, 100, 200, -100)
+    sigmas = [2.5 * math.hypot(1, (place - 20) / 150) for place in z]
+    spots(tmp_path / "shots", sigmas, depth_um=z)
+    assert call(f"measure {tmp_path}/shots -o {tmp_path}/out --quiet") == 0
+    told = json.loads((tmp_path / "out" / "measure.json").read_text())
+    assert told["best_depth"][0]["depth_um"] == pytest.approx(20, abs=10)
 
 
 def test_light_beside_that_of_an_empty_aperture_is_the_efficiency(tmp_path):
