@@ -25,7 +25,7 @@ from metalens.fabrication import (
     perturbed_transmission,
 )
 from metalens.lens import Lens
-from metalens.optics.paths import path_difference
+from metalens.optics.paths import axial_path_difference
 
 _ANGLES = 8  # along a circle of points where the corrected map is judged
 DRAWS = 24
@@ -253,9 +253,9 @@ def _wave(lens: Lens, response: Sensitivity, x: Array) -> Array:
     x[PLACE["wavelength_nm"]] = 0.0
     radius2 = lens.diameters.x_um**2 + lens.diameters.y_um[:, None] ** 2
     distance = lens.sensor_distance_um
-    defocus_um = path_difference(
+    defocus_um = axial_path_difference(
         radius2, distance + float(x[PLACE["distance_um"]])
-    ) - path_difference(radius2, distance)
+    ) - axial_path_difference(radius2, distance)
     wave = as_built.as_built_transmission(lens, response, x)
     return np.asarray(wave * np.exp(2j * np.pi / lens.wavelength_um * defocus_um))
 

@@ -575,7 +575,7 @@ def _of_built(path: Path, settings: PsfSettings, built: Any) -> psf.PsfStack:
     Args:
         path: of the file.
         settings: with nothing left to the lens.
-        given: the as-built lens.
+        built: the as-built lens.
 
     Raises:
         ConfigError: settings that are for a design.

@@ -13,7 +13,7 @@ from torch import Tensor
 from metalens.core.errors import PropagationError
 from metalens.image.rays import middle_direction
 from metalens.optics import Layers
-from metalens.optics.paths import path_difference, sensor_path, source_path
+from metalens.optics.paths import axial_path_difference, sensor_path, source_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +240,11 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
     if not field.angle_rad:
         x, y = coordinates(pupil)
         return PupilView(
-            x, y, amplitude(pupil), None, -k * path_difference(x**2 + y**2, focus_um)
+            x,
+            y,
+            amplitude(pupil),
+            None,
+            -k * axial_path_difference(x**2 + y**2, focus_um),
         )
     cx, cy = (d * t for t in field.tangents)
     air = Layers().after(d, pupil.wavelength_um)
@@ -264,7 +268,7 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
         .long()
         for a in (y, x)
     )
-    focus = path_difference(r2, d) + path_difference(r2, focus_um)
+    focus = axial_path_difference(r2, d) + axial_path_difference(r2, focus_um)
     return PupilView(
         x, y, weight, row * n + column, k * (sensor_path(x, y, (cx, cy), d) - focus)
     )

@@ -12,7 +12,7 @@ def hypot_minus_length(length: Any, more: Any) -> Any:
     return more / ((length * length + more) ** 0.5 + length)
 
 
-def path_difference(radius2_um2: Any, distance_um: Any) -> Any:
+def axial_path_difference(radius2_um2: Any, distance_um: Any) -> Any:
     """Extra path from an axial point out to radius r, sqrt(r² + z²) - z, from r² (paper
     Eq. 1).
 
@@ -20,7 +20,7 @@ def path_difference(radius2_um2: Any, distance_um: Any) -> Any:
         radius2_um2: (*shape) squared distance from the axis.
         distance_um: axial distance, above 0; inf gives 0.
 
-    >>> path_difference(9.0, 4.0)
+    >>> axial_path_difference(9.0, 4.0)
     1.0
     """
     return (

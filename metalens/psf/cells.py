@@ -72,17 +72,13 @@ def plan_pixel_cells(case: PropagationCase, finer: int = FINER[0]) -> PixelCells
         )
     down, across = (n * points + 2 * BORDER for n in case.samples)
     fine = replace(case, step_um=case.step_um / points, samples=(down, across))
-    return PixelCells(points, fine, _left(math.sin(math.pi / (2 * finer))))
-
-
-def _left(s: float) -> tuple[float, float]:
-    """Error of the corrections of a cell's mean for a wave, as ``PixelCells.left``.
-
-    The wave advances by 2 asin(s) rad from point to point. Its mean over that step is
-    s / asin(s), and the corrections are s²/6 and 17 s⁴/360.
-    """
+    # a wave of Nyquist's frequency advances by 2 angle from point to point; its mean
+    # over a step is sin(angle) / angle, its corrections are s²/6 and 17 s⁴/360
+    angle = math.pi / (2 * finer)
+    s = math.sin(angle)
     second, fourth = s**2 / 6, 17 / 360 * s**4
-    return (1 - second - fourth - s / math.asin(s)) / fourth, fourth / second
+    beyond = 1 - second - fourth - s / angle
+    return PixelCells(points, fine, (beyond / fourth, fourth / second))
 
 
 def integrate_cells(

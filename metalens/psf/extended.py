@@ -292,24 +292,17 @@ def shift_invariance_error(
         square = 0.0
         sizes = _tangent_change(case, extent, inverse[depth])
         for axis in (0, 1):
-            other = probe(_moved(single, sizes[:, axis] * SIGMA[extent.shape]))
+            x, y = single.tangents + sizes[:, axis] * SIGMA[extent.shape]
+            tangents = float(x), float(y)
+            shift = np.subtract(
+                _sensor_place(case, tangents), _sensor_place(case, case.tangents)
+            )
+            centre_um = np.add(case.centre_um, shift).tolist()
+            other = probe(
+                replace(single, tangents=tangents, centre_um=tuple(centre_um))
+            )
             change = _filtered(other.detach() - middle, single, extent, 1)
             square += float(change.norm()) ** 2
         blurred = _filtered(middle, single, extent, 0)
         errors.append(math.sqrt(square) / float(blurred.norm()))
     return max(errors)
-
-
-def _moved(case: PropagationCase, turn: Array) -> PropagationCase:
-    """The case with its tangents changed, and its window moved with the chief ray.
-
-    Args:
-        case: direction and window.
-        turn: [x, y] added to the tangents.
-    """
-    tangents = case.tangents[0] + float(turn[0]), case.tangents[1] + float(turn[1])
-    shift = np.subtract(
-        _sensor_place(case, tangents), _sensor_place(case, case.tangents)
-    )
-    x, y = np.add(case.centre_um, shift).tolist()
-    return replace(case, tangents=tangents, centre_um=(x, y))

@@ -40,8 +40,6 @@ PLACES = 9  # along each axis of the window, to which optical paths are computed
 ROWS = 64  # rows of pillars whose delays are computed
 NEARBY = 1e-4  # relative step of the wavelength for those delays
 TRIES = 3  # at a spectrum: the PSFs of one give the paths for the next
-ABOVE = "above the tolerance by its spectrum"
-AT_NORMAL = "pillars respond as at normal incidence: their library has no angles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,11 +332,15 @@ def _at_wavelengths(
     worst = max(parts, key=lambda part: part.error)
     words = [
         worst.reason,
-        ABOVE if budget.computed > tolerance and worst.converged else "",
+        "above the tolerance by its spectrum"
+        if budget.computed > tolerance and worst.converged
+        else "",
         f"of {lens.one_light}: these pillars respond to x and y separately"
         if lens.one_light
         else "",
-        AT_NORMAL if budget.angle else "",
+        "pillars respond as at normal incidence: their library has no angles"
+        if budget.angle
+        else "",
         neighbours_text(lens.neighbours),
     ]
     joined: dict[str, Any] = {

@@ -100,17 +100,13 @@ class PsfStack:
 
     def numpy(self) -> "PsfStack":
         """The same record with numpy arrays, detached from any graph."""
-        return dataclasses.replace(
-            self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2)
+        if isinstance(self.intensity, np.ndarray):
+            return self
+        light, energy = (
+            values.detach().cpu().numpy()
+            for values in (self.intensity, self.energy_um2)
         )
-
-
-def _array(value: Any) -> Array:
-    return (
-        value
-        if isinstance(value, np.ndarray)
-        else np.asarray(value.detach().cpu().numpy())
-    )
+        return dataclasses.replace(self, intensity=light, energy_um2=energy)
 
 
 AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
@@ -121,7 +117,7 @@ def save(path: str | Path, stack: PsfStack) -> None:
     """Write a PSF file (kind ``psf``).
 
     Args:
-        path: file to read or write.
+        path: file to write.
         stack: PSFs over angle, depth and wavelength.
     """
     plain = stack.numpy()
@@ -142,7 +138,7 @@ def load(path: str | Path) -> PsfStack:
     """Read a PSF file.
 
     Args:
-        path: file to read or write.
+        path: file to read.
 
     Raises:
         StoreError: missing, truncated, or not a PSF file.

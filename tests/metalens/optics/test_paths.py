@@ -30,7 +30,7 @@ def test_every_difference_keeps_its_digits(x, y, z):
     tx, ty = 0.31, -0.17
     lens = Decimal(x) ** 2 + Decimal(y) ** 2
     axial = lens / ((lens + Decimal(z) ** 2).sqrt() + Decimal(z))
-    assert paths.path_difference(x * x + y * y, z) == pytest.approx(
+    assert paths.axial_path_difference(x * x + y * y, z) == pytest.approx(
         float(axial), rel=1e-15
     )
     plain = away(x + 0.0, y, z) - Decimal(z)  # 60 digits survive the subtraction
@@ -61,7 +61,10 @@ def test_a_far_source_is_a_plane_wave_and_its_rays_lean_with_the_tangents():
     assert paths.source_path(2.5, 1.5, (tx, ty), 0.0) == pytest.approx(
         (2.5 * tx + 1.5 * ty) / s, rel=1e-15
     )
-    assert paths.path_difference(np.array([4.0, 9.0]), math.inf).tolist() == [0.0, 0.0]
+    assert paths.axial_path_difference(np.array([4.0, 9.0]), math.inf).tolist() == [
+        0.0,
+        0.0,
+    ]
 
 
 def test_gradients_are_those_of_a_difference():
