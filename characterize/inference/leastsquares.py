@@ -156,7 +156,6 @@ class FitSolution:
     merit: float
     converged: bool
     reason: str
-    iterations: int
     beyond: Array
     slopes: Array
 
@@ -228,9 +227,7 @@ class FitProblem:
         damping = 1e-3
         converged = False
         reason = f"stopped after {settings.iterations} iterations"
-        iteration = 0
-        while iteration < settings.iterations:
-            iteration += 1
+        for _ in range(settings.iterations):
             step, image, damping, accepted = self._step(state, damping)
             x = state.x + step if accepted else state.x
             moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
@@ -254,7 +251,7 @@ class FitProblem:
                 break
         if settings.finish and state.travel > near:
             state = self._linearise(state.x)
-        return self._solution(state, (converged, reason, iteration))
+        return self._solution(state, converged, reason)
 
     def _linearise(self, x: Array, slopes: Array | None = None) -> _State:
         """The problem at (p,) ``x``, with an exact Jacobian or with ``slopes``.
@@ -361,12 +358,8 @@ class FitProblem:
         pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma, 0.0)
         return float(loss.sum() + (pull**2).sum())
 
-    def _solution(self, state: _State, ended: tuple[bool, str, int]) -> FitSolution:
-        """The solution at the end of a fit: covariance, reduced chi-square.
-
-        Args:
-            ended: (converged, reason, iterations).
-        """
+    def _solution(self, state: _State, converged: bool, reason: str) -> FitSolution:
+        """The solution at the end of a fit: covariance, reduced chi-square."""
         counted = self.data.usable & ~self.data.saturated
         inlier = counted & (np.abs(state.residual) <= HUBER)
         dof = max(int(inlier.sum()) - len(state.x), 1)
@@ -379,7 +372,8 @@ class FitProblem:
             state.residual * self.data.usable,
             float((state.residual[inlier] ** 2).sum()) / dof,
             self._merit(state.image, state.x),
-            *ended,
+            converged,
+            reason,
             beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
             slopes=state.jacobian,
         )
