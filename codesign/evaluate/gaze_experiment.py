@@ -394,8 +394,6 @@ def _check_sources(sources: Sequence[FinishedRun], config: ExperimentConfig) -> 
     """Refuse runs of different geometry, and slippage out of the depths of a run's
     images.
     """
-    if not sources:
-        raise ConfigError("no run to evaluate; give one run folder or more")
     views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
               s.settings.optics.sensor_distance_mm) for s in sources]  # fmt: skip
     if len(set(views)) > 1:

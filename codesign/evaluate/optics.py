@@ -158,27 +158,26 @@ def measure_axial_information(
             to compare lenses, pass :meth:`MeasurementSettings.about` of one.
     """
     resolved = (setting or MeasurementSettings()).about(lens)
-    depths = np.linspace(
-        1e3 * resolved.depths_mm[0], 1e3 * resolved.depths_mm[1], resolved.count
-    )
-    all_depths = np.sort(np.concatenate([depths, depths + resolved.step_um]))
+    depths_um = np.linspace(*resolved.depths_mm, resolved.count) * 1e3
     samples = round(resolved.window_um / resolved.sample_um)
     angles = tuple((math.radians(angle_deg), 0.0) for angle_deg in resolved.angles_deg)
-    stack = from_lens(
-        lens,
-        View(tuple(all_depths), angles, resolved.window_um, samples),
-        tolerance=resolved.tolerance,
-    )
-    order = np.searchsorted(
-        all_depths, np.concatenate([depths, depths + resolved.step_um])
-    )
-    intensity = torch.as_tensor(stack.intensity)[..., order, :, :].reshape(
-        len(angles), 2, resolved.count, samples, samples
+    stacks = [
+        from_lens(
+            lens,
+            View(tuple(z_um), angles, resolved.window_um, samples),
+            tolerance=resolved.tolerance,
+        )
+        for z_um in (depths_um, depths_um + resolved.step_um)
+    ]
+    shape = len(angles), resolved.count
+    near, far = (
+        torch.as_tensor(stack.intensity).reshape(*shape, samples, samples)
+        for stack in stacks
     )
     information = [
         axial_information(
-            intensity[:, 0],
-            intensity[:, 1],
+            near,
+            far,
             step_um=resolved.step_um,
             sample_um=resolved.sample_um,
             pixel_um=resolved.pixel_um * binning,
@@ -186,17 +185,14 @@ def measure_axial_information(
         )
         for binning in resolved.binnings
     ]
-    energy_um2 = torch.as_tensor(stack.energy_um2)[
-        ..., order[: resolved.count]
-    ].reshape(len(angles), resolved.count)
-    share = energy_um2 / torch.as_tensor(
-        np.array([passed_um2(lens, angle, tuple(depths)) for angle in angles])
-    )
-    inside = most_encircled(
-        intensity[:, 0], resolved.sample_um, radius_um=resolved.radius_um
-    )
+    passed = [passed_um2(lens, angle, tuple(depths_um)) for angle in angles]
+    energy_um2 = torch.as_tensor(stacks[0].energy_um2).reshape(shape)
+    share = energy_um2 / torch.as_tensor(np.array(passed))
+    inside = most_encircled(near, resolved.sample_um, radius_um=resolved.radius_um)
     return AxialInformation(
-        torch.stack(information, 1), inside * share.clamp(max=1.0), float(stack.error)
+        torch.stack(information, 1),
+        inside * share.clamp(max=1.0),
+        max(float(stack.error) for stack in stacks),
     )
 
 

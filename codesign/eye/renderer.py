@@ -19,7 +19,6 @@ from codesign.eye.population import (
     select_rows,
 )
 from metalens.core.arrays import Array
-from metalens.core.errors import SceneError
 from metalens.image import Frames
 
 
@@ -33,12 +32,6 @@ class PinholeCamera:
 
     pixels: int = 160
     pitch_um: float = 9.0
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.pixels <= 8192 and 0 < self.pitch_um < 1e4):
-            raise SceneError(
-                f"camera of {self.pixels} pixels of {self.pitch_um} um: need 1-8192 pixels, pitch above 0"
-            )
 
     def tangents(self, rig: CameraRig) -> Array:
         """(pixels,) tangents of the rays through the pixel centres along one side.

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from metalens.core.arrays import Array
-from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,12 +51,7 @@ def fit_regressor(
         hidden: neurons of the hidden layer.
         penalty: of the squared weights, relative to the squared error of a point.
         seed: of the initial weights. steps: evaluations at most.
-
-    Raises:
-        TrainingError: fewer than 3 points.
     """
-    if len(features) < 3:
-        raise TrainingError(f"a regressor from {len(features)} points, need 3 or more")
     scales = [
         np.stack([a.mean(0), np.maximum(a.std(0), 1e-9)]) for a in (features, targets)
     ]

@@ -4,6 +4,7 @@ whether it reads the optics.
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -337,45 +338,41 @@ def gaze_error_deg(
     return bench.calibrated_error_deg(people, read)
 
 
-def bootstrap_interval(
-    values: Array, *, draws: int = 1000, seed: int = 0
-) -> tuple[float, float]:
-    """(low, high) 95 % percentile interval of the mean of (n,) values by the bootstrap.
-
-    Of a single value both are the value itself.
+def bootstrap_interval(values: Array) -> tuple[float, float]:
+    """(low, high) 95 % interval of the mean of (n,) values by the bootstrap.
 
     Args:
-        values: to average. draws: resamples. seed: of them.
+        values: to average.
     """
-    if len(values) < 2:
-        return float(values[0]), float(values[0])
-    ends = stats.bootstrap(
-        (values,), np.mean, n_resamples=draws, method="percentile", rng=seed
-    ).confidence_interval
-    return float(ends.low), float(ends.high)
+    return _percentile_interval((values,), np.mean)
 
 
-def bootstrap_ratio(
-    values: Array, reference: Array, *, draws: int = 2000, seed: int = 0
-) -> tuple[float, float, float]:
+def bootstrap_ratio(values: Array, reference: Array) -> tuple[float, float, float]:
     """(ratio, low, high): ratio of two means and its 95 % interval by the paired
     bootstrap.
 
-    Percentile interval; of a single pair all three are the ratio.
-
     Args:
         values, reference: (n,) of the same n subjects or scenes.
-        draws: resamples. seed: of them.
     """
 
     def ratio_of_means(top: Array, bottom: Array, axis: int = -1) -> Array:
         return np.asarray(top.mean(axis) / bottom.mean(axis))
 
-    estimate = float(ratio_of_means(values, reference))
-    if len(values) < 2:
-        return estimate, estimate, estimate
+    pair = values, reference
+    return float(ratio_of_means(*pair)), *_percentile_interval(pair, ratio_of_means)
+
+
+def _percentile_interval(
+    samples: tuple[Array, ...], statistic: Callable[..., Any]
+) -> tuple[float, float]:
+    """95 % percentile interval of a statistic over 2000 resamples, paired; of single
+    values the statistic itself, twice.
+    """
+    if len(samples[0]) < 2:
+        estimate = float(statistic(*samples))
+        return estimate, estimate
     ends = stats.bootstrap(
-        (values, reference), ratio_of_means, n_resamples=draws, paired=True,
-        method="percentile", rng=seed,
+        samples, statistic, n_resamples=2000, paired=len(samples) > 1,
+        method="percentile", rng=0,
     ).confidence_interval  # fmt: skip
-    return estimate, float(ends.low), float(ends.high)
+    return float(ends.low), float(ends.high)

@@ -99,7 +99,7 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
-        low, high = assess.bootstrap_interval(rng.exponential(1.0, 200), draws=200)
+        low, high = assess.bootstrap_interval(rng.exponential(1.0, 200))
         hits += low <= 1.0 <= high
     # 95 %, with the spread of 200 trials and the bootstrap's own bias
     assert 0.88 <= hits / 200 <= 0.99

@@ -117,7 +117,7 @@ def test_bootstrap_interval_covers_the_true_ratio():
             torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40))
             for level in (1.5, 1.0)
         )
-        _, low, high = bootstrap_ratio(a, b, draws=400, seed=k)
+        _, low, high = bootstrap_ratio(a, b)
         covered += low <= 1.5 <= high
     # 95 asked; binomial sd 2.2, percentile bootstrap of 40 scenes a little short
     assert 85 <= covered <= 100
