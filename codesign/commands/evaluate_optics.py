@@ -1,10 +1,11 @@
 """LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: information about
 depth, and about whole scenes.
 """
+# ruff: noqa: RUF009  (records of settings are frozen)
 
 import dataclasses
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,10 @@ class OpticsSettings:
     table is made of. reader: what the reference reader sees, with ``--reader``.
     """
 
-    axial: MeasurementSettings = field(default_factory=MeasurementSettings)
-    over_field: FieldSetting = field(default_factory=FieldSetting)
-    scenes: SensitivityScenes = field(default_factory=SensitivityScenes)
-    reader: ReaderConfig = field(default_factory=ReaderConfig)
+    axial: MeasurementSettings = MeasurementSettings()
+    over_field: FieldSetting = FieldSetting()
+    scenes: SensitivityScenes = SensitivityScenes()
+    reader: ReaderConfig = ReaderConfig()
 
 
 def run(options: Options) -> int:

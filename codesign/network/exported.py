@@ -118,6 +118,8 @@ def write_onnx(
     Raises:
         OSError: the target cannot be written.
     """
+    import onnx
+
     network = ExportedNetwork(net, architecture, scale)
     example = torch.zeros(2, 1, size, size)
     names = scale.outputs
@@ -129,12 +131,6 @@ def write_onnx(
                 network, (example,), str(part), dynamo=False, input_names=["frames"], output_names=list(names),
                 opset_version=17, dynamic_axes={name: {0: "batch"} for name in ("frames", *names)},
             )  # fmt: skip
-        with torch.no_grad():
-            values = network(example)
-        shapes = {
-            name: tuple(value.shape[1:])
-            for name, value in zip(names, values, strict=True)
-        }
         camera = {
             "pixels": size,
             "pitch_um": pitch_um,
@@ -143,23 +139,10 @@ def write_onnx(
             "azimuth_rad": scale.rig.azimuth_rad,
             "right_eye": scale.rig.right_eye,
         }
-        _describe(part, shapes, {name: repr(value) for name, value in camera.items()})
-
-
-def _describe(
-    path: Path, shapes: dict[str, tuple[int, ...]], about: dict[str, str]
-) -> None:
-    """Write descriptions of input, outputs and camera into an ONNX file."""
-    import onnx
-
-    graph_file = onnx.load(str(path))
-    graph_file.graph.input[0].doc_string = FRAMES
-    for value in graph_file.graph.output:
-        shape: list[str | int | None] = ["batch", *shapes[value.name]]
-        value.CopyFrom(
-            onnx.helper.make_tensor_value_info(
-                value.name, onnx.TensorProto.FLOAT, shape, OUTPUTS[value.name]
-            )
-        )
-    onnx.helper.set_model_props(graph_file, about)
-    path.write_bytes(graph_file.SerializeToString())
+        graph_file = onnx.load(str(part))
+        graph_file.graph.input[0].doc_string = FRAMES
+        for value in graph_file.graph.output:
+            value.doc_string = OUTPUTS[value.name]
+        about = {name: repr(value) for name, value in camera.items()}
+        onnx.helper.set_model_props(graph_file, about)
+        part.write_bytes(graph_file.SerializeToString())

@@ -1,6 +1,7 @@
 """The optics that training moves: a focus and a few dozen orthonormal polynomials of
 phase, and their PSFs.
 """
+# ruff: noqa: RUF009  (records of settings are frozen)
 
 import contextlib
 import functools
@@ -104,7 +105,7 @@ class OpticsConfig:
     sample_um: float = 9.0
     window_samples: int = 33
     tolerance: float = field(default=3e-3, metadata={"above": 0})
-    spread: LensErrors = field(default_factory=LensErrors)
+    spread: LensErrors = LensErrors()
     angle_deg: float = 0.0
     image: Literal["true", "uniform"] = "true"
     fwhm_nm: float = 0.0

@@ -1,12 +1,13 @@
 """A co-design run from its config: joint training, search over architectures under
 budgets, and what is kept of it.
 """
+# ruff: noqa: RUF009  (records of settings are frozen)
 
 import functools
 import math
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -94,13 +95,13 @@ class RunConfig:
     checkpoint_every: int = 50
     validation_batches: int = 8
     test_batches: int = 32
-    scenes: SceneConfig = field(default_factory=SceneConfig)
-    optics: OpticsConfig = field(default_factory=OpticsConfig)
-    sensor: Sensor = field(default_factory=Sensor)
-    space: SearchSpace = field(default_factory=SearchSpace)
-    inner: InnerConfig = field(default_factory=InnerConfig)
-    search: EvolutionSettings = field(default_factory=EvolutionSettings)
-    run: RunBudgets = field(default_factory=RunBudgets)
+    scenes: SceneConfig = SceneConfig()
+    optics: OpticsConfig = OpticsConfig()
+    sensor: Sensor = Sensor()
+    space: SearchSpace = SearchSpace()
+    inner: InnerConfig = InnerConfig()
+    search: EvolutionSettings = EvolutionSettings()
+    run: RunBudgets = RunBudgets()
 
     def __post_init__(self) -> None:
         counts = ("checkpoint_every", "validation_batches", "test_batches")

@@ -1,6 +1,7 @@
 """The inner loop: lens, pixel pitch and network weights move together against one loss
 (paper Eqs. 8 and 10), on a processor or a GPU.
 """
+# ruff: noqa: RUF009  (records of settings are frozen)
 
 import math
 import os
@@ -198,15 +199,9 @@ class InnerConfig:
     batch: int = 32
     seed: int = 0
     subnets: int = 1
-    weights: LearningRateSchedule = field(
-        default_factory=lambda: LearningRateSchedule(4e-3, clip=2.0)
-    )
-    optics: LearningRateSchedule = field(
-        default_factory=lambda: LearningRateSchedule(0.02, 0.1, 0.8, clip=1.0)
-    )
-    pitch: LearningRateSchedule = field(
-        default_factory=lambda: LearningRateSchedule(0.0, 0.1, 0.8, clip=1.0)
-    )
+    weights: LearningRateSchedule = LearningRateSchedule(4e-3, clip=2.0)
+    optics: LearningRateSchedule = LearningRateSchedule(0.02, 0.1, 0.8, clip=1.0)
+    pitch: LearningRateSchedule = LearningRateSchedule(0.0, 0.1, 0.8, clip=1.0)
     slip_weight: float = 2.0
     depth_weight: float = 0.5
     axis_weight: float = 0.5
@@ -219,7 +214,7 @@ class InnerConfig:
     refresh: int = 50
     draws: int = 4
     patience: int = 20
-    separability: SeparabilityConfig = field(default_factory=SeparabilityConfig)
+    separability: SeparabilityConfig = SeparabilityConfig()
 
     def __post_init__(self) -> None:
         counts = ("steps", "batch", "patience", "refresh", "draws")
