@@ -12,6 +12,7 @@ import numpy as np
 from codesign.settings import LEAST, check_ranges
 from metalens.aberrations import OverField, frequencies_per_mm, over_field
 from metalens.core import report
+from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table, figure_png, make_figure
 from metalens.lens import Lens
@@ -96,14 +97,13 @@ def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
     for name, one in field_aberrations.items():
         for k, angle in enumerate(one.angles_deg):
             begin = name if k == 0 else "", f"{angle:g}"
+            percent = 100 * one.distortion[k], 100 * one.vignetting[k]
             numbers = (
-                (one.chief_um[k, 0], 2), (100 * one.distortion[k], 2),
-                *((focus, 1) for focus in one.close_um[k]),
-                (100 * one.vignetting[k], 2), (one.illumination[k], 3),
+                one.chief_um[k, 0], percent[0], *one.close_um[k], percent[1],
+                one.illumination[k],
             )  # fmt: skip
-            rows.append((*begin, *(_format_value(*number) for number in numbers)))
-            mtf = (_format_value(value, 3) for value in one.mtf[k].T.ravel())
-            mtf_rows.append((*begin, *mtf))
+            rows.append((*begin, *_rounded(np.array(numbers))))
+            mtf_rows.append((*begin, *_rounded(one.mtf[k].T.ravel())))
     frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
     columns = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
     return [
@@ -131,11 +131,9 @@ def _caption(field_aberrations: Mapping[str, OverField]) -> str:
     )
 
 
-def _format_value(value: float, digits: int) -> str:
-    if not math.isfinite(value):
-        return "–"
-    text = f"{value:.{digits}f}"
-    return text.removeprefix("-") if float(text) == 0 else text
+def _rounded(values: Array) -> Any:
+    """Numbers of three decimals, None where there is none."""
+    return report.finite_or_none((np.round(values, 3) + 0.0).tolist())
 
 
 def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:

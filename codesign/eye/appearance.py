@@ -41,23 +41,9 @@ CAUSES: Mapping[str, FrameAugmentation] = {
 ARC = np.linspace(0, 1, 5)  # along a lash
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class DrawnAugmentations:
-    """What each of n frames has: ``size`` by cause, 0 where it is off.
-
-    draws: by cause, (n, 12) independent draws in [0, 1) that place it.
-    """
-
-    size: Mapping[str, Array]
-    draws: Mapping[str, Array]
-
-    def __getitem__(self, rows: Array | slice) -> "DrawnAugmentations":
-        """Those of some frames."""
-        size, draws = (
-            {name: values[rows] for name, values in record.items()}
-            for record in (self.size, self.draws)
-        )
-        return DrawnAugmentations(size, draws)
+# of every cause and frame its size, 0 where it is off, and 12 independent draws in [0, 1)
+# that place it: (n, 13)
+DrawnAugmentations = Mapping[str, Array]
 
 
 def drawn_of_people(
@@ -72,15 +58,12 @@ def drawn_of_people(
         variety: factor on the spread of looks; above 1 with augmentations.
         seed: of the random generator.
     """
-    people = draw_augmentations(
-        int(who.max()) + 1, variety, np.random.default_rng((*seed, 0))
+    people, frames = (
+        draw_augmentations(count, variety, np.random.default_rng((*seed, stream)))
+        for stream, count in enumerate((int(who.max()) + 1, len(who)))
     )
-    own = people[who]
-    frame = draw_augmentations(len(who), variety, np.random.default_rng((*seed, 1)))
-    return DrawnAugmentations(
-        {**own.size, "movement": frame.size["movement"]},
-        {**own.draws, "movement": frame.draws["movement"]},
-    )
+    own = {name: values[who] for name, values in people.items()}
+    return own | {"movement": frames["movement"]}
 
 
 def draw_augmentations(
@@ -91,12 +74,12 @@ def draw_augmentations(
     A cause is on with probability share * (variety - 1), limited to [0, 1]; none is on
     up to variety 1. A ``generator`` of one seed draws the same sizes at any variety.
     """
-    size, draws = {}, {}
+    drawn = {}
     for name, cause in CAUSES.items():
         on = generator.random(count) < min(cause.share * max(variety - 1.0, 0.0), 1.0)
-        size[name] = np.where(on, generator.uniform(cause.low, cause.high, count), 0.0)
-        draws[name] = generator.random((count, 12))
-    return DrawnAugmentations(size, draws)
+        size = np.where(on, generator.uniform(cause.low, cause.high, count), 0.0)
+        drawn[name] = np.column_stack([size, generator.random((count, 12))])
+    return drawn
 
 
 def render_dressed(
@@ -127,7 +110,7 @@ def apply_augmentations(
     Args:
         rendered: rendered frames. worn: augmentations of every frame.
     """
-    if not any(size.any() for size in worn.size.values()):
+    if not any(values[:, 0].any() for values in worn.values()):
         return rendered
     light, cover, depth = (
         getattr(rendered.frames, name).clone() for name in Frames.__slots__
@@ -136,8 +119,9 @@ def apply_augmentations(
     for i, place in enumerate(rendered.labels.pupil_px.tolist()):
         canvas = _Canvas(light[i], cover[i], depth[i], pupil[i], place)
         for name, paint in PAINTERS.items():
-            if size := float(worn.size[name][i]):
-                paint(canvas, size, worn.draws[name][i])
+            size, *draws = worn[name][i].tolist()
+            if size:
+                paint(canvas, size, np.array(draws))
     before, after = (mask.sum((1, 2)).double() for mask in (rendered.pupil, pupil))
     share = torch.where(before > 1e-6, after / before.clamp_min(1e-9), 1.0)
     visible = (rendered.labels.visible * share).clamp(max=1.0)

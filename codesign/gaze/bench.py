@@ -54,9 +54,8 @@ class PeopleFrames:
         """
         rows = slice(step * size, (step + 1) * size)
         rig, camera = self.scenes.rig, self.scenes.camera
-        rendered = render_dressed(
-            self.states[rows], self.worn[rows], rig=rig, camera=camera
-        )
+        worn = {name: values[rows] for name, values in self.worn.items()}
+        rendered = render_dressed(self.states[rows], worn, rig=rig, camera=camera)
         return as_batch(rendered, self.margin)
 
 

@@ -61,14 +61,12 @@ class SearchSpace:
     """
 
     stem_channels: int = field(default=16, metadata={"above": 0})
-    stages: tuple[StageSpace, ...] = field(
-        default_factory=lambda: (
-            StageSpace(24, 2, False, "relu"),
-            StageSpace(40, 2, True, "relu"),
-            StageSpace(80, 2, False, "hardswish"),
-            StageSpace(112, 1, True, "hardswish"),
-            StageSpace(160, 1, True, "hardswish"),
-        )
+    stages: tuple[StageSpace, ...] = (
+        StageSpace(24, 2, False, "relu"),
+        StageSpace(40, 2, True, "relu"),
+        StageSpace(80, 2, False, "hardswish"),
+        StageSpace(112, 1, True, "hardswish"),
+        StageSpace(160, 1, True, "hardswish"),
     )
     kernels: tuple[int, ...] = (3, 5, 7)
     expansions: tuple[int, ...] = (3, 4, 6)

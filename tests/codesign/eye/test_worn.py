@@ -48,7 +48,7 @@ def put_on(made, draws=None, **size):
     }
     placed = np.full((1, 12), 0.3) if draws is None else np.array([draws])
     return wear.apply_augmentations(
-        made, wear.DrawnAugmentations(all_of, dict.fromkeys(wear.CAUSES, placed))
+        made, {name: np.column_stack([size, placed]) for name, size in all_of.items()}
     )
 
 
@@ -165,10 +165,11 @@ def test_a_moved_mask_keeps_its_area_and_centre_and_depths_stay():
 
 def test_nothing_is_worn_up_to_variety_1_and_the_share_of_the_record_at_2():
     off = wear.draw_augmentations(2000, 1.0, np.random.default_rng(0))
-    assert not any(size.any() for size in off.size.values())
+    assert not any(values[:, 0].any() for values in off.values())
     on = wear.draw_augmentations(2000, 2.0, np.random.default_rng(0))
     for name, cause in wear.CAUSES.items():
-        size = on.size[name][on.size[name] != 0]
+        size = on[name][:, 0]
+        size = size[size != 0]
         assert len(size) / 2000 == pytest.approx(
             cause.share, abs=4 * math.sqrt(0.25 / 2000)
         )
@@ -177,8 +178,8 @@ def test_nothing_is_worn_up_to_variety_1_and_the_share_of_the_record_at_2():
         assert cause.what
     more = wear.draw_augmentations(2000, 3.0, np.random.default_rng(0))
     assert all(
-        np.array_equal(more.size[name][size != 0], size[size != 0])
-        for name, size in on.size.items()
+        np.array_equal(more[name][values[:, 0] != 0, 0], values[values[:, 0] != 0, 0])
+        for name, values in on.items()
     )
 
 
