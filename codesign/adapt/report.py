@@ -49,7 +49,7 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     judge = (
         "the true lens of the virtual bench"
         if story.known
-        else "lenses of the posterior not seen before"
+        else "other lenses of the posterior"
     )
     lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
     text = (

@@ -195,7 +195,7 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
     Args:
         inner: of the run. config: of the retraining.
     """
-    # a prime apart, so that steps of different retrainings differ
+    # a prime between them, so that steps of different retrainings differ
     seed = inner.seed + 7919 * (config.seed + 1)
     return inner.fine_tuning(config.steps, seed, weights=config.rate)
 

@@ -1,5 +1,5 @@
 """Training and search under ``torchrun``: every process takes its part of each batch,
-and all move alike.
+and all take the same steps.
 """
 
 import contextlib

@@ -155,7 +155,7 @@ class SceneSource(Protocol):
 
     @property
     def margin(self) -> int:
-        """Samples around the frames that are blurred in but not seen."""
+        """Samples around the frames that are blurred in and then cut off."""
 
     def batch(self, step: int, size: int) -> FrameBatch:
         """``size`` frames of training step ``step``."""

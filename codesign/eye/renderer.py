@@ -65,7 +65,7 @@ class FrameLabels:
     optic_axis, visual_axis: (n, 3) unit vectors, pointing out of the eye.
     centre_um, pupil_um: (n, 3) centre of rotation and of the pupil.
     pupil_px: (n, 2) where the refracted centre of the pupil lands (x, y).
-    visible: (n,) seen share of the pupil's area, 0 where it is hidden or out of the
+    visible: (n,) visible share of the pupil's area, 0 where it is hidden or out of the
     frame.
     landmarks_px: (n, len(landmarks.NAMES), 2).
     """

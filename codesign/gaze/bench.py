@@ -43,7 +43,7 @@ class PeopleFrames:
 
     @property
     def margin(self) -> int:
-        """Samples around the frame that are blurred in but not seen."""
+        """Samples around the frame that are blurred in and then cut off."""
         return self.scenes.margin
 
     def batch(self, step: int, size: int) -> FrameBatch:

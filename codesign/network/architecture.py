@@ -238,7 +238,7 @@ def mutate_architecture(
 
 
 def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
-    """The input scales that the search tries, 0.1 apart.
+    """The input scales that the search tries, in steps of 0.1.
 
     Args:
         space: architectures to choose from.

@@ -527,7 +527,7 @@ def _orthonormal_mix(pupil: Pupil, count: int, family: Family) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def _carriers(settings: OpticsConfig, pupil: Pupil) -> tuple[PupilView, Tensor]:
-    """The pupil as seen from where the chief ray meets the sensor, and (depths, nodes,
+    """The pupil from where the chief ray meets the sensor, and (depths, nodes,
     nodes) complex64 wave of every source behind the hyperbolic lens and its stop.
     """
     field = Field(math.radians(settings.angle_deg))

@@ -333,8 +333,8 @@ def gaze_error_deg(
         architecture: member of the search space.
         people: people, their frames and gaze. frames: their frames on the sensor.
     """
-    answers = predict_frames(trainer.model.net, architecture, frames, trainer.inner)
-    read = bench.read_of(people, answers.centre, answers.slip_mm)
+    predictions = predict_frames(trainer.model.net, architecture, frames, trainer.inner)
+    read = bench.read_of(people, predictions.centre, predictions.slip_mm)
     return bench.calibrated_error_deg(people, read)
 
 

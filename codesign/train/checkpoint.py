@@ -1,4 +1,4 @@
-"""Training state on disk, bit for bit, and the JSON log beside it."""
+"""Training state on disk, bit for bit, and its JSON log."""
 
 import contextlib
 import json

@@ -277,10 +277,14 @@ def largest_and_smallest(
         space: architectures to choose from.
         count: multiply-accumulates of an architecture. budget: of them.
     """
-    small = fit_resolution(space, smallest_architecture(space), count, budget)
+    largest, smallest = largest_architecture(space), smallest_architecture(space)
+    shallow = dataclasses.replace(largest, depths=smallest.depths)
+    small = fit_resolution(space, smallest, count, budget)
+    # equal in all stages: by width, then depth, then kernel and expansion
     fitted = (
-        fit_resolution(space, candidate, count, budget)
-        for candidate in uniform_architectures(space)
+        fit_resolution(space, dataclasses.replace(base, width=width), count, budget)
+        for width in sorted(space.widths, reverse=True)
+        for base in (largest, shallow, smallest)
     )
     large = next((a for a in fitted if count(a) <= budget), small)
     return large, small
@@ -306,23 +310,6 @@ def fit_resolution(
         fits = count(dataclasses.replace(architecture, resolution=middle)) <= budget
         low, high = (middle, high) if fits else (low, middle)
     return dataclasses.replace(architecture, resolution=low)
-
-
-def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
-    """Architectures equal in all stages, from large to small: width, then depth, then
-    kernel and expansion.
-
-    Args:
-        space: architectures to choose from.
-    """
-    largest = largest_architecture(space)
-    smallest = smallest_architecture(space)
-    shallow = dataclasses.replace(largest, depths=smallest.depths)
-    for width in sorted(space.widths, reverse=True):
-        yield from (
-            dataclasses.replace(base, width=width)
-            for base in (largest, shallow, smallest)
-        )
 
 
 def state_to_json(search: EvolutionState) -> dict[str, Any]:

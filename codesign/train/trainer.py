@@ -171,7 +171,7 @@ def align_moments(optimiser: torch.optim.Optimizer) -> None:
 class InnerConfig:
     """Settings of the inner loop.
 
-    steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest
+    steps, batch, seed: of the run. subnets: sampled with the largest and the smallest
     (sandwich rule); with
         ``architecture`` fixed, that one alone is trained.
     weights, optics, pitch: schedules of the three groups. The pitch never gets finer

@@ -111,7 +111,7 @@ def test_scene_energies_tell_lenses_apart():
 def test_bootstrap_interval_covers_the_true_ratio():
     rng = np.random.default_rng(0)
     covered = 0
-    for k in range(100):
+    for _ in range(100):
         shared = rng.gamma(4.0, 1.0, 40)
         a, b = (
             torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40))
