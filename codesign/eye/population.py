@@ -233,10 +233,12 @@ def model_parameters(
     pupil_plane = cornea_centre + cornea - t["pupil_behind_um"] * size
     face = _face(rig, states)
     axis, across, down = _rotated_axes(face, rig, states)
-    centre = (
-        _turn(_nominal_centre(rig, t["depth_um"], pupil_plane), states.mount_rad)
-        + states.slip_um
-    )
+
+    def centre_of(some: EyeStates) -> Tensor:
+        nominal = _nominal_centre(rig, t["depth_um"], pupil_plane)
+        return _turn(nominal, some.mount_rad) + some.slip_um
+
+    centre = centre_of(states)
     lamps = torch.tensor(rig.lamps_um, dtype=torch.float64)
     lamps = lamps * torch.tensor([rig.temple, 1.0, 1.0], dtype=torch.float64)
     lid_shift = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
@@ -246,8 +248,9 @@ def model_parameters(
         - (1 - states.aperture) * lower
     )
     half_width = t["fissure_half_um"] * size
-    exposed_states = states if exposed is None else exposed
-    depth = _exposure_depth(rig, t["depth_um"], pupil_plane, exposed_states)
+    # of the eye's front, for exposure and the softness of edges
+    front = centre_of(states if exposed is None else exposed)[:, 2] - 0.7 * pupil_plane
+    depth = front.detach().clamp_min(1000.0)
     brightness = (depth.clamp_min(3000.0) / 20e3) ** 2
     return t | {
         "centre": centre,
@@ -355,19 +358,6 @@ def _nominal_centre(rig: CameraRig, depth_um: Tensor, behind_um: Tensor) -> Tens
     return (
         rig.pupil_um + depth_um[:, None] * along - behind_um[:, None] * rig.face_axes[2]
     )
-
-
-def _exposure_depth(
-    rig: CameraRig, depth_um: Tensor, behind_um: Tensor, states: EyeStates
-) -> Tensor:
-    """(n,) depth in um of the eye's front for exposure and edge width, without
-    gradient.
-    """
-    centre = (
-        _turn(_nominal_centre(rig, depth_um, behind_um), states.mount_rad)
-        + states.slip_um
-    )
-    return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)
 
 
 def _rotated_axes(
