@@ -430,7 +430,7 @@ def smooth_planes(planes: Tensor, nodes: torch.Size, error: float) -> Tensor:
     return planes
 
 
-def moments(psf: Tensor) -> Tensor:
+def psf_moments(psf: Tensor) -> Tensor:
     """(n, [sum, x, y]) sum and first moments of PSFs, lengths in half windows.
 
     Args:
@@ -453,8 +453,8 @@ def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
         kernels: (rank, h, w) low-rank kernels.
         psf: (n, h, w) PSFs whose moments are matched.
     """
-    kernel_moments = moments(kernels.double())
-    missing = moments(psf.double()) - weights.double() @ kernel_moments
+    kernel_moments = psf_moments(kernels.double())
+    missing = psf_moments(psf.double()) - weights.double() @ kernel_moments
     change: Tensor = missing @ torch.linalg.pinv(kernel_moments)
     return weights.double() + change
 

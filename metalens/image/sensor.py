@@ -103,7 +103,7 @@ def mean_electrons(
     return (sensor.exposure_e * light + sensor.ambient_e * scale).clamp_min(0)
 
 
-def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def draw_photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Poisson counts k of mean m, with the surrogate gradient dk/dm = (1 + k / m) / 2.
 
     The expected gradient of k is 1 and that of k² is 2m + 1, as of the true
@@ -138,7 +138,7 @@ def expose(
         sensor: pixels, gain and noise of the sensor.
         generator: of the random draws; the global one without it.
     """
-    collected = photons(mean, generator).clamp(max=sensor.well_e)
+    collected = draw_photons(mean, generator).clamp(max=sensor.well_e)
     noise = normal(tuple(mean.shape), mean, generator)
     return (
         collected

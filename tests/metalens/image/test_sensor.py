@@ -74,7 +74,7 @@ def test_shift_moves_the_pixel_grid_towards_plus_x():
 def test_photon_gradient_has_the_moments_of_poisson(mean):
     n = 400_000
     m = torch.full((n,), mean, dtype=torch.float64, requires_grad=True)
-    k = sensors.photons(m, torch.Generator().manual_seed(1))
+    k = sensors.draw_photons(m, torch.Generator().manual_seed(1))
     assert float(k.detach().mean()) == pytest.approx(mean, abs=5 * math.sqrt(mean / n))
     assert float(k.detach().var()) == pytest.approx(mean, rel=0.02)
     (first,) = torch.autograd.grad(k.sum(), m, retain_graph=True)
