@@ -229,8 +229,8 @@ def _frame_groups(
     sources = chief - offset_um / films.apparent_um(depth_um)[:, None]
     groups: dict[_Incidence, list[int]] = {}
     for i, (ray, source) in enumerate(zip(chief, sources, strict=True)):
-        crossings = [films.chief_um(distance, (x, y)) for x, y in (ray, source)]
-        shift = decentre_um + np.subtract(*crossings)
+        crossing = [films.chief_um(distance, (x, y)) for x, y in (ray, source)]
+        shift = decentre_um + np.array(crossing[0]) - np.array(crossing[1])
         incidence = _Incidence(
             (float(source[0]), float(source[1])),
             (float(shift[0]), float(shift[1])),

@@ -48,8 +48,8 @@ def frames_page(
     ):
         if values:
             head = ("angle along x / deg", "angle along y / deg", column)
-            rows = [(x, y, value) for (x, y), value in values.items()]
-            sections.append(report.Section(title, "", [report.Table(head, rows)]))
+            by_field = [(x, y, value) for (x, y), value in values.items()]
+            sections.append(report.Section(title, "", [report.Table(head, by_field)]))
     sections.append(
         report.Section("Put right or assumed on the way", "\n\n".join(quality.notes))
     )

@@ -301,8 +301,8 @@ def _sharpest_depths(rows: list[FrameMetrics], notes: list[str]) -> dict[Field, 
         places, frame = np.unique(1 / z if are_distances else z, return_inverse=True)
         if len(places) < 3 or not np.isfinite(z).all():
             continue
-        sharpness = np.bincount(frame, [row.ee80_um**-2 for row in of_field])
-        sharpness = sharpness / np.bincount(frame)
+        total = np.bincount(frame, [row.ee80_um**-2 for row in of_field])
+        sharpness = total / np.bincount(frame)
         best = int(sharpness.argmax())
         k = min(max(best, 1), len(places) - 2)
         near = slice(k - 1, k + 2)
