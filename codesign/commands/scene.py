@@ -102,7 +102,9 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     if options.image or options.depth_mm or options.width_mm:
-        return picture.run(options, options.lens or options.config, options.output)
+        lens_files = [file for file in (options.config, options.lens) if file]
+        one = lens_files[0] if len(lens_files) == 1 else None
+        return picture.run(options, one, options.output)
     settings = (
         config.load(options.config, SceneSettings)
         if options.config

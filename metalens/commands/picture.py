@@ -47,7 +47,7 @@ def run(options: PictureOptions, lens_file: Path | None, target: Path) -> int:
 
     Args:
         options: of the command line.
-        lens_file: of the lens.
+        lens_file: of the lens; None where it is not one.
         target: folder to write.
 
     Returns:
