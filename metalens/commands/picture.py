@@ -62,9 +62,9 @@ def run(options: PictureOptions, lens_file: Path | None, target: Path) -> int:
     from metalens.image import Grid, imager
 
     depth_um, width_um = 1e3 * options.depth_mm, 1e3 * options.width_mm
-    sizes = depth_um > 0 <= width_um and options.fwhm_nm >= 0
-    sizes &= not (width_um and math.isinf(depth_um))
-    if options.image is None or lens_file is None or not sizes:
+    in_range = depth_um > 0 <= width_um and options.fwhm_nm >= 0
+    in_range &= not (width_um and math.isinf(depth_um))
+    if options.image is None or lens_file is None or not in_range:
         raise ConfigError(
             "a picture needs --image, one lens (lens.h5), --depth-mm above 0, and "
             "--width-mm (none at infinity) and --fwhm-nm of 0 or more"
