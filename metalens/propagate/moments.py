@@ -265,52 +265,6 @@ def _to_powers(order: int) -> Array:
     return np.array(columns).T
 
 
-@dataclass(frozen=True, slots=True)
-class ReferencePhase:
-    """The carrier in turns along the rows of a block, c(u) = Σ_n coefficients[n] uⁿ for
-    u in [-1, 1].
-
-    reference: inverse depth, 1/um. rows: blocks of rows. chunk: columns in a chunk.
-    """
-
-    case: PropagationCase
-    reference: float
-    rows: AxisBlocks
-    chunk: int
-
-    @property
-    def rounding_rad(self) -> float:
-        """Standard deviation of the phase by rounding of its polynomials, rad: a tenth
-        of the largest error.
-        """
-        y, x = (half * np.array([-1.0, 0.0, 1.0]) for half in self.case.half_size_um)
-        longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
-        return float(2 * np.pi * ROUNDED / 10 * longest)
-
-    def row_polynomials(self, block: int, order: int) -> Array:
-        """(chunk, order, column) coefficients of a block row, in turns, without whole
-        turns.
-
-        The columns are cut in chunks of equal size; the last is padded with zeros.
-        """
-        columns = self.case.shape[1]
-        chunks = -(-columns // self.chunk)
-        step_um = self.case.steps_um[0]
-        half_um = (self.rows.length - 1) / 2 * step_um
-        middle_um = self.rows.middles_um(step_um)[block]
-        coefficients = _powers(
-            self.case,
-            self.reference,
-            (middle_um, half_um),
-            self.case.pillars_um[1],
-            order,
-        )
-        coefficients[0] -= np.rint(coefficients[0])
-        row = np.zeros((order, chunks * self.chunk))
-        row[:, :columns] = coefficients
-        return row.reshape(order, chunks, self.chunk).swapaxes(0, 1)
-
-
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
 # factors on the light of several maps: light on the window is
 # Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
@@ -321,15 +275,17 @@ Pupils = Callable[[Array, Array], tuple[Array, Array]]
 class PillarMoments:
     """Plan of the reduction of a lens to moments.
 
-    blocks: of rows and columns. carrier: the phase that is removed. polynomials: its
-    coefficients by block row, kept where they take little memory. dtype: of the maps.
-    rows, columns: (y node, m) and (x node, n) weights of the nodes in the moments, in
-    the dtype of the sums.
+    blocks: of rows and columns. polynomials: coefficients (chunk, order, column) of the
+    carrier over a block row, in turns without whole turns: Σ_n coefficients[n] uⁿ for u
+    in [-1, 1]. The columns are cut in chunks of equal size, the last padded with zeros.
+    rounding_rad: standard deviation of the phase by rounding of these polynomials.
+    dtype: of the maps. rows, columns: (y node, m) and (x node, n) weights of the nodes
+    in the moments, in the dtype of the sums.
     """
 
     blocks: tuple[AxisBlocks, AxisBlocks]
-    carrier: ReferencePhase
     polynomials: Callable[[int], Array]
+    rounding_rad: float
     dtype: torch.dtype
     rows: torch.Tensor
     columns: torch.Tensor
@@ -365,21 +321,32 @@ def plan_moments(
     rows, columns = blocks
     width = columns.length
     chunk = width * max(1, min(CHUNK // width, -(-case.shape[1] // width)))
-    carrier = ReferencePhase(case, reference, rows, chunk)
-    nodes_um = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
+    chunks = -(-case.shape[1] // chunk)
+    row_um, column_um = case.steps_um
+    half_um = (rows.length - 1) / 2 * row_um
+    middles_um = rows.middles_um(row_um)
+    order = ORDER[itemsize]
+
+    def polynomials(block: int) -> Array:
+        along_rows = middles_um[block], half_um
+        coefficients = _powers(case, reference, along_rows, case.pillars_um[1], order)
+        coefficients[0] -= np.rint(coefficients[0])
+        row = np.zeros((order, chunks * chunk), f"f{itemsize}")
+        row[:, : case.shape[1]] = coefficients
+        return np.ascontiguousarray(row.reshape(order, chunks, chunk).swapaxes(0, 1))
+
+    if rows.count * order * case.shape[1] * itemsize < 1 << 26:  # lenses of some 5 mm
+        polynomials = functools.cache(polynomials)
+    y, x = (half * np.array([-1.0, 0.0, 1.0]) for half in case.half_size_um)
+    longest = np.abs(carrier_turns(case, reference, x, y[:, None])).max()
+    # a tenth of the largest error
+    rounding_rad = float(2 * np.pi * ROUNDED / 10 * longest)
+    nodes_um = rows.nodes_um(row_um), columns.nodes_um(column_um)
     values = [
         torch.tensor(np.ascontiguousarray(weight(at_um)), dtype=sums)
         for weight, at_um in zip(weights, nodes_um, strict=True)
     ]
-
-    def polynomials(block: int) -> Array:
-        row = carrier.row_polynomials(block, ORDER[itemsize])
-        return np.ascontiguousarray(row, f"f{itemsize}")
-
-    bytes_kept = rows.count * ORDER[itemsize] * case.shape[1] * itemsize
-    if bytes_kept < 1 << 26:  # lenses of some 5 mm
-        polynomials = functools.cache(polynomials)
-    return PillarMoments(blocks, carrier, polynomials, dtype, *values)
+    return PillarMoments(blocks, polynomials, rounding_rad, dtype, *values)
 
 
 def reduce_to_moments(

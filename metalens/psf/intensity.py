@@ -436,7 +436,7 @@ def _windowed(
         _check(maps, case, sum(powers), nodes)
         at_um = plan.check_nodes_um
         mixing_at_nodes = None if pupils is None else pupils(*at_um)
-        rounding = plan.moments.carrier.rounding_rad
+        rounding = plan.moments.rounding_rad
         noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
         noise *= _incoherent(_noisy_power(powers, mixing_at_nodes), case)
         checked.append(NodeLight(case, weight, nodes, at_um, noise, mixing_at_nodes))
