@@ -32,10 +32,10 @@ def from_source(
     """Optical path from a source to (x, y), less its path to the lens centre, um; numpy
     or torch operands.
 
-    ``tangents`` are those in air.
-
     Args:
         case: geometry of the propagation.
+        x, y: places on the lens, um.
+        tangents: (x, y) of the field angle, in air.
         inverse: 1 / depth of the source, 1/um.
     """
     return media.source_path(case.front, x, y, tangents, inverse)
@@ -45,11 +45,12 @@ def to_sensor(
     case: PropagationCase, x: Any, y: Any, centre: tuple[float, float] | None = None
 ) -> Any:
     """Optical path from (x, y) on the lens to a point of the sensor, by default the
-    middle of the window, less that
-    from the lens centre, um.
+    middle of the window, less that from the lens centre, um.
 
     Args:
         case: geometry of the propagation.
+        x, y: places on the lens, um.
+        centre: (x, y) of the point, um.
     """
     cx, cy = case.centre_um if centre is None else centre
     if case.behind is None:
@@ -82,6 +83,7 @@ def ray_to_offset(
 
     Args:
         case: geometry of the propagation.
+        x, y: places on the lens, um. X, Y: offsets from the window's centre, um.
     """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
     change = X * X + Y * Y + 2 * (X * dx + Y * dy)
