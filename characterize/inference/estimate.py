@@ -177,7 +177,8 @@ def _refuse(
 def _with_likely_causes(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
 ) -> tuple[SearchTask, list[FitSolution], ResidualAnalysis]:
-    """The task with the parameters of likely causes (:func:`unmodelled_effects.to_fit`) freed.
+    """The task with the parameters of likely causes freed
+    (:func:`unmodelled_effects.effects_to_fit`).
 
     At most four, one after the other, each the largest fall of the misfit; none without
     a known gain.
@@ -218,7 +219,7 @@ def _misfit_falls(
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
-    for cause in unmodelled_effects.to_fit(score_tests, stuck=stuck):
+    for cause in unmodelled_effects.effects_to_fit(score_tests, stuck=stuck):
         fall = best.merit - multistart.merit_with(task, best, cause.effect.frees)
         if fall > (10.0 if stuck else cause.chi2 / 2):
             falls.append((fall, cause))

@@ -291,18 +291,17 @@ def expected_shifts(task: SearchTask) -> UnmodelledShifts:
     return run_score_tests(task, mode)[1]
 
 
-def to_fit(
-    score_tests: list[ScoreTest], *, stuck: bool = False, most: int = 5
+def effects_to_fit(
+    score_tests: list[ScoreTest], *, stuck: bool = False
 ) -> list[ScoreTest]:
     """Causes to fit next: those that have parameters and may explain the frames.
 
     Those that the residuals lean to beyond chance; else those whose odds exceed
-    ``ODDS``, likeliest first. At most ``most``.
+    ``ODDS``, likeliest first. At most five.
 
     Args:
         score_tests: score tests.
         stuck: a parameter ran to its bound: any unstated cause may be behind it.
-        most: causes that are fitted in turn to see which explains most.
     """
     free = [test for test in score_tests if test.effect.frees]
     clear = [test for test in free if test.chance < CHANCE]
@@ -311,7 +310,7 @@ def to_fit(
     )
     if stuck:
         clear = [test for test in free if not test.effect.stated]
-    return (clear or likely)[:most]
+    return (clear or likely)[:5]
 
 
 def score_test_text(score_tests: list[ScoreTest]) -> list[ResidualFinding]:

@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 
 import metalens
 from characterize.model import solving
-from metalens.cell import Cell, index
+from metalens.cell import index
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
@@ -126,7 +126,9 @@ def _solve_round(lens: Lens, extra: tuple[str, ...]) -> Sensitivity:
     Raises:
         CellError, MaterialError: pillars that no solver takes.
     """
-    table = solving.solved_transmission(lens) if _upright(lens.cell) else None
+    cell = lens.cell
+    upright = not (cell.under or cell.over or cell.sidewall_rad)
+    table = solving.solved_transmission(lens) if upright else None
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())
     low, high = (low, high) if high > low else (low - 1e-3, high + 1e-3)
@@ -146,10 +148,6 @@ def _solve_round(lens: Lens, extra: tuple[str, ...]) -> Sensitivity:
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
     error += rates.error
     return Sensitivity(np.array(padded) * scale, center, error, low, high, table)
-
-
-def _upright(cell: Cell) -> bool:
-    return cell.round and not (cell.under or cell.over or cell.sidewall_rad)
 
 
 def _degree(unit: Array, rows: Array) -> tuple[int, float]:
