@@ -50,6 +50,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "metalens.commands.psf",
         "lens.h5 or asbuilt.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
+    "lens-report": (
+        "codesign.commands.options.lens_report",
+        "lens.h5 -> a page over field and wavelength: MTF, distortion, efficiency by cause",
+    ),
     "export": (
         "metalens.commands.export",
         "lens.h5 -> NPZ, MATLAB or Zemax grid phase for other programs",

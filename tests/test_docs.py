@@ -220,7 +220,7 @@ def test_links_and_commands_of_a_page_exist(page):
             ), target
         else:
             assert (page.parent / target).exists(), target
-    for verb in re.findall(r"^ *metalens ([a-z]+)", text, re.M):
+    for verb in re.findall(r"^ *metalens ([a-z-]+)", text, re.M):
         assert verb in VERBS, verb
 
 

@@ -21,6 +21,7 @@ from characterize.captures.tiff import ImageFile, read_tiff
 from metalens.core import reading, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, MetalensError
+from metalens.core.notebook import RecordView, own_axes
 
 TIFF = (".tif", ".tiff", ".tf8", ".btf")
 PNG = (".png",)
@@ -29,8 +30,8 @@ LOSSY = (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = ColourChannels()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Capture:
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Capture(RecordView):
     """Frames of a bench run in right-aligned counts, with their stage, camera and
     description.
 
@@ -62,6 +63,36 @@ class Capture:
     about: dict[str, Any] = field(default_factory=dict)
     corrections: tuple[str, ...] = ()
     fill: float = 1.0
+
+    def plot(self, ax: Any = None, *, frame: int = 0) -> Any:
+        """Draw one frame in counts; returns the axes.
+
+        Args:
+            ax: matplotlib axes; those of a new figure where none are given.
+            frame: its number.
+        """
+        axes = own_axes(ax)
+        axes.imshow(self.frames[frame], cmap="gray")
+        axes.set(title=self.names[frame], xlabel="x / pixel", ylabel="y / pixel")
+        return axes
+
+    def to_xarray(self) -> Any:
+        """xarray.Dataset of the counts over (frame, y, x), with the stage of every
+        frame.
+        """
+        import xarray
+
+        stage = {
+            "position_um": self.position_um,
+            "angle_x_rad": self.angle_rad[:, 0],
+            "angle_y_rad": self.angle_rad[:, 1],
+            "exposure_s": self.exposure_s,
+        }
+        return xarray.Dataset(
+            {"frames": (("frame", "y", "x"), self.frames)},
+            {name: (("frame",), values) for name, values in stage.items()},
+            {"pixel_um": self.pixel_um, "bits": self.bits},
+        )
 
     def __post_init__(self) -> None:
         n = len(self.frames)

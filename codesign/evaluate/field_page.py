@@ -169,7 +169,8 @@ def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:
                 color=f"C{number}",
                 label=name,
             )
-    panels[0].legend(fontsize=7)
+    if len(field_aberrations) > 1:
+        panels[0].legend(fontsize=7)
     for panel, title in zip(panels, titles, strict=True):
         panel.set(title=title, xlabel="field angle / °")
     return figure_png(figure)

@@ -1,5 +1,5 @@
 """lens.h5 for other programs: arrays with axes (.npz, .mat), or the smooth phase of ray
-tracers (Zemax .dat).
+tracers (Zemax .dat, Binary 2).
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Options(CommonOptions):
         output: file to write; its ending says the format: .npz, .mat (x, y, diameter,
             phase, transmission of every
             pillar) or .dat (Zemax OpticStudio grid phase, unwrapped, in mm; other ray
-            tracers read it too).
+            tracers read it too), or .json (Binary 2: even polynomial of the radius).
         samples: points across the aperture of a .dat.
     """
 
@@ -37,11 +37,10 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    export.check_export_format(options.output)
-    is_array = options.output.suffix.lower() in export.ARRAYS
-    if options.samples != Options.samples and is_array:
+    is_grid = options.output.suffix.lower() == export.GRID
+    if options.samples != Options.samples and not is_grid:
         raise LensError(
-            "--samples counts the points of a .dat; arrays hold every pillar"
+            "--samples counts the points of a .dat; other files hold every pillar"
         )
     with options.claim(options.output) as draft:
         device = lens.load(options.lens)

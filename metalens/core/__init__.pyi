@@ -4,6 +4,7 @@ from . import errors as errors
 from . import executor as executor
 from . import foreign_arrays as foreign_arrays
 from . import legendre as legendre
+from . import notebook as notebook
 from . import reading as reading
 from . import report as report
 from . import store as store

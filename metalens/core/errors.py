@@ -111,6 +111,7 @@ EXTRAS = {
     "torch": "optics",
     "colour": "optics",
     "astropy": "fits",
+    "xarray": "xarray",
     "cv2": "bench",
     "tifffile": "bench",
     "safetensors": "codesign",

@@ -1,21 +1,24 @@
 """A lens for other programs: arrays with axes (NPZ, MATLAB), and a smooth phase for ray
-tracers (Zemax grid phase).
+tracers (Zemax grid phase, Binary 2).
 """
 
 import io
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.core.store import write_bytes
+from metalens.core.store import write_bytes, write_text
 from metalens.lens.record import Lens
 
-ARRAYS, GRID = (".npz", ".mat"), ".dat"
-SUFFIXES = (*ARRAYS, GRID)
+ARRAYS, GRID, RADIAL = (".npz", ".mat"), ".dat", ".json"
+SUFFIXES = (*ARRAYS, GRID, RADIAL)
+TERMS = 8  # of a Binary 2 surface: r² to r¹⁶
 # grid-phase file: mm per um (unit flag 0), and the flag of a point without data
 _MM, _NO_DATA = 1e-3, 1
 # points beyond the rim to which a phase is extended: a cubic spline then reads the rim
@@ -44,6 +47,7 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     pitch_um, wavelength_um; where pillars are turned angle_rad; where they have two
     sizes length_um, phase and transmission for light along x. ``.dat``: Zemax grid
     phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
+    ``.json``: :func:`radial_phase`.
 
     Args:
         path: target; its ending selects the format.
@@ -64,6 +68,10 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
         grid = grid_phase(lens, samples)
         write_bytes(path, grid.text().encode("ascii"))
         return grid.error_rad
+    if suffix == RADIAL:
+        surface = radial_phase(lens)
+        write_text(path, json.dumps(surface, indent=1) + "\n")
+        return float(surface["residual_rad"])
     values = lens_arrays(lens)
     file = io.BytesIO()
     head = b""
@@ -98,6 +106,43 @@ def lens_arrays(lens: Lens) -> dict[str, Array]:
         name: np.asarray(values)
         for name, values in (("angle_rad", d.angle_rad), ("length_um", d.length_um))
         if values is not None
+    }
+
+
+def radial_phase(lens: Lens) -> dict[str, Any]:
+    """Binary 2 surface of OpticStudio: phase Σ A_i ρ^(2i), ρ = r / norm radius.
+
+    Least squares over all pillars; a constant is left out.
+
+    Args:
+        lens: the lens, of one phase at any azimuth.
+
+    Returns:
+        wavelength, norm radius, coefficients A_1 to A_8 in rad (diffraction order 1),
+            and ``residual_rad``, the largest difference of a pillar from the sum.
+
+    Raises:
+        LensError: pillars differ by more than a quarter wave from any such sum; see
+            :func:`unwrap_phase`.
+    """
+    phase = unwrap_phase(lens)
+    d = lens.diameters
+    square = ((d.x_um**2 + d.y_um[:, None] ** 2) / d.radius_um**2)[np.isfinite(phase)]
+    phase = phase[np.isfinite(phase)]
+    fit = np.polynomial.Chebyshev.fit(square, phase, TERMS, domain=[0, 1])
+    residual = float(np.abs(fit(square) - phase).max())
+    if residual > math.pi / 2:
+        raise LensError(
+            f"pillars differ by {residual:.3g} rad from any radial polynomial of {TERMS} "
+            "terms, need a quarter wave: write a grid phase (.dat)"
+        )
+    coefficients = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef
+    return {
+        "surface": "Binary 2",
+        "wavelength_um": lens.wavelength_um,
+        "norm_radius_mm": d.radius_um * _MM,
+        "coefficients_rad": coefficients[1:].tolist(),
+        "residual_rad": residual,
     }
 
 

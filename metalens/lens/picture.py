@@ -1,27 +1,39 @@
 """A picture of a lens: the phase across its aperture."""
 
+from typing import Any
+
 import numpy as np
 
 from metalens.core import report
 from metalens.core.arrays import Array
-from metalens.lens.record import Lens
 
 
-def lens_picture(lens: Lens) -> bytes:
-    """PNG of the wrapped phase at the design wavelength, and of the aperture stop.
+def lens_picture(lens: Any) -> bytes:
+    """PNG of :func:`draw_phase`.
+
+    Args:
+        lens: the lens.
+    """
+    figure, axes = report.make_figure(1, 1, size=(5.2, 4.4))
+    draw_phase(lens, axes)
+    return report.figure_png(figure)
+
+
+def draw_phase(lens: Any, axes: Any) -> None:
+    """Draw the wrapped phase at the design wavelength, and the aperture stop.
 
     A pixel has the phase of the mean of exp(iφ) over its sites and fades where the
     phase turns within it, so that undersampling draws no false zones.
 
     Args:
         lens: the lens.
+        axes: matplotlib axes.
     """
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Circle
 
-    figure, axes = report.make_figure(1, 1, size=(5.2, 4.4))
     d = lens.diameters
     # a hexagonal lattice leaves every other site of the map empty
     least = 2 if d.lattice.centred else 1
@@ -41,7 +53,7 @@ def lens_picture(lens: Lens) -> bytes:
             loc="upper right",
         )
     scale = ScalarMappable(Normalize(0, 2 * np.pi), "twilight")
-    figure.colorbar(
+    axes.figure.colorbar(
         scale,
         ax=axes,
         label="phase / rad, faded where it turns in a pixel",
@@ -53,10 +65,9 @@ def lens_picture(lens: Lens) -> bytes:
         ylabel="y / µm",
     )
     axes.grid(visible=False)
-    return report.figure_png(figure)
 
 
-def mean_field(lens: Lens, sites: int) -> Array:
+def mean_field(lens: Any, sites: int) -> Array:
     """(y, x) complex mean of exp(iφ) over blocks of ``sites`` by ``sites``; sites
     without a pillar count as 0.
 

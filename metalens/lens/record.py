@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import h5py
 import numpy as np
@@ -16,6 +16,7 @@ from metalens.cell import Cell, Lattice
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError, LensError
+from metalens.core.notebook import RecordView, own_axes
 from metalens.core.store import Provenance, typed_reader
 from metalens.lens.neighbours import NeighbourRows
 from metalens.library import Proxy
@@ -298,8 +299,8 @@ def _place(axis: Array, size_um: Array) -> Array:
     return np.asarray(index.astype(int))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Lens:
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Lens(RecordView):
     """A designed (or as-built) metalens.
 
     diameters: of every pillar.
@@ -404,6 +405,18 @@ class Lens:
             sensor_distance_um=sensor,
             source_distance_um=source,
         )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the wrapped phase across the aperture; returns the axes.
+
+        Args:
+            ax: matplotlib axes; those of a new figure where none are given.
+        """
+        from metalens.lens.picture import draw_phase
+
+        axes = own_axes(ax)
+        draw_phase(self, axes)
+        return axes
 
     def phase_rad(
         self,

@@ -7,7 +7,7 @@ import itertools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.core.notebook import RecordView, own_axes
 from metalens.core.store import Provenance, typed_reader
 from metalens.library.geometric_phase import GeometricPhase, check_geometric_phase
 from metalens.library.proxy import MOST_ERROR, Proxy
@@ -168,8 +169,8 @@ class Sweep:
         return low, high
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class PillarLibrary:
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class PillarLibrary(RecordView):
     """Response of one pillar cell; see :class:`metalens.cell.response.Response` for the
     normalisation.
 
@@ -222,6 +223,35 @@ class PillarLibrary:
                 )
             if not np.isfinite(getattr(self, name)).all():
                 raise DomainError(f"library {name} holds values that are not finite")
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw |t|² and the phase in turns over the size; returns the axes.
+
+        Args:
+            ax: matplotlib axes; those of a new figure where none are given.
+        """
+        axes = own_axes(ax)
+        t = self.t[0, 0, 0]
+        phase = np.unwrap(np.angle(t)) / (2 * np.pi)
+        axes.plot(self.diameter_um, phase - phase.min(), label="phase / turns")
+        axes.plot(self.diameter_um, np.abs(t) ** 2, label="|t|²")
+        axes.set(xlabel="size / µm")
+        axes.legend()
+        return axes
+
+    def to_xarray(self) -> Any:
+        """xarray.Dataset of t, r, t_error and energy over (polarization, angle_rad,
+        wavelength_um, diameter_um).
+        """
+        import xarray
+
+        names = ("polarization", "angle_rad", "wavelength_um", "diameter_um")
+        values = ("t", "r", "t_error", "energy")
+        return xarray.Dataset(
+            {name: (names, getattr(self, name)) for name in values},
+            {name: np.array(getattr(self, name)) for name in names},
+            {"pitch_um": self.cell.pitch_um, "height_um": self.cell.height_um},
+        )
 
     @property
     def converged(self) -> bool:

@@ -11,6 +11,7 @@ from .directions import FarField as FarField
 from .directions import far_field as far_field
 from .extended import SourceExtent as SourceExtent
 from .focus import focus_metrics as focus_metrics
+from .focus import incident_um2 as incident_um2
 from .lens_psfs import View as View
 from .lens_psfs import all_maps as all_maps
 from .lens_psfs import from_lens as from_lens

@@ -1,7 +1,6 @@
 """PSFs as a sensor sees them: pixels of any pitch, and binned pixels."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -106,19 +105,6 @@ def integrate_pixels(
         pitch.
     """
     counts = (None, None) if shape is None else shape
-    axes = list(zip(image.shape[-2:], counts, shift_um, strict=True))
-    if not (
-        isinstance(pitch_um, Tensor)
-        and pitch_um.requires_grad
-        and torch.is_grad_enabled()
-    ):
-        width = float(pitch_um.detach()) if isinstance(pitch_um, Tensor) else pitch_um
-        spacing = width if grid_um is None else grid_um
-        lengths = [width / sample_um, spacing / sample_um]
-        if all(
-            _samples(n, count, shift / sample_um, lengths) for n, count, shift in axes
-        ):
-            return image
     rows, columns = (
         pixel_weights(
             n,
@@ -128,25 +114,9 @@ def integrate_pixels(
             shift_um=shift,
             grid_um=grid_um,
         )
-        for n, count, shift in axes
+        for n, count, shift in zip(image.shape[-2:], counts, shift_um, strict=True)
     )
     return rows.to(image) @ image @ columns.to(image).mT
-
-
-def _samples(
-    samples: int, count: int | None, shift: float, lengths: Sequence[float]
-) -> bool:
-    """Whether every pixel is one sample, to the rounding of its edges in float64.
-
-    Args:
-        samples: of the image.
-        count: of pixels; None for as many as cover the image.
-        shift: of the pixel grid, in samples.
-        lengths: width and spacing of the pixels, in samples.
-    """
-    if (pixel_count(samples, 1.0, lengths[1]) if count is None else count) != samples:
-        return False
-    return max(abs(length - 1) for length in lengths) * samples / 2 + abs(shift) < 5e-12
 
 
 def _smooth_step(t: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import numpy as np
 
 from metalens.core import store
 from metalens.core.arrays import Array
+from metalens.core.notebook import RecordView, own_axes
 from metalens.core.store import Provenance, typed_reader
 from metalens.propagate import axis_positions
 from metalens.psf.budget import PsfErrorBudget
@@ -25,8 +26,8 @@ def _made_here() -> Provenance:
     return Provenance()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class PsfStack:
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class PsfStack(RecordView):
     """Point spread functions over depth, field angle and lens.
 
     Attributes:
@@ -96,6 +97,45 @@ class PsfStack:
         fit = self.budget.posterior
         return (
             math.sqrt(max(self.error**2 - np.nan_to_num(fit) ** 2, 0)) <= self.tolerance
+        )
+
+    def plot(self, ax: Any = None, *, depth: int = 0) -> Any:
+        """Draw the square root of a PSF of the first direction; returns the axes.
+
+        Args:
+            ax: matplotlib axes; those of a new figure where none are given.
+            depth: its number.
+        """
+        axes = own_axes(ax)
+        x, y = self.x_um, self.y_um
+        psfs = self.numpy().intensity.reshape(-1, len(y), len(x))
+        root = np.sqrt(psfs[depth].clip(0))
+        axes.imshow(root, extent=(x[0], x[-1], y[-1], y[0]))
+        axes.set(title="√PSF", xlabel="x / µm", ylabel="y / µm")
+        return axes
+
+    def to_xarray(self) -> Any:
+        """xarray.Dataset of intensity and energy over (angle, depth_um, y_um, x_um)."""
+        import xarray
+
+        plain = self.numpy()
+        shape = len(self.angles_rad), len(self.depths_um)
+        names = ("angle", "depth_um", "y_um", "x_um")
+        x, y = self.x_um, self.y_um
+        light = plain.intensity.reshape(*shape, len(y), len(x))
+        return xarray.Dataset(
+            {
+                "intensity": (names, light),
+                "energy_um2": (names[:2], plain.energy_um2.reshape(shape)),
+            },
+            {
+                "depth_um": self.depths_um,
+                "y_um": y,
+                "x_um": x,
+                "angle_x_rad": (("angle",), self.angles_rad[:, 0]),
+                "angle_y_rad": (("angle",), self.angles_rad[:, 1]),
+            },
+            {"relative_error": self.error, "wavelengths_um": self.wavelengths_um},
         )
 
     def numpy(self) -> "PsfStack":

@@ -50,11 +50,11 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
         ),
         (
             'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_design = "c.toml"\n',
-            "belongs to a bench_truth",
+            "measures one lens",
         ),
         (
             'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_truth = "c.toml"\n',
-            "no lens to measure",
+            "measures one lens",
         ),
         ('cell = "c.toml"\ndesin = "c.toml"\n', "did you mean 'design'"),
     ],

@@ -1,5 +1,6 @@
 """A lens for other programs: what they read is what the pillars do."""
 
+import json
 import math
 
 import numpy as np
@@ -144,3 +145,22 @@ def test_every_pillar_up_to_the_rim_can_be_read_from_the_written_map(tmp_path):
         error[np.asarray(d.diameter_um)[held, held] > 0].max()
         < 0.202 * (0.4**2 + 0.24**2) / 8 + 2 * 0.53**3 * 3**0.5 / 216 + 1e-4
     )
+
+
+def test_rays_through_the_binary_2_surface_meet_in_the_focus(tmp_path):
+    """sin of the ray behind it is phi'(r) / k: a hyperbolic phase of focus 71 um sends
+    all collimated rays there, whatever its radius.
+    """
+    k, focus_um = 2 * math.pi / 0.85, 71.0
+    phase = -k * (np.sqrt(X**2 + X[:, None] ** 2 + focus_um**2) - focus_um)
+    residual = export.export_lens(tmp_path / "a.json", made(phase))
+    surface = json.loads((tmp_path / "a.json").read_text())
+    assert residual == surface["residual_rad"] < 1e-6
+    radius_um = 1e3 * surface["norm_radius_mm"]
+    r = np.array([0.5, 6.3, 11.9, 18.7])
+    order = 2 * np.arange(1, 9)
+    terms = surface["coefficients_rad"] * order / radius_um
+    sine = -(terms * (r[:, None] / radius_um) ** (order - 1)).sum(1) / k
+    assert r / np.tan(np.arcsin(sine)) == pytest.approx(focus_um, rel=1e-5)
+    with pytest.raises(LensError, match="need a quarter wave"):
+        export.export_lens(tmp_path / "b.json", made(smooth(X, X[:, None])))
