@@ -75,7 +75,7 @@ def test_every_kind_of_file_says_what_it_is_and_what_made_it(kind, tmp_path, cap
 
 def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
     path = tmp_path / "checkpoint.safetensors"
-    checkpoint.save(
+    checkpoint.save_checkpoint(
         path,
         {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0]},
         settings=InnerConfig(steps=7),

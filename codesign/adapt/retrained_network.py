@@ -119,7 +119,7 @@ def load_retrained(path: Path) -> FinishedRun:
         )
     # batch statistics are those behind the lens that the network was trained on for
     trainer = retraining.make_trainer(source, recipe.settings, (stacks[job],))
-    state = checkpoint.load(folder / f"{job}.safetensors", settings=recipe)
+    state = checkpoint.load_checkpoint(folder / f"{job}.safetensors", settings=recipe)
     trainer.model.restore(state["trainer"])
     return replace(source, run=replace(source.run, trainer=trainer), made=made)
 

@@ -91,7 +91,7 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
         ) from None
     if settings.run.finetune_steps or settings.search.inner_steps:
         file = weights_file(folder, selected[0]["budget_mmacs"])
-        run.trainer.model.restore(checkpoint.load(file, settings=settings))
+        run.trainer.model.restore(checkpoint.load_checkpoint(file, settings=settings))
     return FinishedRun(run, best.architecture, selected[0])
 
 

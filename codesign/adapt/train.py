@@ -225,7 +225,9 @@ def run_job(
     for record in trainer.run():
         yield record
         if record.step % every == 0 or record.step == trainer.inner.steps:
-            checkpoint.save(path, {"trainer": trainer.state()}, settings=settings)
+            checkpoint.save_checkpoint(
+                path, {"trainer": trainer.state()}, settings=settings
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

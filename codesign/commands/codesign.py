@@ -213,7 +213,7 @@ def _write_results(
         errors = [candidate.error for candidate in state.history]
         axes.plot(costs, errors, "o", label=f"budget {budget:g} MMACs")
         file = weights_file(folder, budget)
-        checkpoint.save(file, model.state(), settings=settings)
+        checkpoint.save_checkpoint(file, model.state(), settings=settings)
         if settings.search.inner_steps:
             save_lens(lens_file(folder, settings, budget), model)
         if export:

@@ -163,7 +163,7 @@ def _train(
     trainer = retraining.make_trainer(source, options.settings, stacks)
     path = folder / f"{name}.safetensors"
     if path.is_file():
-        trainer.restore(checkpoint.load(path, settings=recipe)["trainer"])
+        trainer.restore(checkpoint.load_checkpoint(path, settings=recipe)["trainer"])
     entries = checkpoint.read_entries(folder / LOG)
     checkpoint.write_entries(
         folder / LOG,
@@ -187,7 +187,7 @@ def _write_results(
     source, trainer = trained
     assess.recalibrate_network(trainer, source.architecture)
     file = folder / "subnet_retrained.safetensors"
-    checkpoint.save(file, trainer.model.state(), settings=source.settings)
+    checkpoint.save_checkpoint(file, trainer.model.state(), settings=source.settings)
     retrain_report.write_retraining_page(folder / "report.html", story)
     store.write_bytes(
         folder / "cases.png", retrain_report.plot_error_bars(story.outcome)

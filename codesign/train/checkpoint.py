@@ -18,7 +18,9 @@ ABOUT = "about"
 _TENSOR = "\0tensor"
 
 
-def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
+def save_checkpoint(
+    path: str | Path, state: dict[str, Any], *, settings: object
+) -> None:
     """Write a training state.
 
     Args:
@@ -58,7 +60,7 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
             raise OSError(f"{path}: cannot be written ({error})") from error
 
 
-def load(path: str | Path, *, settings: object) -> dict[str, Any]:
+def load_checkpoint(path: str | Path, *, settings: object) -> dict[str, Any]:
     """Read a training state back.
 
     Args:

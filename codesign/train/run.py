@@ -355,7 +355,7 @@ def save_run(path: Path, run: CodesignRun) -> None:
         "trainer": run.trainer.state(),
         "searches": [evolution.state_to_json(s) for s in run.searches],
     }
-    checkpoint.save(path, state, settings=run.settings)
+    checkpoint.save_checkpoint(path, state, settings=run.settings)
 
 
 def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
@@ -368,7 +368,7 @@ def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
         TrainingError: no checkpoint, a damaged one, or one of other settings (the
             difference is named).
     """
-    state = checkpoint.load(path, settings=settings)
+    state = checkpoint.load_checkpoint(path, settings=settings)
     run = start_run(settings)
     run.trainer.restore(state["trainer"])
     run.searches = [evolution.state_from_json(table) for table in state["searches"]]

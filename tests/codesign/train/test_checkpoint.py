@@ -37,8 +37,8 @@ tree = st.recursive(
 @given(st.dictionaries(st.text(max_size=5), tree, max_size=4))
 def test_any_tree_comes_back(tmp_path_factory, state):
     path = tmp_path_factory.mktemp("c") / "c.safetensors"
-    checkpoint.save(path, state, settings=Settings())
-    assert checkpoint.load(path, settings=Settings()) == state
+    checkpoint.save_checkpoint(path, state, settings=Settings())
+    assert checkpoint.load_checkpoint(path, settings=Settings()) == state
 
 
 def test_optimiser_continues_bit_for_bit(tmp_path):
@@ -60,10 +60,10 @@ def test_optimiser_continues_bit_for_bit(tmp_path):
         "optimiser": optimiser.state_dict(),
         "random": torch.get_rng_state(),
     }
-    checkpoint.save(tmp_path / "c", state, settings=Settings())
+    checkpoint.save_checkpoint(tmp_path / "c", state, settings=Settings())
     step(net, optimiser, 4)
     other, other_optimiser = fresh()
-    back = checkpoint.load(tmp_path / "c", settings=Settings())
+    back = checkpoint.load_checkpoint(tmp_path / "c", settings=Settings())
     other.load_state_dict(back["net"])
     saved = back["optimiser"]
     moments = {int(number): row for number, row in saved["state"].items()}
@@ -75,38 +75,42 @@ def test_optimiser_continues_bit_for_bit(tmp_path):
 
 
 def test_changed_settings_are_refused_with_the_difference(tmp_path):
-    checkpoint.save(tmp_path / "c", {"a": 1}, settings=Settings())
+    checkpoint.save_checkpoint(tmp_path / "c", {"a": 1}, settings=Settings())
     with pytest.raises(TrainingError, match=r"rate: 0\.1 -> 0\.2"):
-        checkpoint.load(tmp_path / "c", settings=replace(Settings(), rate=0.2))
+        checkpoint.load_checkpoint(
+            tmp_path / "c", settings=replace(Settings(), rate=0.2)
+        )
 
 
 @pytest.mark.parametrize("keep", [0, 5, 60, 200])
 def test_truncated_checkpoint_is_refused(tmp_path, keep):
     path = tmp_path / "c"
-    checkpoint.save(path, {"a": torch.arange(100)}, settings=Settings())
+    checkpoint.save_checkpoint(path, {"a": torch.arange(100)}, settings=Settings())
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(TrainingError, match="truncated or not a checkpoint"):
-        checkpoint.load(path, settings=Settings())
+        checkpoint.load_checkpoint(path, settings=Settings())
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path):
     with pytest.raises(TrainingError, match="no checkpoint"):
-        checkpoint.load(tmp_path / "absent", settings=Settings())
+        checkpoint.load_checkpoint(tmp_path / "absent", settings=Settings())
     from safetensors.torch import save_file
 
     save_file({"x": torch.zeros(2)}, str(tmp_path / "w"))
     with pytest.raises(TrainingError, match=r"no kind.*train again"):
-        checkpoint.load(tmp_path / "w", settings=Settings())
+        checkpoint.load_checkpoint(tmp_path / "w", settings=Settings())
 
 
 def test_what_cannot_be_kept_is_named(tmp_path):
     with pytest.raises(TrainingError, match="is a object"):
-        checkpoint.save(tmp_path / "c", {"bad": object()}, settings=Settings())
+        checkpoint.save_checkpoint(
+            tmp_path / "c", {"bad": object()}, settings=Settings()
+        )
     assert not (tmp_path / "c").exists()
 
 
 def _checkpointed(path, size):
-    checkpoint.save(path, {"w": torch.ones(size)}, settings=Settings())
+    checkpoint.save_checkpoint(path, {"w": torch.ones(size)}, settings=Settings())
 
 
 def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path):

@@ -108,9 +108,9 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole, stop, tmp_path):
     one, lines = whole
     first = _trainer(MOVING)
     list(first.run(until=stop))
-    checkpoint.save(tmp_path / "c", first.state(), settings=MOVING)
+    checkpoint.save_checkpoint(tmp_path / "c", first.state(), settings=MOVING)
     second = _trainer(MOVING)
-    second.restore(checkpoint.load(tmp_path / "c", settings=MOVING))
+    second.restore(checkpoint.load_checkpoint(tmp_path / "c", settings=MOVING))
     assert list(second.run()) == lines[stop:]
     assert _equal(one, second)
 
