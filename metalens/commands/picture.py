@@ -147,7 +147,9 @@ def read_colours(picture: Path) -> Array:
     """
     import cv2
 
-    pixels = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
+    pixels = None
+    if picture.is_file():
+        pixels = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ConfigError(f"{picture}: no picture that can be read (PNG, TIFF, JPEG)")
     largest = np.iinfo(str(pixels.dtype)).max if pixels.dtype.kind == "u" else 1
