@@ -23,6 +23,7 @@ CASES = {
     "field": ("cell.toml --diameter-um 0.12 -o out.h5", "out.h5"),
     "design": ("design.toml -o out.h5", "out.h5"),
     "psf": ("lens.h5 -o out.h5", "out.h5"),
+    "lens-report": ("lens.h5 -o out.h5", "out.h5"),
     "export": ("lens.h5 -o out.npz", "out.npz"),
     "scene": ("scene.toml -o out", "out"),
     "layout": ("lens.h5 -o out", "out"),

@@ -4,7 +4,7 @@ distortion, field curvature, efficiency by cause.
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +15,36 @@ from codesign.evaluate import field_page
 from metalens import design, lens, psf
 from metalens.aberrations import OverField, over_field
 from metalens.core import store
+from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import Figure, KeyFigure, Section, Table, write_report
 from metalens.lens import reach
+from metalens.psf import plots
 
 FIELDS = 5  # field angles where none are given
 AIRY, SAMPLES = 28.0, 192  # window in wavelength / NA, samples across it
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FocusAtWavelength:
-    """Figures of every field angle at one wavelength.
+class LensAtWavelength:
+    """A lens at one wavelength over its field angles.
 
-    figures: (angles,) FWHM, Strehl ratio, MTF50 and focusing efficiency.
-    passed: (angles,) power behind the pillars over the power on the aperture, at the
-    design wavelength: what reflection, absorption and other orders leave.
-    stack: PSFs (angle, y, x) they were measured on.
+    focus: (angles,) FWHM, Strehl ratio, MTF50 and focusing efficiency.
+    shares: (angles, 3) light behind the pillars over that on the aperture (reflection,
+    absorption and other orders take the rest), share of it in the window of the PSF,
+    share of that within three FWHM; their product is the efficiency.
+    stack: PSFs (angle, y, x) they were measured on. field: aberrations.
     """
 
-    wavelength_um: float
-    figures: tuple[psf.FocusMetrics, ...]
-    passed: tuple[float, ...]
+    focus: tuple[psf.FocusMetrics, ...]
+    shares: Array
     stack: psf.PsfStack
+    field: OverField
+
+    @property
+    def name(self) -> str:
+        """The wavelength in words."""
+        return f"{1e3 * self.stack.wavelengths_um[0]:g} nm"
 
 
 def run(options: Options) -> int:
@@ -49,26 +57,29 @@ def run(options: Options) -> int:
     """
     device = lens.load(options.lens)
     view = _view(options, device)
-    wavelengths_nm = options.wavelengths_nm or (device.wavelength_um * 1e3,)
+    waves_um = [nm * 1e-3 for nm in options.wavelengths_nm] or [device.wavelength_um]
     with options.claim(options.output, companions=(".json",)) as draft:
-        by_wavelength = [
-            measure_focus(device, view, nm * 1e-3, tolerance=options.tolerance)
-            for nm in options.console.track(
-                wavelengths_nm, total=len(wavelengths_nm), label="wavelengths"
+        measured = [
+            measure_lens(
+                replace(device, wavelength_um=wave), view, tolerance=options.tolerance
+            )
+            for wave in options.console.track(
+                waves_um, total=len(waves_um), label="wavelengths"
             )
         ]
-        angles_deg = tuple(math.degrees(x) for x, _ in view.angles_rad)
-        field = over_field(device, angles_deg, depth_um=view.depths_um[0])
-        values = report_values(by_wavelength, field)
+        values = {one.name: report_values(one) for one in measured}
         text = json.dumps(values, indent=1) + "\n"
         store.write_text(draft.path.with_suffix(".json"), text)
-        shown = [focus_table(by_wavelength), *field_page.field_tables({"": field})]
-        _write_page(draft.path, options.lens.name, by_wavelength, field, shown)
+        fields = {one.name: one.field for one in measured}
+        shown = [focus_table(measured)]
+        for table in field_page.field_tables(fields):
+            shown.append(replace(table, head=("wavelength", *table.head[1:])))
+        _write_page(draft.path, options.lens.name, measured, shown)
     failures = [
-        f"{focus.wavelength_um * 1e3:g} nm: the relative error {focus.stack.error:.2g} "
-        f"is above the tolerance {options.tolerance:g}"
-        for focus in by_wavelength
-        if not focus.stack.converged
+        f"{one.name}: the relative error {one.stack.error:.2g} is above the tolerance "
+        f"{options.tolerance:g}"
+        for one in measured
+        if not one.stack.converged
     ]
     text = "\n\n".join(table.text for table in shown)
     return options.console.judged(values, f"{text}\n\n{options.output}", failures)
@@ -101,61 +112,62 @@ def _view(options: Options, device: lens.Lens) -> psf.View:
     )
 
 
-def measure_focus(
-    device: lens.Lens, view: psf.View, wavelength_um: float, *, tolerance: float
-) -> FocusAtWavelength:
-    """Figures of the focus at the field angles of a view and one wavelength.
+def measure_lens(
+    device: lens.Lens, view: psf.View, *, tolerance: float
+) -> LensAtWavelength:
+    """Focus, efficiency and aberrations of a lens at its wavelength.
 
     Args:
         device: the lens.
         view: one depth, angles and window.
-        wavelength_um: in vacuum.
         tolerance: relative L2 error of the PSFs.
     """
-    nodes = psf.SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
-    stack = psf.from_lens(device, view, tolerance=tolerance, spectrum=nodes)
-    figures = psf.focus_metrics(stack, device, power_error=design.power_error(device))
-    passed = []
-    for metrics in figures:
-        angle, depth_um = metrics.angle_rad, metrics.depth_um
-        light_um2 = float(psf.passed_um2(device, angle, (depth_um,))[0])
-        passed.append(light_um2 / psf.incident_um2(device, angle, depth_um))
-    return FocusAtWavelength(wavelength_um, figures, tuple(passed), stack)
+    stack = psf.from_lens(device, view, tolerance=tolerance)
+    focus = psf.focus_metrics(stack, device, power_error=design.power_error(device))
+    shares = []
+    for one in focus:
+        passed = float(psf.passed_um2(device, one.angle_rad, view.depths_um)[0])
+        passed /= psf.incident_um2(device, one.angle_rad, view.depths_um[0])
+        within = one.efficiency / (passed * one.window_share)
+        shares.append((passed, one.window_share, within))
+    angles_deg = tuple(math.degrees(x) for x, _ in view.angles_rad)
+    field = over_field(device, angles_deg, depth_um=view.depths_um[0])
+    return LensAtWavelength(focus, np.array(shares), stack, field)
 
 
-def focus_table(by_wavelength: list[FocusAtWavelength]) -> Table:
+def focus_table(measured: list[LensAtWavelength]) -> Table:
     """Table of the focus: a row for each wavelength and field angle, errors of one
     sigma, and the diffraction limit of the aperture.
 
     Args:
-        by_wavelength: figures of each wavelength.
+        measured: the lens at each wavelength.
     """
     head = (
-        "wavelength / nm", "angle / °", "FWHM / µm", "limit", "Strehl", "MTF50 x / mm⁻¹", "y",
-        "limit", "efficiency", "limit", "passed by pillars",
+        "wavelength", "angle / °", "FWHM / µm", "limit", "Strehl", "MTF50 T / mm⁻¹", "S", "limit",
+        "efficiency", "limit", "behind the pillars", "in the window", "in three FWHM",
     )  # fmt: skip
     rows = []
-    for focus in by_wavelength:
-        for one, passed in zip(focus.figures, focus.passed, strict=True):
+    for at_wave in measured:
+        for one, shares in zip(at_wave.focus, at_wave.shares, strict=True):
+            pairs = zip(one.mtf50_per_um, one.mtf50_error_per_um, strict=True)
             rows.append((
-                f"{focus.wavelength_um * 1e3:g}",
+                at_wave.name,
                 f"{math.degrees(one.angle_rad[0]):.3g}",
                 _with_error(one.fwhm_um, one.fwhm_error_um),
                 f"{one.limit.fwhm_um:.3g}",
                 _with_error(one.strehl, one.strehl_error),
-                *(
-                    _with_error(1e3 * value, 1e3 * error)
-                    for value, error in zip(one.mtf50_per_um, one.mtf50_error_per_um, strict=True)
-                ),
+                *(_with_error(1e3 * value, 1e3 * error) for value, error in pairs),
                 f"{1e3 * one.limit.mtf50_per_um:.3g}",
                 _with_error(one.efficiency, one.efficiency_error),
                 f"{one.limit.efficiency:.3g}",
-                f"{passed:.3g}",
+                *(f"{share:.3g}" for share in shares),
             ))  # fmt: skip
     caption = (
-        "Focus over field and wavelength, one-sigma errors. Efficiency: power within "
-        "three FWHM over power on the aperture. Pillars pass, at the design wavelength, "
-        "what reflection, absorption and other orders leave; the rest falls outside."
+        "Focus over field and wavelength, one-sigma errors; T tangential (along x), S "
+        "sagittal. Efficiency, power within three FWHM over power on the aperture, is "
+        "the product of the last three columns: what reflection, absorption and other "
+        "orders leave behind the pillars, its share in the window, and of that in the "
+        "focus."
     )
     return Table(head, rows, caption)
 
@@ -166,50 +178,41 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.4g} ± {error:.1g}"
 
 
-def report_values(
-    by_wavelength: list[FocusAtWavelength], field: OverField
-) -> dict[str, Any]:
-    """Every number of the report, for JSON.
+def report_values(measured: LensAtWavelength) -> dict[str, Any]:
+    """Every number of one wavelength, for JSON.
 
     Args:
-        by_wavelength: figures of each wavelength.
-        field: aberrations at the design wavelength.
+        measured: the lens at that wavelength.
     """
-    focus = [
-        {
-            "wavelength_um": one.wavelength_um,
-            "error": one.stack.error,
-            "angles": [
-                asdict(metrics) | {"passed": passed}
-                for metrics, passed in zip(one.figures, one.passed, strict=True)
-            ],
-        }
-        for one in by_wavelength
-    ]
-    return {"focus": focus, "field": field_page.field_values(field)}
+    names = ("behind_pillars", "in_window", "in_focus")
+    return {
+        "error": measured.stack.error,
+        "focus": [
+            asdict(one) | dict(zip(names, shares, strict=True))
+            for one, shares in zip(
+                measured.focus, measured.shares.tolist(), strict=True
+            )
+        ],
+        "field": field_page.field_values(measured.field),
+    }
 
 
 def _write_page(
-    path: Path,
-    name: str,
-    by_wavelength: list[FocusAtWavelength],
-    field: OverField,
-    shown: list[Table],
+    path: Path, name: str, measured: list[LensAtWavelength], shown: list[Table]
 ) -> None:
-    """Write the page: curves over the field, PSFs of each wavelength, tables."""
-    from metalens.psf.plots import plot_montage
-
-    axis = by_wavelength[0].figures[0]
-    pictures = [
-        Figure(field_page.plot_over_field({"": field}), field_page.CAPTION, wide=True),
-        *(
-            Figure(
-                plot_montage(one.stack),
-                f"PSF at {one.wavelength_um * 1e3:g} nm over the field angle (down).",
-            )
-            for one in by_wavelength
-        ),
-    ]
+    """Write the page: curves over the field, PSFs and MTF of each wavelength, tables."""
+    fields = {one.name: one.field for one in measured}
+    curves = field_page.plot_over_field(fields)
+    pictures = [Figure(curves, field_page.CAPTION, wide=True)]
+    for one in measured:
+        montage = plots.plot_montage(one.stack)
+        transfer = plots.plot_mtf(one.stack, limit=one.focus[0].limit)
+        pictures += [
+            Figure(montage, f"PSF at {one.name} over the field angle (down)."),
+            Figure(transfer, f"MTF and encircled energy at {one.name}.", wide=True),
+        ]
+    axis = measured[0].focus[0]
+    distortion = max(float(np.nanmax(np.abs(f.distortion))) for f in fields.values())
     write_report(
         path,
         f"Lens report: {name}",
@@ -217,6 +220,6 @@ def _write_page(
         key_figures=[
             KeyFigure("Strehl ratio on axis", f"{axis.strehl:.3f}"),
             KeyFigure("focusing efficiency", f"{axis.efficiency:.3f}"),
-            KeyFigure("largest distortion", f"{100 * np.nanmax(np.abs(field.distortion)):.2g} %"),
+            KeyFigure("largest distortion", f"{100 * distortion:.2g} %"),
         ],
-    )  # fmt: skip
+    )

@@ -19,8 +19,7 @@ class Options(CommonOptions):
         output: the page to write; NAME.json with all numbers is written next to it.
         angles_deg: field angles along x; left out, five from 0 to the half field over
             which a hyperbolic lens of this focus is diffraction-limited.
-        wavelengths_nm: in vacuum; left out, the design wavelength. Distortion, field
-            curvature and the MTF of all light are those of the design wavelength.
+        wavelengths_nm: in vacuum; left out, the design wavelength.
         depth_mm: of the source, inf for collimated light; left out, the focus of the
             lens.
         tolerance: relative L2 error of the PSFs.
