@@ -4,12 +4,12 @@ and its transpose.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from layout.mask.plan import PillarArray
 from layout.pec.psf import PointExposure
-from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -34,16 +34,21 @@ class NodeAxis:
             int((high_um - low_um) / spacing_um) + 5,
         )
 
-    def at(self, position_um: Array) -> tuple[Array, Array]:
-        """First of the four nodes around each position (n,), and their cubic Lagrange
-        weights (n, 4).
+    def weights(self, position_um: Array) -> Any:
+        """(n, count) sparse matrix: values at positions (n,) from those on the nodes, by
+        cubic Lagrange interpolation between four nodes each.
         """
+        from scipy.sparse import csr_array
+
         steps = (np.asarray(position_um, float) - self.origin_um) / self.spacing_um
         first = np.clip(np.floor(steps).astype(np.int64) - 1, 0, self.count - 4)
         t = steps - first - 1
         inner = (-t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2)
         outer = (-(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6)
-        return first, np.stack([*inner, *outer], -1)
+        node = first[:, None] + np.arange(4)
+        rows = np.arange(0, node.size + 1, 4)
+        values = np.stack([*inner, *outer], -1).ravel()
+        return csr_array((values, node.ravel(), rows), (len(first), self.count))
 
 
 @dataclass(frozen=True)
@@ -81,9 +86,8 @@ class NodeGrid:
 
     def deposit(self, x_um: Array, y_um: Array, mass: Array) -> Array:
         """(y, x) node sums of masses (n,) at any places."""
-        out = np.zeros(self.shape)
-        _deposit(*self.x.at(x_um), *self.y.at(y_um), np.asarray(mass, float), out)
-        return out
+        across = self.x.weights(x_um).multiply(np.asarray(mass, float)[:, None])
+        return np.asarray((self.y.weights(y_um).T @ across.tocsr()).toarray())
 
     def gather(self, lattice: PillarArray, value: Array, sums: Array) -> None:
         """Add what the pillars of a lattice carry to node sums (fields, y, x).
@@ -93,10 +97,11 @@ class NodeGrid:
             value: (fields, classes + 1) amount that each pillar of a class carries.
             sums: changed in place.
         """
-        across = self.x.at(lattice.columns_um)
+        across = self.x.weights(lattice.columns_um)
         for first, block in lattice.blocks():
-            down = self.y.at(lattice.rows_um(first, len(block)))
-            _gather(block, value, *down, *across, sums)
+            down = self.y.weights(lattice.rows_um(first, len(block)))
+            for total, amount in zip(sums, value, strict=True):
+                total += down.T @ (amount[block] @ across)
 
     def convolution(self, point: PointExposure) -> "RadialConvolution":
         """Convolution of node sums with Gaussians."""
@@ -105,62 +110,11 @@ class NodeGrid:
 
     def sample(self, field: Array, x_um: Array, y_um: Array) -> Array:
         """(n,) values of a node field at any places."""
-        first_x, weight_x = self.x.at(x_um)
-        first_y, weight_y = self.y.at(y_um)
-        near = np.arange(4)
-        rows = first_y[:, None, None] + near[:, None]
-        nodes = field[rows, first_x[:, None, None] + near]
-        return np.asarray(np.einsum("nij,ni,nj->n", nodes, weight_y, weight_x))
-
-
-@compile_loop
-def _deposit(
-    x_node: Array,
-    x_weight: Array,
-    y_node: Array,
-    y_weight: Array,
-    mass: Array,
-    out: Array,
-) -> None:
-    """Add masses (n,) to the 4 x 4 nodes around each place, by cubic weights."""
-    for n in range(mass.shape[0]):
-        for i in range(4):
-            for j in range(4):
-                out[y_node[n] + i, x_node[n] + j] += (
-                    mass[n] * y_weight[n, i] * x_weight[n, j]
-                )
-
-
-@compile_loop
-def _gather(
-    block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
-) -> None:
-    """Add what the pillars of a block of rows carry to the nodes, by cubic weights.
-
-    Args:
-        block: (rows, columns) entries; 0: no pillar.
-        value: (fields, entries) amount that each entry carries.
-        yn: (rows,) first node of each row.
-        yw: (rows, 4) weights.
-        xn: (columns,) first node of each column.
-        xw: (columns, 4) weights.
-        out: (fields, y, x) sums, in place.
-    """
-    fields = out.shape[0]
-    wide = out.shape[2]
-    line = np.zeros((fields, wide))
-    for row in range(block.shape[0]):
-        line[:] = 0
-        for column in range(block.shape[1]):
-            entry = block[row, column]
-            if entry:
-                for f in range(fields):
-                    for j in range(4):
-                        line[f, xn[column] + j] += value[f, entry] * xw[column, j]
-        for f in range(fields):
-            for i in range(4):
-                for node in range(wide):
-                    out[f, yn[row] + i, node] += yw[row, i] * line[f, node]
+        across, down = self.x.weights(x_um), self.y.weights(y_um)
+        columns, rows = (each.indices.reshape(-1, 4) for each in (across, down))
+        nodes = field[rows[:, :, None], columns[:, None]]
+        weights = (each.data.reshape(-1, 4) for each in (down, across))
+        return np.asarray(np.einsum("nij,ni,nj->n", nodes, *weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,41 +142,14 @@ class ScatterBackground:
             first: row.
             count: of rows.
         """
-        exposure = np.empty((count, lattice.columns), np.float32)
-        down = self.grid.y.at(lattice.rows_um(first, count))
-        _interpolate(self.far, *down, *self.grid.x.at(lattice.columns_um), exposure)
+        down = self.grid.y.weights(lattice.rows_um(first, count))
+        across = self.grid.x.weights(lattice.columns_um)
+        exposure = np.asarray((across @ (down @ self.far).T).T, np.float32)
         return (
             exposure + self.near[number][first : first + count]
             if self.near
             else exposure
         )
-
-
-@compile_loop
-def _interpolate(
-    field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
-) -> None:
-    """Interpolate a node field at the sites of a block of rows, by cubic weights.
-
-    Args:
-        field: (y, x) values at the nodes.
-        yn: (rows,) first node of each row.
-        yw: (rows, 4) weights.
-        xn: (columns,) first node of each column.
-        xw: (columns, 4) weights.
-        out: (rows, columns) float32, filled.
-    """
-    line = np.zeros(field.shape[1])
-    for row in range(out.shape[0]):
-        line[:] = 0
-        for i in range(4):
-            for node in range(field.shape[1]):
-                line[node] += yw[row, i] * field[yn[row] + i, node]
-        for column in range(out.shape[1]):
-            total = 0.0
-            for j in range(4):
-                total += xw[column, j] * line[xn[column] + j]
-            out[row, column] = total
 
 
 @dataclass(frozen=True, eq=False)
