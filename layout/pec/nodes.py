@@ -35,8 +35,8 @@ class NodeAxis:
         )
 
     def weights(self, position_um: Array) -> Any:
-        """(n, count) sparse matrix: values at positions (n,) from those on the nodes, by
-        cubic Lagrange interpolation between four nodes each.
+        """(n, count) sparse matrix: values at positions (n,) from those on the nodes,
+        by cubic Lagrange interpolation between four nodes each.
         """
         from scipy.sparse import csr_array
 
