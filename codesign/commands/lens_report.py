@@ -218,7 +218,9 @@ def _write_page(
         f"Lens report: {name}",
         [Section("Pictures", items=pictures), Section("Tables", items=shown)],
         key_figures=[
-            KeyFigure("Strehl ratio on axis", f"{axis.strehl:.3f}"),
+            KeyFigure(
+                f"Strehl ratio on axis, {measured[0].name}", f"{axis.strehl:.3f}"
+            ),
             KeyFigure("focusing efficiency", f"{axis.efficiency:.3f}"),
             KeyFigure("largest distortion", f"{100 * distortion:.2g} %"),
         ],
