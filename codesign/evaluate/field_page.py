@@ -126,8 +126,9 @@ def _caption(field_aberrations: Mapping[str, OverField]) -> str:
         for line in aberrations.left_out
     )
     return (
-        f"Over the field along x, sources at {', '.join(sorted(depths))}, at the wavelength of each lens. Foci behind (+) or before "
-        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{notes}"
+        f"Over the field along x, sources at {', '.join(sorted(depths))}, at the "
+        "wavelength of each lens. Foci behind (+) or before the sensor, T tangential "
+        f"and S sagittal; illumination relative to 0°.{notes}"
     )
 
 
