@@ -38,7 +38,16 @@ def seen(case):
     return over_field(made(case), ANGLES, depth_um=depth, frequencies=(41.0,))
 
 
-@pytest.mark.parametrize("case", ["plain", "off-centre", "glass", "stop", "all"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "plain",
+        "off-centre",
+        "glass",
+        "stop",
+        pytest.param("all", marks=pytest.mark.slow),
+    ],
+)
 def test_distortion_is_by_how_much_a_traced_image_is_not_linear(case):
     """Landing places of traced rays over the line through those of ± 0.02 degrees."""
     ends = [(_landing(case, a), _place(case, a)) for a in (-0.02, 0.02)]

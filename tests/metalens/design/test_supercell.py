@@ -255,7 +255,9 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     assert (np.abs(found.factor[0]) < np.abs(found.factor[1]) - 0.05)[:2].all()
 
 
-@pytest.mark.parametrize(("count", "diagonal"), [(5, False), (8, True)])
+@pytest.mark.parametrize(
+    ("count", "diagonal"), [(5, False), pytest.param(8, True, marks=pytest.mark.slow)]
+)
 def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     steep, count, diagonal
 ):

@@ -1,5 +1,5 @@
 """Pillars by their own shape: derivatives of ln t against differences of the same
-truncation, and their error bar.
+truncation.
 """
 
 import dataclasses
@@ -125,30 +125,6 @@ def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(
     want = slope("grown") - slope("wider")
     assert abs(found.edges[0] - want) < 0.06 * abs(want) + 0.15
     assert abs(found.edges[0]) > 0.1 * abs(slope("wider"))
-
-
-@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (0.004, 7)])
-def test_the_error_is_the_largest_change_from_the_coarser_truncation(
-    angle, rows, monkeypatch, few_orders
-):
-    """Of every row that is there, however little it does: a turn that a mirror of the
-    cell all but forbids is not.
-    """
-    straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
-    sizes = np.array([0.17, 0.26])
-    fine = own_rates(straight, sizes)
-    monkeypatch.setattr(solved_rates, "_TRUNCATIONS", (1, 2))
-    coarse = own_rates(straight, sizes)
-    pairs = zip(
-        *(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True
-    )
-    moved = [
-        np.linalg.norm(a - b) / np.linalg.norm(a)
-        for a, b in pairs
-        if np.abs(a).max() > 1e-4
-    ]
-    assert len(moved) == rows
-    assert fine.error == pytest.approx(max(moved), rel=1e-9)
 
 
 def test_round_pillars_keep_their_form_as_their_edges_move(few_orders):

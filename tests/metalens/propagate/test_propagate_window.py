@@ -199,7 +199,8 @@ def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
 
 
 @pytest.mark.parametrize(
-    ("window_um", "offset_um"), [(900.0, (0.0, 0.0)), (500.0, (200.0, -50.0))]
+    ("window_um", "offset_um"),
+    [pytest.param(900.0, (0.0, 0.0), marks=pytest.mark.slow), (500.0, (200.0, -50.0))],
 )
 def test_a_window_that_is_wide_for_its_distance(window_um, offset_um):
     """The middle of the window is seen under a larger angle than its corners."""
