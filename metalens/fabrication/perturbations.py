@@ -4,7 +4,7 @@ symmetry and measurement of each.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -509,14 +509,10 @@ def names_of_kind(kind: Kind) -> tuple[str, ...]:
     return tuple(row.name for _, row in of_kind(kind))
 
 
-def with_missing(rows: Sequence[Array]) -> Array:
-    """(pillar-response errors, *shape) of the first rows of the table, zeros appended.
-
-    Args:
-        rows: (*shape) of each of the first pillar-response errors.
-    """
+def with_missing(rows: Array) -> Array:
+    """(pillar-response errors, *shape) of the first ``rows`` of it, zeros appended."""
     missing = len(response_errors()) - len(rows)
-    return np.stack([*rows, *[np.zeros_like(rows[0])] * missing])
+    return np.concatenate([rows, np.zeros((missing, *rows.shape[1:]))])
 
 
 def inapplicable_names(cell: Cell) -> tuple[str, ...]:

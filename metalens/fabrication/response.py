@@ -47,14 +47,6 @@ class SolvedResponse:
     diameter_um: Array
     powers: Array
 
-    def series(self, diameter_um: Array) -> Array:
-        """(causes, orders, *shape) at diameters between the ends."""
-        from scipy.interpolate import CubicSpline
-
-        return np.asarray(
-            CubicSpline(self.diameter_um, self.powers, axis=-1)(diameter_um)
-        )
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivity:
@@ -94,11 +86,15 @@ class Sensitivity:
         Raises:
             LensError: of pillars of two sizes.
         """
-        if self.pairs is not None:
-            raise LensError(
-                "pillars of two sizes: their derivatives are no function of one size"
-            )
-        return with_missing(list(self._series(self.coefficients, diameter_um)))
+        return with_missing(self._series(self.coefficients, diameter_um))
+
+    def change(self, amounts: Array, diameter_um: Array) -> Array:
+        """(*shape) change of ln t by (pillar-response errors,) ``amounts``, to first
+        order.
+        """
+        rows = self.coefficients
+        (total,) = self._series(amounts[None, : len(rows)] @ rows, diameter_um)
+        return np.asarray(total)
 
     def by_edges(self, diameter_um: Array) -> Array | None:
         """(*shape) change of ln t per um of a bias of all edges, beyond that of the
@@ -117,6 +113,10 @@ class Sensitivity:
             coefficients: (rows, degree + 1) power series in D - ``center_um``.
             diameter_um: (*shape) diameters, um.
         """
+        if self.pairs is not None:
+            raise LensError(
+                "pillars of two sizes: their derivatives are no function of one size"
+            )
         inside = np.clip(diameter_um, self.low_um, self.high_um)
         offset = inside - self.center_um
         slopes = polynomial.polyval(offset, polynomial.polyder(coefficients.T))
@@ -149,14 +149,13 @@ class RelativeResponse:
         Args:
             amounts: (causes,) a_c in base units (um, rad, 1).
         """
-        change = np.exp(np.tensordot(amounts, self.slopes, 1))
-        if self.series is None:
-            return np.asarray(change)
-        change = change * self.series[0, 0] / self.proxy
-        for amount, row in zip(amounts, self.series, strict=False):
-            if amount:
-                change = change * (polynomial.polyval(amount, row) / row[0])
-        return np.asarray(change)
+        change: Array = np.exp(np.tensordot(amounts, self.slopes, 1))
+        if self.series is not None:
+            change = change * self.series[0, 0] / self.proxy
+            for amount, row in zip(amounts, self.series, strict=False):
+                if amount:
+                    change = change * (polynomial.polyval(amount, row) / row[0])
+        return change
 
     def rates(self, amounts: Array) -> Array:
         """(causes, *shape) d ln t by every cause at the change: s_c, or t_c'(a_c) /
@@ -211,8 +210,8 @@ def _own_shape_sensitivity(lens: Lens) -> Sensitivity:
     """Derivatives of ln t of a lens's own pillar shape, as polynomials of degree 5.
 
     RCWA rates (:func:`metalens.fabrication.solved_rates.own_rates`) at the nine
-    Chebyshev sizes of the proxy's domain are fitted by least squares. ``error``: truncation of the solver
-    plus the largest relative residual of the fit.
+    Chebyshev sizes of the proxy's domain are fitted by least squares. ``error``:
+    truncation of the solver plus the largest relative residual of the fit.
     """
     low, high = lens.proxy.domain_um
     center = (low + high) / 2
@@ -250,19 +249,15 @@ def effective_indices(
         index(material, wavelength_um).real for material in (cell.pillar, cell.fill)
     )
     k = 2 * math.pi / wavelength_um
-    h = cell.height_um
     fill = math.pi * diameter_um[0] ** 2 / 4 / cell.pitch_um**2
     eps_pillar = n_pillar**2
     eps_around = n_around**2
-    eps_thin = (
-        eps_around
-        * (eps_pillar * (1 + fill) + eps_around * (1 - fill))
-        / (eps_pillar * (1 - fill) + eps_around * (1 + fill))
-    )
+    part = fill * (eps_pillar - eps_around) / (eps_pillar + eps_around)
+    eps_thin = eps_around * (1 + part) / (1 - part)
     phase = proxy.phase_rad(diameter_um, wavelength_um)
     offset = diameter_um - diameter_um.mean()
     n_eff = np.polynomial.Polynomial.fit(
-        offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * h), _DEGREE
+        offset, math.sqrt(eps_thin) + (phase - phase[0]) / (k * cell.height_um), _DEGREE
     )
     return WaveguideModel(
         k,
@@ -272,7 +267,7 @@ def effective_indices(
         n_eff.deriv(2)(offset),
         n_pillar,
         n_around,
-        h,
+        cell.height_um,
         cell.sidewall_rad,
     )
 
@@ -323,7 +318,7 @@ def _phase_and_level(
     level = proxy.transmission(inside, *at) + beyond * proxy.dtransmission_ddiameter(
         inside, *at
     )
-    return np.asarray(phase), np.asarray(level)
+    return phase, level
 
 
 def prepare_response(
@@ -339,12 +334,14 @@ def prepare_response(
         response: derivatives of ln t by the pillar-response errors.
         diameter_um: (*shape) diameters, um.
     """
-    slopes = np.asarray(response.at(diameter_um))
+    from scipy.interpolate import CubicSpline
+
+    slopes = response.at(diameter_um)
     solved = response.solved if isinstance(response, Sensitivity) else None
     if solved is None:
         return RelativeResponse(slopes, None, np.ones(1))
     inside = np.clip(diameter_um, solved.diameter_um[0], solved.diameter_um[-1])
-    series = solved.series(inside)
+    series = CubicSpline(solved.diameter_um, solved.powers, axis=-1)(inside)
     slopes[np.flatnonzero(solved.powers[:, 1:].any((1, 2)))] = 0.0
     return RelativeResponse(
         slopes, series, designed_transmission(proxy, inside, solved.wavelength_um)
@@ -365,7 +362,7 @@ def bias_ratio(
         d_um: (*shape) sizes after the bias, um.
         bias_um: displacement of the diameter by moved edges, um.
     """
-    rate = response.by_edges(np.asarray(d_um - np.asarray(bias_um) / 2))
+    rate = response.by_edges(d_um - bias_um / 2)
     return 1.0 if rate is None else np.exp(bias_um * rate)
 
 
@@ -395,7 +392,11 @@ def perturbed_transmission(
             (:func:`bias_ratio`).
         angle_rad: angle of incidence in air, rad.
     """
-    factor = prepare_response(proxy, response, d_um).factor(amounts)
-    changed = factor * bias_ratio(response, d_um, bias_um)
-    designed = designed_transmission(proxy, d_um, wavelength_um, angle_rad=angle_rad)
-    return np.asarray(designed * changed)
+    if isinstance(response, Sensitivity) and response.solved is None:
+        factor = np.exp(response.change(amounts, d_um))
+    else:
+        factor = prepare_response(proxy, response, d_um).factor(amounts)
+    factor = factor * bias_ratio(response, d_um, bias_um)
+    return factor * designed_transmission(
+        proxy, d_um, wavelength_um, angle_rad=angle_rad
+    )

@@ -52,7 +52,7 @@ class ResponseRates:
         Args:
             sizes_um: (*shape) one array of sizes, or those along x and along y, um.
         """
-        return with_missing(list(self._interpolate(self.rates, sizes_um)))
+        return with_missing(self._interpolate(self.rates, sizes_um))
 
     def by_edges(self, size_um: Array) -> Array | None:
         """(*shape) change of ln t per um of a bias of all edges, beyond that of the
