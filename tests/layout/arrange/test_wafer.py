@@ -10,12 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from layout.arrange.record import WaferMark, WaferSettings
-from layout.arrange.wafer import (
-    chord_um,
-    refuse_marks_off,
-    step_and_repeat,
-    usable_dies,
-)
+from layout.arrange.wafer import refuse_marks_off, step_and_repeat, usable_dies
 from metalens.core.errors import ProcessError
 
 
@@ -60,7 +55,7 @@ def counted(wafer, box, reach=40):
                 > radius
             ):
                 continue
-            if wafer.flat_mm and bottom < -chord_um(wafer):
+            if wafer.flat_mm and bottom < points[:, 1].min():
                 continue
             dx = np.maximum(np.maximum(left - points[:, 0], points[:, 0] - right), 0)
             dy = np.maximum(np.maximum(bottom - points[:, 1], points[:, 1] - top), 0)
@@ -80,7 +75,7 @@ BOX = (-2100.0, -1300.0, 1900.0, 1700.0)  # not about its middle
             diameter_mm=50.8,
             edge_exclusion_mm=2.0,
             flat_mm=15.88,
-            offset_um=(710.0, 1290.0),
+            offset_um=(710.0, 1850.0),  # a die lies between flat and circle
         ),
         WaferSettings(
             (4310.0, 3470.0),
