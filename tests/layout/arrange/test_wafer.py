@@ -55,7 +55,7 @@ def counted(wafer, box, reach=40):
                 > radius
             ):
                 continue
-            if wafer.flat_mm and bottom < points[:, 1].min():
+            if bottom < points[:, 1].min():
                 continue
             dx = np.maximum(np.maximum(left - points[:, 0], points[:, 0] - right), 0)
             dy = np.maximum(np.maximum(bottom - points[:, 1], points[:, 1] - top), 0)

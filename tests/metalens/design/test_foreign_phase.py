@@ -33,7 +33,7 @@ def test_levels_of_8_bits_are_refused_as_radians_and_read_as_stated(tmp_path):
             read(tmp_path / name)
         # a level is 2 pi / 256 wide, by definition
         found = read(tmp_path / name, levels=256).phase_rad
-        assert found == pytest.approx(2 * np.pi / 256 * levels, rel=1e-12)
+        assert found == pytest.approx(2 * np.pi / 256 * levels)
     assert read(tmp_path / "a.npy", unit="rad").phase_rad.max() == levels.max()
     with pytest.raises(LensError, match="levels = 16"):
         read(tmp_path / "a.npy", levels=16)
