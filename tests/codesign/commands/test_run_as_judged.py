@@ -1,6 +1,4 @@
-"""What a run's files say is what its network does: with and without events, and after
-fine-tuning.
-"""
+"""What a run's files say is what its network does after fine-tuning."""
 
 import json
 

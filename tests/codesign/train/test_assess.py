@@ -28,6 +28,7 @@ class Typed(torch.nn.Module):
         self.unused = torch.nn.Linear(1, 1)
 
     def forward(self, frames, architecture):
+        assert not self.training  # judged frames move no running means
         part = slice(self.at, self.at + len(frames))
         self.at += len(frames)
         slip, depth = self.slip[part], torch.zeros(len(frames), 2, 7, 7)
@@ -43,11 +44,12 @@ def test_answers_are_scaled_and_errors_are_means_over_frames():
     logits, mask = -torch.ones(3, 5, 5), torch.zeros(3, 5, 5)
     # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[0, :2], mask[0, 1:3] = (1.0, 1.0)
-    logits[1, 0], mask[1, 0] = 1.0, 1.0
+    logits[1, 0] = mask[1, 0] = 1.0
     seen = frames(mask, truth)
     net = Typed((truth + off) / scale, logits)
-    inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0)
+    inner = SimpleNamespace(slip_scale_mm=scale.tolist(), axis_weight=1.0)
     got = assess.predict_frames(net, None, seen, inner)
+    assert net.training
     error = (got.slip_mm - truth).abs().mean(0)
     assert float(error[2]) == pytest.approx((0.7 + 0.4 + 0.1) / 3)
     assert float(error[:2].mean()) == pytest.approx(
@@ -73,10 +75,7 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
 
     net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
     got = assess.predict_frames(
-        net,
-        None,
-        BLANK,
-        SimpleNamespace(slip_scale_mm=tuple(scale.tolist()), axis_weight=1.0),
+        net, None, BLANK, SimpleNamespace(slip_scale_mm=scale.tolist(), axis_weight=1.0)
     )
     assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
     assert torch.allclose(got.slip_mm, scale.expand(3, 3))
