@@ -20,7 +20,7 @@ import benchmarks
 from benchmarks import Row, figures
 from benchmarks._stored import compared, machine
 
-LONG = ("engines", "hard_cells", "limits", "scene_referee", "shaped_cells")
+LONG = ("engines", "hard_cells", "limits", "scene_referee")
 HEAD = (
     "case",
     "method",

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from benchmarks.studies.shaped_cells import Drawn, fitting
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import (
@@ -53,6 +52,31 @@ HEXAGONAL = Lattice("hexagonal")
 WIDE = Lattice("rectangular", 1.3)
 FLAT = Lattice("rectangular", 0.8)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.55)))
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Drawn:
+    """A cell, its size and a plane wave."""
+
+    cell: Cell
+    size_um: float
+    wavelength_um: float
+    angle_rad: float = 0.0
+    azimuth_rad: float = 0.0
+
+    def jones(self, **how: Any) -> rcwa.JonesResponse:
+        """By coupled waves; how: tolerance or harmonics."""
+        light = {"angle_rad": self.angle_rad, "azimuth_rad": self.azimuth_rad}
+        return rcwa.jones(self.cell, self.size_um, self.wavelength_um, **light, **how)
+
+
+def fitting(cell: Cell, size_um: float, gap: float) -> float:
+    """The size, or a smaller one whose widest section leaves a gap, over the pitch."""
+    tilt = abs(math.tan(cell.sidewall_rad)) * cell.height_um
+    grow = max(layer.grow_um + 2 * layer.coat_um for layer in cell.sections) + tilt
+    while cell.gap_um(size_um, grow_um=max(grow, 0.0)) < gap * cell.pitch_um:
+        size_um *= 0.95
+    return size_um
 
 
 Shaped = Callable[[np.random.Generator], Any]
