@@ -2,15 +2,16 @@
 what is known beforehand.
 
 Those of the lens are the table of :mod:`metalens.fabrication.perturbations`; those of
-the bench stand
-here.
+the bench are in ``bench_parameters.toml``.
 """
 
 import dataclasses
 import functools
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import resources
 
 import numpy as np
 
@@ -84,257 +85,20 @@ def _of(row: Perturbation) -> FitParameter:
     return FitParameter(**entries)
 
 
-def _light(name: str, meaning: str) -> FitParameter:
-    return FitParameter(
-        name,
-        meaning,
-        0.1,
-        0.3,
-        -2.0,
-        2.0,
-        free=False,
-        plausible=0.2,
-        measured_by="the profile of the lamp without the lens",
-    )
-
-
 _OF_LENS = {row.name: _of(row) for row in PERTURBATIONS}
+_OF_BENCH = tomllib.loads(
+    resources.files("characterize")
+    .joinpath("model", "bench_parameters.toml")
+    .read_text(encoding="utf-8")
+)
 PARAMETERS: tuple[FitParameter, ...] = (
-    *(
-        _OF_LENS[name]
-        for name in (*names_of_kind(CDError), *names_of_kind(ResponseError))
-    ),
-    FitParameter(
-        "wavelength_nm",
-        "wavelength minus stated",
-        0.3,
-        0.5,
-        -5.0,
-        5.0,
-        measured_by="the wavelength (spectrometer)",
-    ),
-    FitParameter(
-        "bandwidth_nm",
-        "standard deviation of the spectrum",
-        0.5,
-        math.inf,
-        0.0,
-        30.0,
-        free=False,
-        plausible=1.0,
-        effect="a spectrum of finite width",
-        probe=2.0,
-        measured_by="the spectrum",
-    ),
-    FitParameter(
-        "distance_um",
-        "lens to sensor, minus design",
-        2.0,
-        100.0,
-        -400.0,
-        400.0,
-        measured_by="a wider range of depths",
-    ),
-    FitParameter(
-        "decentre_x_um",
-        "window centre minus chief ray on the sensor",
-        1.0,
-        30.0,
-        -60.0,
-        60.0,
-        measured_by="the place of the axis on the sensor",
-    ),
-    FitParameter(
-        "decentre_y_um",
-        "window centre minus chief ray on the sensor",
-        1.0,
-        30.0,
-        -60.0,
-        60.0,
-        measured_by="the place of the axis on the sensor",
-    ),
-    FitParameter(
-        "tilt_x_deg",
-        "tilt of the lens about the y axis",
-        0.2,
-        1.0,
-        -3.0,
-        3.0,
-        free=False,
-        effect="a tilt of the lens about y",
-        probe=0.3,
-        measured_by="frames at opposite field angles",
-    ),
-    FitParameter(
-        "tilt_y_deg",
-        "tilt of the lens about the x axis",
-        0.2,
-        1.0,
-        -3.0,
-        3.0,
-        free=False,
-        effect="a tilt of the lens about x",
-        probe=0.3,
-        measured_by="frames at opposite field angles",
-    ),
-    FitParameter(
-        "source_x_um",
-        "source off the stage's axis",
-        5.0,
-        50.0,
-        -300.0,
-        300.0,
-        free=False,
-        effect="a source off the axis of the stage along x",
-        probe=5.0,
-    ),
-    FitParameter(
-        "source_y_um",
-        "source off the stage's axis",
-        5.0,
-        50.0,
-        -300.0,
-        300.0,
-        free=False,
-        effect="a source off the axis of the stage along y",
-        probe=5.0,
-    ),
-    FitParameter(
-        "stage_zero_um",
-        "true source depth minus stated (with the substrate's plate shift)",
-        50.0,
-        1000.0,
-        measured_by="the zero of the stage, or a wider range of depths",
-    ),
-    FitParameter(
-        "stage_scale",
-        "true stage step over stated, minus 1",
-        1e-3,
-        0.01,
-        -0.05,
-        0.05,
-        measured_by="the stage against a gauge",
-    ),
-    FitParameter(
-        "glass_um",
-        "plane glass of index 1.51 between source and lens",
-        20.0,
-        math.inf,
-        0.0,
-        3000.0,
-        free=False,
-        plausible=100.0,
-        effect="a plate of glass in the beam",
-        probe=100.0,
-        measured_by="the thickness of the glass",
-    ),
-    FitParameter(
-        "glass_tilt_x_deg",
-        "tilt of that glass about the y axis",
-        1.0,
-        5.0,
-        -45.0,
-        45.0,
-        free=False,
-        effect="a tilt of {:g} um of glass about y",
-        probe=5.0,
-    ),
-    FitParameter(
-        "glass_tilt_y_deg",
-        "tilt of that glass about the x axis",
-        1.0,
-        5.0,
-        -45.0,
-        45.0,
-        free=False,
-        effect="a tilt of {:g} um of glass about x",
-        probe=5.0,
-    ),
+    *(_OF_LENS[name] for name in names_of_kind(CDError)),
+    *(_OF_LENS[name] for name in names_of_kind(ResponseError)),
+    *(FitParameter(**row) for row in _OF_BENCH["geometry"]),
     *(_OF_LENS[name] for name in names_of_kind(WavefrontError)),
-    _light(
-        "light_x",
-        "ln of the irradiance at the +x rim of the lens over that at its axis",
-    ),
-    _light(
-        "light_y",
-        "ln of the irradiance at the +y rim of the lens over that at its axis",
-    ),
-    _light(
-        "light_r",
-        "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2",
-    ),
-    FitParameter(
-        "pinhole_um",
-        "diameter of the source",
-        1.0,
-        math.inf,
-        0.0,
-        2000.0,
-        free=False,
-        plausible=5.0,
-        effect="a source of finite size",
-        probe=6.0,
-        measured_by="the pinhole, or frames at more distant depths",
-    ),
-    FitParameter(
-        "crosstalk_px",
-        "standard deviation of pixel crosstalk and vibration",
-        0.1,
-        0.3,
-        0.02,
-        3.0,
-        start=0.2,
-    ),
-    FitParameter(
-        "pixel_percent",
-        "true pixel pitch over the stated one, less 1",
-        0.3,
-        1.0,
-        -8.0,
-        8.0,
-        free=False,
-        effect="a wrong pixel pitch",
-        probe=1.0,
-        measured_by="the pixel pitch",
-    ),
-    FitParameter(
-        "log_gain",
-        "logarithm of the electrons through the aperture in a frame at the reference depth",
-        0.02,
-        measured_by="the power",
-    ),
-    FitParameter(
-        "background_e",
-        "background at the window's centre, in the longest exposure",
-        2.0,
-    ),
-    FitParameter(
-        "background_x_e", "background at the right edge less that at the centre", 2.0
-    ),
-    FitParameter(
-        "background_y_e", "background at the lower edge less that at the centre", 2.0
-    ),
+    *(FitParameter(**row) for row in _OF_BENCH["detection"]),
 )
-UNFITTED: tuple[UnfittedEffect, ...] = (
-    UnfittedEffect(
-        "stitching_nm",
-        "shift of each write field of the mask, four across the lens",
-        60.0,
-    ),
-    UnfittedEffect(
-        "camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0
-    ),
-    UnfittedEffect(
-        "window_px",
-        "window of a field angle off the chief ray there, each way, in addition to the common decentre",
-        0.3,
-    ),
-    UnfittedEffect(
-        "stop_um",
-        "aperture stop of the lens off its place in the design, each way",
-        3.0,
-    ),
-)
+UNFITTED = tuple(UnfittedEffect(**row) for row in _OF_BENCH["unfitted"])
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}
 _IN_PIXELS = (
