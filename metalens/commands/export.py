@@ -48,6 +48,6 @@ def run(options: Options) -> int:
     values = {
         "file": options.output.name,
         "bytes": options.output.stat().st_size,
-        "interpolation_error_rad": error,
+        "phase_error_rad": error,
     }
     return options.console.report(f"{options.output}", values)
