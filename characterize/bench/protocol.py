@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 
 from characterize.inference import (
+    REACH,
     FitImages,
     SearchTask,
     UnmodelledShifts,
     invert_information,
-    uncertainty,
     unmodelled_effects,
 )
 from characterize.model import (
@@ -25,14 +25,12 @@ from characterize.model import (
     KnownValue,
     parameter_vector,
     unfitted_sizes,
-    usual_parameters,
 )
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError, nearest_name_hint
 from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
-REACH = uncertainty.REACH
 # (depth, angle) pairs that a fit needs to be tested on frames left out
 _LEAST_PLACES = 4
 # defocus at the rim below which images count as in focus: there, even errors change
@@ -144,11 +142,25 @@ def plan_captures(
     Raises:
         FitError: as :class:`ForwardModel`.
     """
-    names, prior = _parameters(lens, protocol)
-    candidates, information = candidate_information(lens, protocol, response, names)
+    frames = candidate_frames(protocol)
+    task = _expected_fit(lens, protocol, response, frames)
+    names = task.names
+    prior = np.diag(task.prior.sigma**-2.0)
+    designed = task.at_start()
+    candidates = np.concatenate(
+        [frames * [1, 1, exposure] for exposure in protocol.exposures]
+    )
+    information = np.concatenate(
+        [
+            frame_information(designed.image, designed.slopes, exposure, protocol)
+            for exposure in protocol.exposures
+        ]
+    )
     place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
     chosen = choose_frames(information, prior, place, protocol, names)
-    unstated = _unstated_shifts(lens, protocol, response, candidates[chosen])
+    unstated = unmodelled_effects.expected_shifts(
+        _expected_fit(lens, protocol, response, candidates[chosen])
+    )
     wanted = [one for one in protocol.wanted if one.name in names]
     within = np.array([one.within for one in wanted])
     indices = [names.index(one.name) for one in wanted]
@@ -226,46 +238,34 @@ def _missed_interval(
     )
 
 
-def _bench_model(
+def _expected_fit(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
-) -> tuple[ForwardModel, Array]:
-    """Model of (n, 3) frames, and its parameters: the known ones, with the light of
-    ``peak_e`` in the brightest pixel at exposure 1.
-    """
-    angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
-    side = protocol.pixels
-    setting = FrameSetting(
-        frames[:, 0], angles, frames[:, 2], protocol.pixel_um, side, side
-    )
-    model = ForwardModel(lens, setting, response)
-    x = parameter_vector({k.name: k.value for k in protocol.known if k.name in PLACE})
-    brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
-    x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
-    return model, x
-
-
-def _unstated_shifts(
-    lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
-) -> UnmodelledShifts:
-    """Expected shifts of the parameters by causes outside the model, for a fit of
-    frames of peak ``peak_e``.
+) -> SearchTask:
+    """Fit of frames that were not taken yet: those of the lens as designed, with the
+    light of ``peak_e`` in the brightest pixel at exposure 1.
 
     Args:
         frames: (n, 3) depth in um, angle in degrees, relative exposure.
     """
+    depth_um, angle_deg, exposure = frames.T
+    angles = np.stack([np.radians(angle_deg), np.zeros(len(frames))], 1)
+    side = protocol.pixels
+    setting = FrameSetting(depth_um, angles, exposure, protocol.pixel_um, side, side)
+    model = ForwardModel(lens, setting, response)
     known = {value.name: value for value in protocol.known}
-    model, x = _bench_model(lens, protocol, response, frames)
+    sizes = unfitted_sizes(known, lens)
+    x = parameter_vector({name: stated.value for name, stated in known.items()})
+    light = model.images(x)[0]
+    brightness = protocol.peak_e / (light / exposure[:, None, None]).max()
+    x[PLACE["log_gain"]] = math.log(brightness)
     image = model.images(x)[0]
-    saturated = image >= protocol.full_well_e
     ones = np.ones_like(image)
+    saturated = image >= protocol.full_well_e
     data = FitImages(image, ones > 0, saturated, ones * protocol.read_noise_e**2, ones)
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
-    sizes = unfitted_sizes(known, lens)
-    return unmodelled_effects.expected_shifts(
-        SearchTask(model, data, x, known, free, sizes)
-    )
+    return SearchTask(model, data, x, known, free, sizes)
 
 
 def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> list[str]:
@@ -296,42 +296,37 @@ def _focus_warnings(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> li
     ]
 
 
-def candidate_information(
-    lens: Lens, protocol: BenchProtocol, response: Sensitivity, names: tuple[str, ...]
-) -> tuple[Array, Array]:
-    """((c, 3) depth in um, angle in degrees, exposure; (c, p, p) Fisher information) of
-    every candidate frame.
-
-    Information: sum over unsaturated pixels of t² dI/dp dI/dq / (t I + read noise²),
-    with image I in electrons at exposure 1 and relative exposure t.
+def candidate_frames(protocol: BenchProtocol) -> Array:
+    """(c, 3) depth in um, angle in degrees and exposure 1 of the frames that the bench
+    can take, depths even in 1/z.
 
     Args:
-        lens: the design.
         protocol: what the bench can do.
-        response: what height, index and sidewall do to the pillars.
-        names: of the parameters.
     """
     nearest, farthest = protocol.depths_um
     depths = 1 / np.linspace(1 / nearest, 1 / farthest, protocol.depth_count)
-    pairs = [(depth, angle, 1.0) for angle in protocol.angles_deg for depth in depths]
-    frames = np.array(pairs)
-    model, x = _bench_model(lens, protocol, response, frames)
-    images, slopes = model.images(x, names)
-    if slopes is None:
-        raise FitError("the model gave no derivatives")
-    rows, information = [], []
-    for exposure in protocol.exposures:
-        light = np.maximum(images * exposure, 0)
-        weight = (
-            (light < protocol.full_well_e)
-            / (light + protocol.read_noise_e**2)
-            * exposure**2
-        )
-        information.append(
-            np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True)
-        )
-        rows.append(frames * [1, 1, exposure])
-    return np.concatenate(rows), np.concatenate(information)
+    angle, depth = np.meshgrid(protocol.angles_deg, depths, indexing="ij")
+    return np.stack([depth.ravel(), angle.ravel(), np.ones(depth.size)], 1)
+
+
+def frame_information(
+    images: Array, slopes: Array, exposure: float, protocol: BenchProtocol
+) -> Array:
+    """(n, p, p) Fisher information of every frame at a relative exposure t: sum over
+    unsaturated pixels of t² dI/dp dI/dq / (t I + read noise²).
+
+    Args:
+        images: (n, y, x) light I at exposure 1, electrons.
+        slopes: (p, n, y, x) derivatives of ``images``.
+        exposure: relative exposure t.
+        protocol: full well and read noise of the sensor.
+    """
+    light = np.maximum(images * exposure, 0)
+    variance_e2 = light + protocol.read_noise_e**2
+    weight = (light < protocol.full_well_e) / variance_e2 * exposure**2
+    return np.asarray(
+        np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True)
+    )
 
 
 def choose_frames(
@@ -393,20 +388,3 @@ def design_criterion(
         if criterion == "D"
         else len(values) / (1 / values).sum()
     )
-
-
-def _parameters(lens: Lens, protocol: BenchProtocol) -> tuple[tuple[str, ...], Array]:
-    """Names of the fitted parameters, and their (p, p) prior information,
-    diag(sigma^-2).
-    """
-    known = {k.name: k for k in protocol.known}
-    exact = {k.name for k in protocol.known if k.sigma == 0}
-    fitted = (
-        {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)
-    )  # NAMES has no unfitted ones
-    names = tuple(name for name in NAMES if name in fitted - exact)
-    sigma = [
-        known[row.name].sigma if row.name in known else row.sigma
-        for row in usual_parameters(names, lens)
-    ]
-    return names, np.diag([value**-2.0 for value in sigma])

@@ -7,8 +7,9 @@ from scipy import fft
 
 from metalens.core.arrays import Array
 
-TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
-MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
+_QUARTERS = ("turned by 90°", "turned by 180°", "turned by 270°")
+TURNS = ("as they are", *_QUARTERS)
+MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in _QUARTERS))
 
 
 def orient_frames(frames: Array, orientation: int) -> Array:

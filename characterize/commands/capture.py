@@ -14,6 +14,7 @@ from characterize.bench import (
     protocol,
 )
 from characterize.commands.capture_options import Options
+from characterize.inference import REACH
 from characterize.model import log_response_slopes
 from metalens import lens as lenses
 from metalens.core import config, store
@@ -76,8 +77,8 @@ def _plan(options: Options, path: Path) -> int:
     for name, sigma, unstated in zip(
         plan.names, plan.sigma, plan.unstated_sigma, strict=True
     ):
-        total = protocol.REACH * np.hypot(sigma, unstated)
-        lines.append(f"  {name:<24} +- {total:<8.2g} {protocol.REACH * sigma:.2g}")
+        total = REACH * np.hypot(sigma, unstated)
+        lines.append(f"  {name:<24} +- {total:<8.2g} {REACH * sigma:.2g}")
     lines += [f"  note: {words}" for words in plan.warnings]
     options.console.result(values, "\n".join(lines))
     return 0

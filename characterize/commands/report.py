@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.inference import AsBuilt, identifiability, invert_information
+from characterize.inference import REACH, AsBuilt, identifiability, invert_information
 from characterize.model import PARAMETERS, PLACE
 from characterize.pupil import PupilFit
 from metalens.core import report, store
@@ -247,7 +247,7 @@ def _intervals(result: AsBuilt) -> bytes:
     information = np.diag(
         invert_information(result.within_covariance) - result.information
     )[fitted]
-    half_prior = np.minimum(np.maximum(information, 1e-12) ** -0.5 / unit, 1e3) * 1.96
+    half_prior = np.minimum(np.maximum(information, 1e-12) ** -0.5 / unit, 1e3) * REACH
     figure, axis = report.make_figure(size=(7, 0.22 * len(names) + 0.8))
     rows = np.arange(len(names))[::-1]
     axis.barh(rows, 2 * half_prior, left=-half_prior, color="#e4e4e4")

@@ -1,11 +1,11 @@
 from . import asbuilt as asbuilt
 from . import identifiability as identifiability
 from . import leastsquares as leastsquares
-from . import uncertainty as uncertainty
 from . import unmodelled_effects as unmodelled_effects
 from .asbuilt import AsBuilt as AsBuilt
 from .estimate import FitOptions as FitOptions
 from .estimate import fit as fit
+from .leastsquares import REACH as REACH
 from .leastsquares import FitImages as FitImages
 from .leastsquares import FitProblem as FitProblem
 from .leastsquares import FitSolution as FitSolution

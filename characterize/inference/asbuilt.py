@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from characterize.inference.leastsquares import gaussian_draws
+from characterize.inference.leastsquares import REACH, gaussian_draws
 from characterize.model import (
     PLACE,
     as_built,
@@ -25,12 +25,11 @@ from metalens.lens import DiameterMap, Lens
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class WithinModel:
-    """Statistical (conditional) covariance, intervals and draws: all that is not fitted
-    is as stated; empty where not computed.
+class PosteriorMoments:
+    """Covariance, intervals and draws of the fitted parameters; empty where not
+    computed.
 
-    covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by
-    profile over all modes.
+    covariance: (p, p). low, high: (p,) 95 % intervals by profile over all modes.
     draws: (m, p) of the posterior where it is no parabola.
     """
 
@@ -38,6 +37,25 @@ class WithinModel:
     low: Array = field(default_factory=lambda: np.empty(0))
     high: Array = field(default_factory=lambda: np.empty(0))
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def interval(self, i: int, value: float) -> tuple[float, float]:
+        """95 % interval of parameter ``i``: that of its profile if there is one, else
+        ``value`` +- 1.96 sigma.
+        """
+        if len(self.low):
+            return float(self.low[i]), float(self.high[i])
+        reach = REACH * math.sqrt(float(self.covariance[i, i]))
+        return value - reach, value + reach
+
+    def samples(self, rng: np.random.Generator, count: int, value: Array) -> Array:
+        """(count, p) draws: ``draws`` in random order, repeated as needed, else Gaussian
+        about ``value`` (p,).
+        """
+        if not len(self.draws):
+            return np.asarray(value + gaussian_draws(rng, count, self.covariance))
+        repeats = math.ceil(count / len(self.draws))
+        order = [rng.permutation(len(self.draws)) for _ in range(repeats)]
+        return np.asarray(self.draws[np.concatenate(order)[:count]])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,7 +70,7 @@ class AsBuilt:
     design: the lens as designed. response: what height, index and sidewall do to its
     pillars.
     names, value, covariance: of the fitted parameters, with priors and unstated effects.
-    held: {name: value} of parameters that were not fitted.
+    fixed: {name: value} of parameters that were not fitted.
     information: Fisher information of the frames alone.
     depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the
     sensor.
@@ -66,7 +84,8 @@ class AsBuilt:
     trusted: every check passed; problems: those that did not.
     low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no
     parabola.
-    within: the same within the model, narrower.
+    within: statistical (conditional) covariance, intervals and draws: all that is not
+    fitted is as stated; empty where not computed.
     verdicts: how well the PSF is known, and how well the process, in words.
     causes, by_cause: effects that nobody stated: names (c,), (c, p) standard deviation
     of the shift of every parameter by each. bench: (p, p) second moment of the shifts
@@ -81,7 +100,7 @@ class AsBuilt:
     value: Array
     covariance: Array
     information: Array
-    held: dict[str, float]
+    fixed: dict[str, float]
     depth_um: Array
     angle_rad: Array
     pixel_um: float
@@ -103,7 +122,7 @@ class AsBuilt:
     causes: tuple[str, ...] = ()
     by_cause: Array = field(default_factory=lambda: np.empty((0, 0)))
     bench: Array = field(default_factory=lambda: np.empty((0, 0)))
-    within: WithinModel = field(default_factory=WithinModel)
+    within: PosteriorMoments = field(default_factory=PosteriorMoments)
     curves: dict[str, Array] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -118,11 +137,19 @@ class AsBuilt:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
+    def _total(self) -> PosteriorMoments:
+        """Total (marginal) covariance, intervals and draws."""
+        return PosteriorMoments(self.covariance, self.low, self.high, self.draws)
+
+    @property
+    def _statistical(self) -> PosteriorMoments:
+        """``within``; the total ones where it was not computed."""
+        return self.within if len(self.within.covariance) else self._total
+
+    @property
     def within_covariance(self) -> Array:
         """(p, p) statistical covariance; the total one where it was not computed."""
-        return (
-            self.within.covariance if len(self.within.covariance) else self.covariance
-        )
+        return self._statistical.covariance
 
     @property
     def correlation(self) -> Array:
@@ -136,21 +163,13 @@ class AsBuilt:
         Profile interval and the spread of shifts by unstated effects, in quadrature,
         about the value less their expected shift. It contains the statistical interval.
         """
-        return _ends(
-            self.names.index(name), self.value, self.covariance, self.low, self.high
-        )
+        i = self.names.index(name)
+        return self._total.interval(i, float(self.value[i]))
 
     def within_model(self, name: str) -> tuple[float, float]:
         """Statistical 95 % interval, if the model is complete; too narrow if it is not."""
-        if not len(self.within.covariance):
-            return self.interval(name)
-        return _ends(
-            self.names.index(name),
-            self.value,
-            self.within.covariance,
-            self.within.low,
-            self.within.high,
-        )
+        i = self.names.index(name)
+        return self._statistical.interval(i, float(self.value[i]))
 
     def most(self, name: str) -> tuple[str, ...]:
         """Unstated causes that widen the interval of a parameter, the largest first.
@@ -161,7 +180,8 @@ class AsBuilt:
         i = self.names.index(name)
         own = self.by_cause[:, i] if len(self.causes) else np.empty(0)
         low, high = self.within_model(name)
-        least = max(0.25 * (high - low) / 3.92, float(own.max(initial=0.0)) / 3)
+        sigma = (high - low) / (2 * REACH)
+        least = max(0.25 * sigma, float(own.max(initial=0.0)) / 3)
         return tuple(self.causes[k] for k in np.argsort(-own) if own[k] > least)
 
     def parameters(self, value: Array | None = None) -> Array:
@@ -169,7 +189,7 @@ class AsBuilt:
         ones, the best without it.
         """
         fitted = np.asarray(self.value if value is None else value, float).tolist()
-        return parameter_vector(self.held | dict(zip(self.names, fitted, strict=True)))
+        return parameter_vector(self.fixed | dict(zip(self.names, fitted, strict=True)))
 
     def samples(self, count: int, seed: int = 0) -> Array:
         """(count, p) draws of the fitted parameters from their posterior.
@@ -178,8 +198,7 @@ class AsBuilt:
         posterior is not Gaussian.
         """
         rng = np.random.default_rng(seed)
-        draws = _drawn(rng, count, self.value, self.covariance, self.draws)
-        return _bounded(self.names, self.design, draws)
+        return self._bounded(self._total.samples(rng, count, self.value))
 
     def lens_samples(self, count: int, seed: int = 0) -> Array:
         """(count, p) draws of what the lens does to light: for training and PSF errors.
@@ -191,10 +210,13 @@ class AsBuilt:
         if not len(self.within.covariance):
             return self.samples(count, seed)
         rng = np.random.default_rng(seed)
-        within = self.within
-        own = _drawn(rng, count, self.value, within.covariance, within.draws)
-        draws = own + gaussian_draws(rng, count, self.bench)
-        return _bounded(self.names, self.design, draws)
+        own = self.within.samples(rng, count, self.value)
+        return self._bounded(own + gaussian_draws(rng, count, self.bench))
+
+    def _bounded(self, draws: Array) -> Array:
+        """Draws (count, p) clipped to the bounds of the parameters."""
+        rows = usual_parameters(self.names, self.design)
+        return np.clip(draws, [row.low for row in rows], [row.high for row in rows])
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of
@@ -289,30 +311,3 @@ class AsBuilt:
             StoreError: not an as-built file.
         """
         return store.load_record(path, "asbuilt", AsBuilt)
-
-
-def _ends(
-    i: int, value: Array, covariance: Array, low: Array, high: Array
-) -> tuple[float, float]:
-    """Ends of a 95 % interval: of a profile if there is one, else value +- 1.96 sigma."""
-    if len(low):
-        return float(low[i]), float(high[i])
-    reach = 1.959964 * math.sqrt(float(covariance[i, i]))
-    return float(value[i]) - reach, float(value[i]) + reach
-
-
-def _drawn(
-    rng: np.random.Generator, count: int, value: Array, covariance: Array, draws: Array
-) -> Array:
-    """(count, p) draws: of ``draws`` in random order, repeated as needed, else Gaussian."""
-    if not len(draws):
-        return np.asarray(value + gaussian_draws(rng, count, covariance))
-    order = [rng.permutation(len(draws)) for _ in range(-(-count // len(draws)))]
-    return np.asarray(draws[np.concatenate(order)[:count]])
-
-
-def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
-    rows = usual_parameters(names, lens)
-    return np.asarray(
-        np.clip(draws, [row.low for row in rows], [row.high for row in rows])
-    )

@@ -17,9 +17,9 @@ from characterize.inference import (
     unmodelled_effects,
     verdict,
 )
-from characterize.inference.asbuilt import AsBuilt, WithinModel
+from characterize.inference.asbuilt import AsBuilt, PosteriorMoments
 from characterize.inference.frame_alignment import arrangement_text, find_arrangement
-from characterize.inference.leastsquares import FitSolution, gaussian_draws
+from characterize.inference.leastsquares import REACH, FitSolution, gaussian_draws
 from characterize.inference.multistart import SearchTask, with_values
 from characterize.inference.prepare import (
     check_depths,
@@ -271,12 +271,12 @@ def _result(
     findings = [*_findings(task, solution, tests), *doubts]
     # about the joint optimum, never within the statistical interval
     centre = value - unstated.mean
-    more = uncertainty.REACH * unstated.sigma
+    more = REACH * unstated.sigma
     low = np.minimum(centre - np.hypot(value - posterior.low, more), posterior.low)
     high = np.maximum(centre + np.hypot(posterior.high - value, more), posterior.high)
     # second moment about the value
     spread = unstated.covariance + np.outer(unstated.mean, unstated.mean)
-    prior_share = (posterior.high - posterior.low) / (2 * uncertainty.REACH)
+    prior_share = (posterior.high - posterior.low) / (2 * REACH)
     cautions = [*cautions, *(finding.words for finding in findings)]
     return AsBuilt(
         design=model.lens,
@@ -285,7 +285,7 @@ def _result(
         value=value,
         covariance=posterior.covariance + spread,
         information=solution.information,
-        held={
+        fixed={
             name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted
         },
         depth_um=model.setting.depth_um,
@@ -318,7 +318,7 @@ def _result(
         low=low,
         high=high,
         draws=_drawn(task, posterior.draws, spread),
-        within=WithinModel(
+        within=PosteriorMoments(
             posterior.covariance, posterior.low, posterior.high, posterior.draws
         ),
         curves={

@@ -51,7 +51,7 @@ class FrameArrangement:
     stage zero.
     order: (n,) frame that fits the i-th stated depth best, where it clearly differs
     from the stated one.
-    order_seen: whether the nominal images differ enough with depth to tell.
+    order_is_observable: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames beyond doubt; 0: as stated.
     equivalent: turns (1 to 7) that cannot be distinguished from the chosen one: under
     them the nominal images do not change, or are nearly as similar to the frames.
@@ -62,7 +62,7 @@ class FrameArrangement:
     middle_um: tuple[float, float]
     correlation: float
     order: Array | None
-    order_seen: bool
+    order_is_observable: bool
     orientation: int
     equivalent: tuple[int, ...]
 
@@ -222,7 +222,7 @@ def _arrange(frames: _Frames, x: Array, correlation: float) -> FrameArrangement:
     """
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
-    order, order_seen = _order(light, expected, noise, frames.model)
+    order, order_is_observable = _order(light, expected, noise, frames.model)
     score = _scores(frames.spectra(), expected)
     chosen = _plainest_turn(score)
     if order is not None and chosen:
@@ -252,7 +252,7 @@ def _arrange(frames: _Frames, x: Array, correlation: float) -> FrameArrangement:
         ),
         correlation=correlation,
         order=order,
-        order_seen=order_seen,
+        order_is_observable=order_is_observable,
         orientation=chosen,
         equivalent=tuple(sorted((near | symmetric) - {0})),
     )
@@ -353,7 +353,7 @@ def arrangement_text(arrangement: FrameArrangement) -> list[str]:
             f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
             "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
         )
-    if not arrangement.order_seen:
+    if not arrangement.order_is_observable:
         words.append(
             "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
         )

@@ -19,6 +19,7 @@ _LEAST_UPDATE = 0.03
 # relative error of the predicted change of the images above which the Jacobian is
 # computed anew
 _RENEWED_ABOVE = 0.6
+REACH = 1.959964  # sigma of a 95 % interval
 HUBER = 6.0  # sigma beyond which a residual counts linearly
 _NODES, _WEIGHTS = special.roots_jacobi(4, 1.0, 0.0)
 _JACOBI = (_NODES + 1) / 2, _WEIGHTS / 4  # of (1 - s) f(s) over s from 0 to 1
@@ -128,6 +129,11 @@ class SolverSettings:
     step_tolerance: float = 0.02
     near: float = 0.3
     finish: bool = True
+
+    @classmethod
+    def short(cls, iterations: int, step_tolerance: float) -> "SolverSettings":
+        """Of a fit whose Jacobian is exact at its start alone."""
+        return cls(iterations, step_tolerance, near=math.inf, finish=False)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -397,6 +403,22 @@ def pixel_weights(data: FitImages, image: Array) -> tuple[Array, Array, Array]:
     weight = np.minimum(1.0, HUBER / np.maximum(size, HUBER))
     silent = ~data.usable | (data.saturated & (residual == 0))
     return noise, residual, np.where(silent, 0.0, weight)
+
+
+def shared_error_scatter(changes: Array, shared: Array) -> Array:
+    """(k, k) scatter of sums over all pixels of ``changes`` times errors that all
+    frames share, less what the noise of the single frames already contains of it.
+
+    Args:
+        changes: (k, n, y, x) over the noise.
+        shared: (2, n, y, x) errors of dark and of flat (:meth:`FitImages.shared`), over
+            the noise.
+    """
+    dark, flat = (
+        (changes * error).sum(1).reshape(len(changes), -1) for error in shared
+    )
+    counted = (changes * shared[0]).reshape(len(changes), -1)
+    return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
 
 def invert_information(matrix: Array) -> Array:

@@ -38,7 +38,7 @@ _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
 _MOST, _AGAIN = 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
 _PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of the prior
-_TRIAL = SolverSettings(iterations=6, step_tolerance=0.5, near=math.inf, finish=False)
+_TRIAL = SolverSettings.short(iterations=6, step_tolerance=0.5)
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 _WORTH = 10.0
 
@@ -75,6 +75,11 @@ class SearchTask:
         if frames is not None:
             model, data = model.only(frames), data.planes(frames)
         return FitProblem(named_images(model, self.names, self.start), data, self.prior)
+
+    def at_start(self) -> FitSolution:
+        """Images, slopes and covariance at the start, without a step."""
+        start = self.start[[PLACE[name] for name in self.names]]
+        return self.posed().fit(start, SolverSettings(iterations=0))
 
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
@@ -362,11 +367,8 @@ def short_fit(task: SearchTask, few: Array, begin: Array) -> FitSolution:
         waves, np.minimum(problem.prior.sigma, WAVES_RAD / 2), problem.prior.sigma
     )
     prior = dataclasses.replace(problem.prior, sigma=sigma)
-    short = SolverSettings(
-        iterations=4, step_tolerance=1.0, near=math.inf, finish=False
-    )
     return dataclasses.replace(problem, prior=prior).fit(
-        opened_start(task, begin), short
+        opened_start(task, begin), SolverSettings.short(4, 1.0)
     )
 
 

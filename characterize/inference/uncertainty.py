@@ -10,17 +10,18 @@ from scipy import special, stats
 
 from characterize.captures import SensorNoise
 from characterize.inference.leastsquares import (
+    REACH,
     FitProblem,
     FitSolution,
     SolverSettings,
     gaussian_draws,
     pixel_weights,
+    shared_error_scatter,
 )
 from characterize.inference.multistart import SearchTask, distinct_modes, refine_fit
 from metalens.core import threads
 from metalens.core.arrays import Array
 
-REACH = 1.959964  # sigma of a 95 % interval
 DRAWS = 96
 _PARABOLIC = 0.85, 1.18  # end of an interval over that of the parabola
 # places of a profile on each side, in units of the parabola's interval
@@ -28,9 +29,7 @@ _PLACES = (0.5, 1.0, 2.0, 4.0)
 _LOWER = 0.5  # fall of -2 ln posterior below the mode that counts as a better mode
 _RESTARTS = 2
 _OF_THE_BENCH = ("log_gain", "background")
-_PROFILE_FIT = SolverSettings(
-    iterations=6, step_tolerance=0.3, near=math.inf, finish=False
-)
+_PROFILE_FIT = SolverSettings.short(iterations=6, step_tolerance=0.3)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -202,12 +201,8 @@ def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
     """
     noise, _, weight = pixel_weights(problem.data, mode.image)
     root = np.sqrt(weight) / noise
-    slopes = mode.slopes * root
-    p = len(mode.value)
-    dark, light = problem.data.shared(mode.image) * root
-    flat, floor = ((slopes * c).sum(1).reshape(p, -1) for c in (light, dark))
-    counted = (slopes * dark).reshape(p, -1)
-    spread = flat @ flat.T + floor @ floor.T - counted @ counted.T
+    shared = problem.data.shared(mode.image) * root
+    spread = shared_error_scatter(mode.slopes * root, shared)
     return np.asarray(mode.covariance @ spread @ mode.covariance)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from characterize.captures import shift_frames
-from characterize.inference.leastsquares import FitSolution, SolverSettings
+from characterize.inference.leastsquares import FitSolution, shared_error_scatter
 from characterize.inference.multistart import SearchTask
 from characterize.model import LIGHT, PARAMETERS, PLACE, background_planes, type_b_sigma
 from metalens.core.arrays import Array
@@ -223,20 +223,11 @@ class FitAtMode:
         )
 
     def shared_scatter(self, left: Array) -> Array:
-        """(k, k) additional scatter of scores by errors that all frames share.
-
-        Errors of dark and of flat; less what of the dark is in the noise already.
-
-        Args:
-            left: (k, pixels) changes that the fit does not take up.
+        """(k, k) additional scatter of the scores of ``left`` (k, pixels) by errors
+        that all frames share (:func:`leastsquares.shared_error_scatter`).
         """
-        shape = self.shared.shape[1:]
-        dark, flat = (
-            (left.reshape(-1, *shape) * error).sum(1).reshape(len(left), -1)
-            for error in self.shared
-        )
-        counted = left * self.shared[0].ravel()
-        return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
+        changes = left.reshape(-1, *self.shared.shape[1:])
+        return shared_error_scatter(changes, self.shared)
 
 
 def run_score_tests(
@@ -286,9 +277,7 @@ def expected_shifts(task: SearchTask) -> UnmodelledShifts:
 
     At the task's start, with residuals of 0.
     """
-    start = task.start[[PLACE[name] for name in task.names]]
-    mode = task.posed().fit(start, SolverSettings(iterations=0))
-    return run_score_tests(task, mode)[1]
+    return run_score_tests(task, task.at_start())[1]
 
 
 def effects_to_fit(

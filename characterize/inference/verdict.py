@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from characterize.captures import SensorNoise
-from characterize.inference.leastsquares import FitSolution, GaussianPrior
+from characterize.inference.leastsquares import REACH, FitSolution, GaussianPrior
 from characterize.inference.multistart import WAVES_RAD, SearchTask
 from characterize.inference.uncertainty import FitPosterior
 from characterize.inference.unmodelled_effects import ResidualFinding
@@ -237,7 +237,7 @@ def process_verdict(
     """
     known, loosely, prior = list[str](), list[str](), list[str]()
     for row, a, b, share in zip(rows, low, high, prior_share, strict=True):
-        sigma = (b - a) / 3.92
+        sigma = (b - a) / (2 * REACH)
         if not (row.name.endswith(("_nm", "_rad", "_deg")) or row.name == "index"):
             continue
         if share > 0.7:
