@@ -103,14 +103,11 @@ def _of_one_size(
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
-    # linear interpolation in an even table of t over the diameters
-    place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
-    diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
+    diameter = np.linspace(low, high, _TABLE)
     t = perturbed_transmission(
         lens.proxy, response, diameter, wave, response_amounts, angle_rad=angle_rad
     )
-    below = place.astype(np.int32)
-    t = t[below] + (place - below) * np.diff(t)[below]
+    t = np.interp(grown, diameter, t)
     return np.asarray(t * bias_ratio(response, np.nan_to_num(grown, nan=low), bias_um))
 
 

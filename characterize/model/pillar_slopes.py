@@ -10,7 +10,7 @@ from pathlib import Path
 import joblib
 import numpy as np
 import scipy
-from numpy.polynomial import chebyshev
+from numpy.polynomial import polynomial
 
 import metalens
 from characterize.model import solving
@@ -143,11 +143,9 @@ def _solve_round(lens: Lens, extra: tuple[str, ...]) -> Sensitivity:
         asked = [row.name in extra for row, _ in response_errors()]
         rows = rows * np.array(asked)[:, None]
     degree, error = _degree(unit, rows)
-    fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
-    padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
-    error += rates.error
-    return Sensitivity(np.array(padded) * scale, center, error, low, high, table)
+    series = polynomial.polyfit(unit, rows.T, degree).T * scale
+    return Sensitivity(series, center, error + rates.error, low, high, table)
 
 
 def _degree(unit: Array, rows: Array) -> tuple[int, float]:
@@ -163,11 +161,9 @@ def _degree(unit: Array, rows: Array) -> tuple[int, float]:
     )
     errors = []
     for degree in range(1, _MOST + 1):
-        fits = [
-            chebyshev.chebfit(unit[~held_out], row[~held_out], degree) for row in rows
-        ]
-        predictions = [chebyshev.chebval(unit[held_out], fit) for fit in fits]
-        difference = np.abs(np.array(predictions) - rows[:, held_out]).max(1)
+        series = polynomial.polyfit(unit[~held_out], rows[:, ~held_out].T, degree)
+        predictions = polynomial.polyval(unit[held_out], series)
+        difference = np.abs(predictions - rows[:, held_out]).max(1)
         errors.append(float((difference / size).max()))
         if errors[-1] <= _TOLERANCE:
             break

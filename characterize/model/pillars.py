@@ -15,6 +15,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import (
     PairTable,
+    Perturbation,
     PillarKinds,
     RelativeResponse,
     ResponseError,
@@ -34,7 +35,7 @@ from metalens.library import Proxy
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
 _TOLERANCE = 3e-5  # rms error of t in the basis
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
-_ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
+_ROOM = 1.07  # by which tables of pillars reach beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(ResponseError)]
 
 
@@ -69,14 +70,22 @@ class ChangeRange:
         more = wavelength_scale(lens.wavelength_um)
         absent = inapplicable_names(lens.cell)
         response_amounts = tuple(
-            _ROOM
-            * max(-row.low, row.high)
-            * row.unit
-            * prior_scale(row.name, lens.wavelength_um)
-            * (row.name not in absent)
+            largest_amount(row, lens.wavelength_um) * (row.name not in absent)
             for row in _ROWS
         )
         return cls(0.03 * more, response_amounts, 0.006 * more)
+
+
+def largest_amount(row: Perturbation, wavelength_um: float) -> float:
+    """Largest amount of a pillar-response error that tables hold, in its base unit: the
+    bounds of the fit and some room.
+
+    Args:
+        row: of the error.
+        wavelength_um: of the design.
+    """
+    bound = max(-row.low, row.high) * prior_scale(row.name, wavelength_um)
+    return _ROOM * row.unit * bound
 
 
 class PillarResponse:
@@ -228,12 +237,9 @@ class PillarResponse:
         """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, in its
         precision.
         """
-        x = np.asarray(bias_um) / self.span.bias_um
-        value = np.empty((len(self.nodes_um), *x.shape), x.dtype)
-        value[0], value[1] = 1.0, x
-        for n in range(2, len(value)):
-            value[n] = 2 * x * value[n - 1] - value[n - 2]
-        return value
+        x = bias_um / self.span.bias_um
+        values = chebyshev.chebvander(x, len(self.nodes_um) - 1)
+        return np.moveaxis(values, -1, 0).reshape(-1, *x.shape)
 
     def _training(self) -> list[PillarChange]:
         """Changes that the basis is computed from: none, each extreme, random ones."""

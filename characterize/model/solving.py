@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.polynomial import polynomial
 
+from characterize.model.pillars import largest_amount
 from metalens import modal
 from metalens.cell import Cell, Incidence
 from metalens.core import threads
@@ -18,7 +19,6 @@ from metalens.fabrication import (
     SolvedResponse,
     changed_pillar,
     designed_transmission,
-    prior_scale,
     response_errors,
     wavelength_scale,
 )
@@ -33,7 +33,6 @@ TOLERANCE = 3e-3  # of t
 _SAME, _JUDGED = 0.05, 7
 _FINE_UM = 5e-4  # step of the sampled diameters, for 0.85 um and shorter waves
 _FIT_SHARE = 0.4  # share of the tolerance for the rational functions
-_ROOM = 1.07  # largest amounts over the bounds of a fit
 _AMOUNTS = {
     "height_um": (-1.0, -0.5, 0.0, 0.5, 1.0),
     "n": (-1.0, -0.67, -0.33, 0.0, 0.33, 0.67, 1.0),
@@ -132,7 +131,7 @@ def _changes(wavelength_um: float) -> list[_Change]:
     out = []
     for n, (row, acts) in enumerate(response_errors()):
         if acts.exact:
-            most = _ROOM * row.high * row.unit * prior_scale(row.name, wavelength_um)
+            most = largest_amount(row, wavelength_um)
             out.append((n, acts, tuple(most * part for part in _AMOUNTS[acts.exact])))
     return out
 
