@@ -93,7 +93,7 @@ def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
         value=np.array([TRUE[n] for n in names]),
         covariance=covariance,
         information=np.linalg.inv(covariance),
-        held={},
+        fixed={},
         depth_um=np.array([3000.0]),
         angle_rad=np.zeros((1, 2)),
         pixel_um=3.0,

@@ -75,7 +75,7 @@ def _asbuilt():
     return AsBuilt(
         design=_lens(), response=RESPONSE, names=("bias_nm", "height_nm"), value=one,
         covariance=np.eye(2), information=np.eye(2),
-        held={"index": 0.0}, depth_um=one, angle_rad=np.zeros((2, 2)), pixel_um=3.0, measured=frames, predicted=frames,
+        fixed={"index": 0.0}, depth_um=one, angle_rad=np.zeros((2, 2)), pixel_um=3.0, measured=frames, predicted=frames,
         nominal=frames, residual_sigma=frames, chi2_per_dof=1.0, converged=True, reason="made up",
     )  # fmt: skip
 
