@@ -74,27 +74,6 @@ def test_an_offset_that_weighs_as_light_costs_the_trust():
     assert any("far below 1" in words for words in built.problems)
 
 
-def test_mirrored_frames_have_the_opposite_decentre():
-    """The axis lies at (n - 1) / 2: 16 pixels have no middle one. Both fits see the
-    same noise, so that only the search differs: a tenth of a standard error, 0.03 um.
-    """
-    capture = seen(4)
-
-    def mirrored(frames):
-        return frames[..., ::-1].copy()
-
-    turned = dataclasses.replace(
-        capture,
-        frames=mirrored(capture.frames),
-        dark=mirrored(capture.dark),
-        flat=mirrored(capture.flat),
-    )
-    plain, other = fitted(capture), fitted(turned)
-    for name, sign in (("decentre_x_um", -1), ("decentre_y_um", 1)):
-        i = plain.names.index(name)
-        assert other.value[i] == pytest.approx(sign * plain.value[i], abs=0.06), name
-
-
 def test_a_frame_with_full_wells_is_neither_brighter_nor_darker():
     """Wells of 2500 e under a peak of 6000."""
     built = fitted(seen(0, {"full_well_e": 2500.0}), insist=True)

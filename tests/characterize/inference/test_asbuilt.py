@@ -46,9 +46,10 @@ def model():
     return ForwardModel(b.lens(), SETTING, b.RESPONSE)
 
 
-def fit_usual():
+def fit_usual(shots=None):
     known = dataclasses.replace(b.RESPONSE, error=0.08)
-    return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=known)
+    shots = shots or b.capture(b.electrons())
+    return characterize.fit(shots, b.lens(), USUAL, response=known)
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +206,18 @@ def test_hidden_lens_is_found_within_its_intervals(fitted):
     ]
     assert np.abs(z).max() < 4
     assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_mirrored_frames_have_the_opposite_decentre(fitted):
+    """The axis lies at (n - 1) / 2: 16 pixels have no middle one. Both fits see the
+    same noise, so that only the search differs: a tenth of a standard error, 0.03 um.
+    """
+    plain = b.capture(b.electrons())
+    mirrored = dataclasses.replace(plain, frames=plain.frames[..., ::-1].copy())
+    other = fit_usual(mirrored)
+    for name, sign in (("decentre_x_um", -1), ("decentre_y_um", 1)):
+        i = fitted.names.index(name)
+        assert other.value[i] == pytest.approx(sign * fitted.value[i], abs=0.06), name
 
 
 def test_predicted_frames_are_nearer_the_truth_than_the_noise(fitted):

@@ -43,7 +43,7 @@ def rates(width_um, length_um):
     )
 
 
-def two_sizes(n=141):
+def two_sizes(n=71):
     """Light along x has its focus 150 um behind, light along y 170 um; every pair is of
     the table.
     """

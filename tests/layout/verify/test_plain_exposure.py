@@ -49,7 +49,7 @@ def of_two_sizes(made, low, high):
 @pytest.mark.parametrize(
     ("beam", "source"),
     [
-        ({"alpha_um": 0.041, "beta_um": 3.1, "eta": 0.8}, (41, 0.4, 0.11, 0.29, 1.0)),
+        ({"alpha_um": 0.041, "beta_um": 3.1, "eta": 0.8}, (29, 0.4, 0.11, 0.29, 1.0)),
         (
             {
                 "alpha_um": 0.013,
@@ -58,7 +58,7 @@ def of_two_sizes(made, low, high):
                 "gamma_um": 1.2,
                 "nu": 0.12,
             },
-            (37, 0.35, 0.09, 0.24, 0.6),
+            (29, 0.35, 0.09, 0.24, 0.6),
         ),
     ],
 )

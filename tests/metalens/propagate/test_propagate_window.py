@@ -76,7 +76,7 @@ def check(phase, level, **arguments):
 
 @pytest.mark.parametrize("kind", ["focus", "noisy", "random", "helix"])
 @pytest.mark.parametrize("angle_rad", [0.0, (0.3, -0.2)])
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-6, 1e-9])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
 def test_every_lens_meets_the_tolerance_and_the_estimate_tells(
     kind, angle_rad, tolerance
 ):
@@ -115,8 +115,9 @@ def test_sensor_at_20_um_and_200_mm(distance, window):
     )
 
 
-@pytest.mark.parametrize("shape", [(95, 95), (96, 96), (95, 96)])
-@pytest.mark.parametrize("samples", [19, 20])
+@pytest.mark.parametrize(
+    ("shape", "samples"), [((95, 95), 20), ((96, 96), 19), ((95, 96), 20)]
+)
 def test_odd_and_even_grids(shape, samples):
     check(*lens(shape, kind="noisy"), samples=samples)
 

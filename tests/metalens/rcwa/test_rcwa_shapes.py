@@ -3,6 +3,7 @@ conservation laws.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -255,3 +256,16 @@ def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():
         off.append(abs(got.t - want * np.eye(2)).max())
     assert off[0] < 3e-3
     assert off[1] == pytest.approx(off[0] / 4, rel=0.2)
+
+
+def test_layers_tilt_on_their_own_and_keep_power():
+    about = {"pillar": Index(3.3), "substrate": Index(1.47), "sidewall_rad": -0.02}
+    whole = Cell(0.36, 0.6, **about)
+    layered = replace(whole, layers=(Layer(0.1), Layer(0.5)))
+    cut, one = (
+        rcwa.jones(cell, 0.2, 0.9, angle_rad=0.1, azimuth_rad=0.3, harmonics=2)
+        for cell in (layered, whole)
+    )
+    assert abs(cut.energy - 1).max() < 1e-9
+    # the same pillar in one piece: what the staircases leave
+    assert abs(cut.t - one.t).max() < 2e-4
