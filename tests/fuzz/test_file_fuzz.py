@@ -173,17 +173,3 @@ def test_a_missing_entry_is_named(tmp_path):
     store.save(tmp_path / "l.h5", "lens", {"other": np.ones(3)})
     with pytest.raises(store.StoreError, match="holds no"):
         lens.load(tmp_path / "l.h5")
-
-
-def test_another_version_is_named_with_what_to_do(tmp_path):
-    store.save(tmp_path / "l.h5", "lens", {"x": np.ones(3)}, version=99)
-    with pytest.raises(
-        store.StoreError, match="version 99, need 'lens' version 1; make it again"
-    ):
-        lens.load(tmp_path / "l.h5")
-
-
-def test_every_kind_that_is_fuzzed_is_the_kind_it_says(tmp_path):
-    for kind, (write, _) in KINDS.items():
-        write(tmp_path / "f.h5")
-        assert store.load(tmp_path / "f.h5").kind == kind

@@ -23,7 +23,7 @@ COMMANDS = {
     "psf": ("psf.h5", ("psf", "lens.h5", "--config", "psf.toml"), psf.load),
     "layout": (
         "mask",
-        ("layout", "lens.h5", "--process", "process.toml", "--gds"),
+        ("layout", "lens.h5", "--process", "process.toml", "--oasis", "--gds"),
         None,
     ),
 }

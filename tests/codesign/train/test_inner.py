@@ -101,20 +101,6 @@ def test_two_runs_from_one_seed_are_bit_identical(whole):
     assert _equal(one, two)
 
 
-@pytest.mark.parametrize("stop", [1, 4])
-def test_a_stopped_run_goes_on_bit_for_bit(whole, stop, tmp_path):
-    from codesign.train import checkpoint
-
-    one, lines = whole
-    first = _trainer(MOVING)
-    list(first.run(until=stop))
-    checkpoint.save_checkpoint(tmp_path / "c", first.state(), settings=MOVING)
-    second = _trainer(MOVING)
-    second.restore(checkpoint.load_checkpoint(tmp_path / "c", settings=MOVING))
-    assert list(second.run()) == lines[stop:]
-    assert _equal(one, second)
-
-
 def test_optics_and_pitch_move_only_inside_their_schedules():
     trainer = _trainer(MOVING)
     # it begins at its coarsest

@@ -1,7 +1,5 @@
 """``metalens info`` of a mask: its layers and shapes as another reader counts them."""
 
-import gzip
-
 import numpy as np
 import pytest
 
@@ -127,17 +125,3 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
     told = printed(capsys)
     assert told["layers"] == {"7/0": {"name": "", "shapes": 4}}
     assert sorted(told["tops"]) == ["ONE", "TWO"]
-
-
-@pytest.mark.parametrize("command", ["check", "info"])
-def test_a_compressed_mask_is_told_from_a_damaged_one(tmp_path, capsys, command):
-    """``.gds.gz`` as KLayout writes it: neither record nor checksum of it means
-    anything before it is unpacked.
-    """
-    path = tmp_path / "chip.gds.gz"
-    path.write_bytes(gzip.compress(bytes(range(256)) * 9))
-    assert call(command, f"{path}") == BAD_INPUT
-    assert (
-        "chip.gds.gz: a compressed file (gzip: unpack it), need"
-        in capsys.readouterr().err
-    )

@@ -14,7 +14,6 @@ from layout.drc.lattice import check_plan
 from layout.drc.report import DrcReport
 from layout.mask.plan import MaskPlan, PillarArray, PillarClass, pillar_classes
 from layout.process.process import DesignRules
-from layout.shapes import polygon
 from tests.referees.convex import convex_gap
 
 LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
@@ -159,25 +158,6 @@ def test_a_rule_as_wide_as_two_pitches_looks_at_second_neighbours():
     ).ok
 
 
-def test_off_grid_vertices_and_sites_are_found():
-    plan = plan_of([200], [[1]])
-    assert check_plan(plan, LOOSE).counts["off-grid"] == 0
-    coarse = plan.replace(grid=7)
-    assert check_plan(coarse, LOOSE).counts["off-grid"] == 2
-
-
-def test_density_is_the_share_of_the_window():
-    plan = plan_of([300], np.ones((60, 60)))
-    found = check_plan(
-        plan,
-        DesignRules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8),
-    )
-    share = polygon.twice_area(plan.classes[0].outline) / 2 / 400**2
-    assert found.maximum_density == pytest.approx(share, rel=1e-12)
-    assert found.counts["density"] > 0
-    assert check_plan(plan, DesignRules(minimum_feature_nm=1, maximum_density=0.45)).ok
-
-
 def test_structures_that_meet_are_found(make_plan):
     plan = make_plan()
     again = plan.lattices[0]
@@ -201,22 +181,3 @@ def test_summary_says_what_was_found():
             plan_of([200], np.full((50, 50), 1)), DesignRules(minimum_gap_nm=70)
         ).summary
     )
-
-
-@pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
-def test_a_gap_across_either_diagonal_is_found(corner):
-    """Two pillars 20 nm apart across one diagonal of the lattice, nothing else: sqrt 2
-    · 400 - 546 = 19.7 nm.
-    """
-    classes = np.zeros((4, 5), int)
-    row, column = 1, 2
-    classes[row + corner[0], column + corner[1]] = 1
-    classes[row + 1 - corner[0], column + 1 - corner[1]] = 1
-    found = check_plan(
-        plan_of([546], classes, vertices=32),
-        DesignRules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1),
-    )
-    assert found.counts["space"] == 1
-    assert found.minimum_space_nm == pytest.approx(
-        math.sqrt(2) * 400 - 546, abs=2.5
-    )  # grid, and vertices 0.3 nm out

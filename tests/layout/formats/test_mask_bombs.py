@@ -204,22 +204,6 @@ def test_the_number_of_shapes_is_the_product_of_the_arrays():
         content.refuse_beyond(9 * 8 * 7 * 3 - 1)
 
 
-def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
-    """Two polygons of a leaf on one layer, drawn five times and seven; a cell that
-    nothing places is drawn once.
-    """
-    content = gdsii_read.parse_gdsii(
-        np.frombuffer(
-            gdsii(
-                structure("TWO", LEAF, LEAF),
-                structure("TOP", array("TWO", 5, 1), array("TWO", 7, 1)),
-            ),
-            np.uint8,
-        )
-    )
-    assert content.count_shapes()[9, 3] == 2 * (5 + 7) + 1
-
-
 def test_shapes_on_each_other_are_refused_before_they_are_paired():
     data = gdsii(structure("TOP", array("A", 1000, 10, (0, 0))))
     with pytest.raises(MaskFileError, match=r"pairs of shapes.*lie on"):

@@ -108,26 +108,3 @@ def test_random_bytes_are_refused(tmp_path):
             )
             with pytest.raises(MaskFileError, match="byte"):
                 READ[suffix](path)
-
-
-def test_an_empty_file_is_refused(tmp_path):
-    (tmp_path / "e").write_bytes(b"")
-    for read in READ.values():
-        with pytest.raises(MaskFileError, match="byte 0: empty"):
-            read(tmp_path / "e")
-
-
-def test_a_bomb_of_zeros_is_refused(tmp_path):
-    from layout.formats import oasis_records as oasis
-
-    block = (
-        bytes([oasis.CBLOCK, 0])
-        + oasis.unsigned_integer(2**45)
-        + oasis.unsigned_integer(3)
-        + b"abc"
-    )
-    (tmp_path / "z.oas").write_bytes(
-        oasis.start_record(1.0) + block + oasis.end_record((0,) * 6, 0)
-    )
-    with pytest.raises(MaskFileError, match="compressed block of 3 bytes"):
-        layout.read_oasis(tmp_path / "z.oas")

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 import layout
 from layout.mask import cells, die, font
-from layout.mask.plan import PillarArray
 from layout.pec import psf
 from layout.process.process import (
     DesignRules,
@@ -105,20 +104,6 @@ def test_a_pitch_off_the_grid_is_refused():
         layout.plan(
             disc_map(pitch=0.402),
             Process(rules=DesignRules(grid_nm=5, diameter_step_nm=10)),
-        )
-
-
-def test_coordinates_beyond_32_bit_are_refused():
-    rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
-    with pytest.raises(ProcessError, match="32 bits"):
-        PillarArray(
-            "LENS",
-            rows,
-            2,
-            400,
-            -200,
-            200 * (rows - 1),
-            lambda a, b: np.zeros((b - a, 2), np.uint8),
         )
 
 

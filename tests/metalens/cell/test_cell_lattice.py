@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from metalens import materials
 from metalens.cell import Cell, Lattice, Layer
 from metalens.cell.orders import check_subwavelength, propagating_orders
 from metalens.cell.record import Index
@@ -22,7 +21,7 @@ from metalens.cell.shapes import (
     Square,
 )
 from metalens.core import config
-from metalens.core.errors import CellError, MaterialError
+from metalens.core.errors import CellError
 
 LATTICES = (
     Lattice(),
@@ -205,21 +204,6 @@ def test_the_pitch_named_for_light_aslant_in_azimuth_is_the_limit():
             )
         )
         == 3
-    )
-
-
-def test_silica_ends_where_its_source_does():
-    for wavelength_um in (0.2099, 3.7101):
-        with pytest.raises(MaterialError, match=r"from 0.21 to 3.71 um"):
-            materials.index("SiO2", wavelength_um)
-    # Malitson's table: 1.53836 at 0.21
-    assert materials.index("SiO2", 0.2101).real == pytest.approx(1.5383, abs=3e-4)
-
-
-def test_a_table_in_nanometres_is_that_in_micrometres(tmp_path):
-    (tmp_path / "nm.csv").write_text("wavelength_nm,n,k\n800,3.5,0.1\n900,3.3,0\n")
-    assert materials.index(str(tmp_path / "nm.csv"), 0.825) == pytest.approx(
-        3.45 + 0.075j, rel=1e-12
     )
 
 

@@ -38,11 +38,6 @@ def test_rows_of_the_sources_come_back(name, wavelength_um, want):
     assert abs(materials.index(name, wavelength_um) - want) < 1e-12
 
 
-@given(st.floats(0.31, 2.066))
-def test_absorption_is_never_negative(wavelength_um):
-    assert materials.index("a-Si", wavelength_um).imag >= 0
-
-
 def test_plain_numbers_hold_at_every_wavelength():
     assert materials.index(Index(3.6, 0.1), 0.85) == 3.6 + 0.1j
 

@@ -148,13 +148,6 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
     assert "unlike neighbours counted, by 2 solved rows" in own.reason
 
 
-def test_nothing_is_overwritten_without_force(folder):
-    assert command(folder, "--quiet") == 0
-    assert command(folder, "--quiet") == 2
-    assert command(folder, "--quiet", "--force", "--tolerance", "1e-5") == 0
-    assert psf.load(folder / "psf.h5").tolerance == 1e-5
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -170,11 +163,6 @@ def test_bad_settings_exit_2_and_write_nothing(folder, text, capsys):
     assert command(folder) == 2
     assert not (folder / "psf.h5").exists()
     assert "metalens: error" in capsys.readouterr().err
-
-
-def test_a_proxy_outside_its_wavelengths_exits_2(folder):
-    (folder / "psf.toml").write_text(SETTINGS + "led_fwhm_nm = 30.0\n")
-    assert command(folder) == 2
 
 
 def test_a_tolerance_out_of_reach_exits_1(folder):

@@ -85,13 +85,6 @@ def test_double_helix_winds_one_three_five_times():
         assert round(turns) == 2 * ring - 1
 
 
-def test_cubic_phase_is_odd_in_x_and_y():
-    x = np.array([7.0, -7.0])
-    extra = _phase_at(Cubic(50.0), FOCUS, 10.0, x, 0 * x)
-    extra = extra - profiles.hyperbolic_phase(x, np.zeros(1), FOCUS)
-    assert extra == pytest.approx([50 * 0.343, -50 * 0.343])
-
-
 def test_every_pillar_makes_the_wanted_phase(proxy):
     made, quality = _make(proxy)
     d = made.diameters

@@ -172,6 +172,7 @@ def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
         (CELL, []),
         (CELL, [0.1, 0.3]),
         (CELL, [0.0]),
+        (dataclasses.replace(CELL, shape=Square()), [0.1]),
     ],
 )
 def test_what_cannot_be_a_row_is_refused(cell, row):
@@ -285,10 +286,3 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     change = abs(want - 1).max()
     assert change > 0.1
     assert abs(np.array(fields) - want).max() < HELD_OUT * change
-
-
-def test_rows_of_other_cells_are_refused_by_name():
-    with pytest.raises(CellError, match="square on a square lattice"):
-        supercell.solve_row(
-            dataclasses.replace(CELL, shape=Square()), [0.1], WAVE, polarization="x"
-        )

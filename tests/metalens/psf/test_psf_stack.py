@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import propagate, psf
-from metalens.core.errors import PropagationError, StoreError
+from metalens.core.errors import PropagationError
 from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
@@ -78,23 +78,6 @@ def test_torch_in_torch_out_and_dtype_follows():
         psf.psf_stack(torch.zeros(4, 4, dtype=torch.int32), level, **GEOMETRY, **WINDOW)
 
 
-def test_file_round_trip_and_same_bytes(tmp_path):
-    stack = psf.psf_stack(*focus(), **GEOMETRY, **WINDOW)
-    for name in ("a.h5", "b.h5"):
-        psf.save(tmp_path / name, stack)
-    back = psf.load(tmp_path / "a.h5")
-    assert np.array_equal(back.intensity, stack.intensity)
-    assert (back.reason, back.error, back.step_um) == (
-        stack.reason,
-        stack.error,
-        stack.step_um,
-    )
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-    (tmp_path / "a.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:500])
-    with pytest.raises(StoreError):
-        psf.load(tmp_path / "a.h5")
-
-
 @settings(max_examples=15)
 @given(pitch=st.floats(1.0, 7.0), bins=st.integers(1, 3))
 def test_pixels_keep_all_light(pitch, bins):
@@ -151,16 +134,6 @@ def test_blur_of_even_discs_is_their_radius():
     )
     want = np.hypot(np.ptp(ends), np.ptp(down)) / 2 / 0.404 / np.sqrt(2)
     assert psf_metrics.blur_um(most, 0.5, 0.9) == pytest.approx(want, abs=0.5 / 0.404)
-
-
-def test_metrics_of_gaussians_are_closed_forms():
-    stack = gaussian_stack([2.0, 3.0])
-    f = np.linspace(0, 0.2, 9)
-    for depth, width in enumerate((2.0, 3.0)):
-        want = np.exp(-2 * (np.pi * width * f) ** 2)
-        assert psf_metrics.mtf(stack, frequencies_per_um=f)[depth, 0] == pytest.approx(
-            want, abs=1e-9
-        )
 
 
 def test_polychromatic_psf_converges_with_the_nodes():

@@ -147,13 +147,6 @@ def test_hard_tiny_angles_join_normal_incidence(polarization, azimuth_rad):
         assert abs(got.r - straight.r) < ROUNDING
 
 
-@pytest.mark.parametrize("polarization", ["s", "p"])
-def test_hard_grazing_light(polarization):
-    got = amplitude(CELL, 0.2, angle_rad=math.radians(89), polarization=polarization)
-    assert abs(got.energy - 1) < ROUNDING
-    assert 0 < abs(got.t) < 0.3
-
-
 def test_hard_dark_mode_is_seen_and_its_error_admitted():
     got = amplitude(
         CELL, 0.272, harmonics=8, angle_rad=math.radians(5), polarization="p"
