@@ -52,7 +52,9 @@ _OF_DETECTION = (
 Light = tuple[Array, dict[str, Array]]  # light, and its derivatives by name
 # relative error of derivatives: it slows the last steps of a fit, not its result
 _SLOPE_TOLERANCE = 8e-3
-_KERNEL_STEP = 1e-3  # relative step of distance and wavelength in the kernel
+# relative step of distance and wavelength in the kernel: truncation, (step times phase)²
+# / 6, is as small as rounding, 1e-7 over the step
+_KERNEL_STEP = 5e-4
 # of difference quotients: typical uncertainties, bandwidth, bias
 _STEP, _WIDER_NM, _BIAS_STEP_UM = 0.02, 0.02, 2e-5
 # pixels: least disc of a derivative, as a point has no slope by its size
