@@ -229,16 +229,15 @@ class ForwardModel:
         Returns:
             Frames, and derivatives (len(wanted), n, rows, columns) or None.
         """
-        if x[_PITCH]:
-            return self._off_pitch(x, names)
-        response, background = self._detection(x, self._source_images(x))
-        light, slopes = self._light(x, names or (), response)
-        frames = self.grid.sample(light, response) + background
+        model = self.with_pixel_pitch(1 + float(x[_PITCH]) / 100)
+        response, background = model._detection(x, model._source_images(x))
+        light, slopes = model._light(x, names or (), response)
+        frames = model.grid.sample(light, response) + background
         if names is None:
             return frames, None
         for name in names:
             if name in _OF_DETECTION:
-                slopes[name] = slopes[name] + self._detection_slope(x, name, light)
+                slopes[name] = slopes[name] + model._detection_slope(x, name, light)
             elif name == "pixel_percent":
                 slopes[name] = self._pitch_slope(x)
         return frames, np.stack([slopes[name] for name in names])
@@ -298,22 +297,6 @@ class ForwardModel:
         distance_um = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
         image_um = self.films.reduced_um(distance_um) * x[PLACE["pinhole_um"]]
         return np.asarray(image_um / self.films.apparent_um(depth_um))
-
-    def _off_pitch(
-        self, x: Array, names: Sequence[str] | None
-    ) -> tuple[Array, Array | None]:
-        """:meth:`images` where the pixel pitch is not the stated one.
-
-        A model of the actual pitch is evaluated, at 0 percent. Its derivative is per
-        percent of that pitch, hence the division by ``ratio``.
-        """
-        ratio = 1 + float(x[_PITCH]) / 100
-        stated = x.copy()
-        stated[_PITCH] = 0.0
-        frames, slopes = self.with_pixel_pitch(ratio).images(stated, names)
-        if slopes is not None and names is not None and "pixel_percent" in names:
-            slopes[list(names).index("pixel_percent")] /= ratio
-        return frames, slopes
 
     def _pitch_slope(self, x: Array) -> Array:
         """(n, rows, columns) derivative by the pixel pitch per percent: central
