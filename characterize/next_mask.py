@@ -27,8 +27,6 @@ from metalens.fabrication import (
 from metalens.lens import Lens
 from metalens.optics.paths import axial_path_difference
 
-_ANGLES = 8  # along a circle of points where the corrected map is judged
-DRAWS = 24
 # largest standard deviation of usable table entries: the step of drawn diameters
 WIDE_NM = 2.0
 _FRAMES = (
@@ -286,7 +284,7 @@ def wavefront_overlap(one: Array, other: Array) -> float:
     return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
 
 
-def uneven_nm(x: Array) -> Array:
+def uneven_nm(x: Array, *, angles: int = 8) -> Array:
     """(points,) deviation of the bias from its mean, nm: what the corrected map
     subtracts.
 
@@ -294,9 +292,10 @@ def uneven_nm(x: Array) -> Array:
 
     Args:
         x: all parameters of a lens, in the fit's order.
+        angles: points along each circle.
     """
-    angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    rho = np.repeat([0.5, 1.0], _ANGLES)
+    angle = 2 * np.pi * np.arange(angles) / angles
+    rho = np.repeat([0.5, 1.0], angles)
     u = np.append(0.0, rho * np.tile(np.cos(angle), 2))
     v = np.append(0.0, rho * np.tile(np.sin(angle), 2))
     state = process_state_of(x)
@@ -453,10 +452,12 @@ def reason_left_open(
     result: AsBuilt,
     part: tuple[str, tuple[str, ...]],
     correction_nm: Callable[[Array], Array],
+    *,
+    count: int = 24,
 ) -> str:
     """Why the posterior leaves a correction too open to be used, and what to measure.
 
-    Empty where its standard deviation over DRAWS draws is at most ``WIDE_NM``
+    Empty where its standard deviation over ``count`` draws is at most ``WIDE_NM``
     everywhere.
 
     Args:
@@ -464,8 +465,10 @@ def reason_left_open(
         part: ``TABLE`` or ``MAP``.
         correction_nm: (knots,) nm from all parameters of one lens: the bias table, or
             the deviation that the map subtracts.
+        count: draws from the posterior; their standard deviation is known to
+            1 / sqrt(2 count), 14 %.
     """
-    draws = result.samples(DRAWS, seed=5)
+    draws = result.samples(count, seed=5)
     try:
         corrections = [correction_nm(result.parameters(row)) for row in draws]
     except ConfigError as refusal:

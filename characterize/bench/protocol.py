@@ -18,12 +18,12 @@ from characterize.inference import (
 )
 from characterize.model import (
     NAMES,
-    PARAMETERS,
     PLACE,
     ForwardModel,
     FrameSetting,
     KnownValue,
     parameter_vector,
+    typical_scales,
     unfitted_sizes,
 )
 from metalens.core.arrays import Array
@@ -381,7 +381,7 @@ def design_criterion(
         criterion: D or A.
         names: (p,) names of the parameters.
     """
-    unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    unit = typical_scales(names)
     values = np.maximum(np.linalg.eigvalsh(information * np.outer(unit, unit)), 1e-12)
     return float(
         np.exp(np.log(values).mean())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from characterize.inference import REACH, AsBuilt, identifiability, invert_information
-from characterize.model import PARAMETERS, PLACE
+from characterize.model import PARAMETERS, PLACE, typical_scales
 from characterize.pupil import PupilFit
 from metalens.core import report, store
 from metalens.core.arrays import Array
@@ -91,8 +91,8 @@ def asbuilt_report(
         result: the as-built lens.
         truth: true values by name, drawn with the posteriors; None where unknown.
     """
-    units = [PARAMETERS[PLACE[name]].scale for name in result.names]
-    known_share = float(np.mean(result.sigma < 0.5 * np.array(units)))
+    is_known = result.sigma < 0.5 * typical_scales(result.names)
+    known_share = float(is_known.mean())
     key_figures = [
         report.KeyFigure(
             "verdict",
@@ -242,7 +242,7 @@ def _intervals(result: AsBuilt) -> bytes:
         if name != "log_gain" and not name.startswith("background")
     ]
     names = [result.names[i] for i in fitted]
-    unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    unit = typical_scales(names)
     value = result.value[fitted] / unit
     information = np.diag(
         invert_information(result.within_covariance) - result.information

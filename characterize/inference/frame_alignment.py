@@ -25,7 +25,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import FitRefused
 from metalens.fabrication import wavelength_scale
 
-_ORIENTATIONS = range(8)
+_ORIENTATIONS = range(len(TURNS + MIRRORED))
 _ASIDE_UM = 50.0  # largest offset of a window
 # correlation by which a lens at another distance must be better
 _CLEARER = 0.05
@@ -35,10 +35,9 @@ _NEAR = 0.02
 _DISTINCT = 40.0  # chi-square between two orientations that a fit can distinguish
 _SURE = 0.9  # correlation above which the nominal lens explains the frames
 _RESEMBLES = 0.45  # below which the frames show no image of it
-_ZEROS = 17  # stage zeros of a scan
-# distances of a scan: steps of 25 um over two prior sigma, a tenth of a wave of defocus
-# at NA 0.25
-_DISTANCES = 17
+# places of a scan of stage zeros or distances: for distances steps of 25 um over two
+# prior sigma, a tenth of a wave of defocus at NA 0.25
+_SCAN_PLACES = 17
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -112,14 +111,14 @@ def find_arrangement(
     """
     frames = _Frames.of(model, data)
     nearest = float(model.setting.depth_um.min())
-    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS)
+    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _SCAN_PLACES)
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     stated_um = start[PLACE["distance_um"], None]
     best = _arrange(frames, *frames.scanned(start, zeros, stated_um))
     if reach_um > 0 and (any(_is_unusual(best)) or best.correlation < _SURE):
-        distances = stated_um + reach_um * np.linspace(-1, 1, _DISTANCES)
+        distances = stated_um + reach_um * np.linspace(-1, 1, _SCAN_PLACES)
         few = frames.some(few_frames(model.setting))
-        place, _ = few.scanned(start, zeros[:: _ZEROS // 4], distances)
+        place, _ = few.scanned(start, zeros[:: _SCAN_PLACES // 4], distances)
         place, correlation = frames.scanned(
             place, zeros, place[PLACE["distance_um"], None]
         )

@@ -4,7 +4,7 @@ degeneracies in words, densities.
 
 import numpy as np
 
-from characterize.model import PARAMETERS, PLACE
+from characterize.model import PARAMETERS, PLACE, typical_scales
 from metalens.core.arrays import Array
 
 
@@ -52,7 +52,7 @@ def identifiable_combinations(
         sigma_prior: (p,) prior standard deviations, inf where none.
     """
     values, vectors = information_eigenvectors(names, information)
-    unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    unit = typical_scales(names)
     prior = np.minimum(sigma_prior / unit, 1e9)
     lines = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
@@ -73,7 +73,7 @@ def information_eigenvectors(
     Args:
         names: (p,) names of the fitted parameters.
     """
-    unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    unit = typical_scales(names)
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     return np.maximum(values, 0), vectors
 

@@ -21,8 +21,7 @@ _LEAST_UPDATE = 0.03
 _RENEWED_ABOVE = 0.6
 REACH = 1.959964  # sigma of a 95 % interval
 HUBER = 6.0  # sigma beyond which a residual counts linearly
-_NODES, _WEIGHTS = special.roots_jacobi(4, 1.0, 0.0)
-_JACOBI = (_NODES + 1) / 2, _WEIGHTS / 4  # of (1 - s) f(s) over s from 0 to 1
+_JACOBI = special.roots_jacobi(4, 1.0, 0.0)  # of (1 - s) f(s) over s from -1 to 1
 Model = Callable[[Array, bool], tuple[Array, Array | None]]
 """(parameters, with Jacobian) -> (images (n, y, x), Jacobian (p, n, y, x) or None)."""
 
@@ -76,10 +75,10 @@ class FitImages:
         off = np.where(self.usable, self.electrons - image, 0.0)
         off = np.where(self.saturated, np.maximum(off, 0.0), off)
         integral = sum(
-            weight / self.variance(image + share * off)
-            for share, weight in zip(*_JACOBI, strict=True)
+            weight / self.variance(image + (1 + node) / 2 * off)
+            for node, weight in zip(*_JACOBI, strict=True)
         )
-        return np.asarray(2 * off**2 * integral)
+        return np.asarray(off**2 / 2 * integral)
 
     def planes(self, index: Array) -> "FitImages":
         """Some of the frames."""

@@ -35,7 +35,6 @@ from metalens.lens import Lens
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another mode is reported
 _EVEN = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
-_MOST, _AGAIN = 2, 3
 _OFF_PX = 0.1  # off the decentre that windows may stay
 _PLACES = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # of starts, in sigma of the prior
 _TRIAL = SolverSettings.short(iterations=6, step_tolerance=0.5)
@@ -125,7 +124,9 @@ def search_modes(
     return task, find_other_modes(task, [refine_fit(task, first.value)])
 
 
-def find_other_modes(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
+def find_other_modes(
+    task: SearchTask, ends: list[FitSolution], *, rounds: int = 3
+) -> list[FitSolution]:
     """The modes, and those that other starts lead to, until the best stays.
 
     Starts are mirror images of the best (:func:`mirrored_starts`), and places along the
@@ -134,8 +135,9 @@ def find_other_modes(task: SearchTask, ends: list[FitSolution]) -> list[FitSolut
     Args:
         task: model, frames and priors of the search.
         ends: fits of the modes so far, best first.
+        rounds: largest number of repetitions.
     """
-    for _ in range(_AGAIN):
+    for _ in range(rounds):
         best = ends[0]
         starts = [*mirrored_starts(task, best), *starts_along_bias(task, best)]
         ends = distinct_modes([*ends, *follow_starts(task, ends, starts)])
@@ -164,16 +166,21 @@ def starts_along_bias(task: SearchTask, best: FitSolution) -> list[Array]:
 
 
 def follow_starts(
-    task: SearchTask, ends: Sequence[FitSolution], begins: Sequence[Array]
+    task: SearchTask,
+    ends: Sequence[FitSolution],
+    begins: Sequence[Array],
+    *,
+    most: int = 2,
 ) -> list[FitSolution]:
     """Modes that some starts lead to: short fits, the best of these to the end.
 
-    At most ``_MOST``, none equal to one of ``ends`` or to another.
+    At most ``most``, none equal to one of ``ends`` or to another.
 
     Args:
         task: model, frames and priors of the search.
         ends: the fits so far, best first.
         begins: (p,) starts.
+        most: largest number of fits that are followed to their ends.
     """
     problem = task.posed()
 
@@ -188,7 +195,7 @@ def follow_starts(
     modes = list(ends)
     for trial in sorted(trials, key=lambda trial: trial.merit):
         if (
-            len(modes) < len(ends) + _MOST
+            len(modes) < len(ends) + most
             and trial.merit < ends[0].merit + MODES_WITHIN + _WORTH
             and all(sigma_distance(trial.value, mode) > 1.0 for mode in modes)
         ):

@@ -73,14 +73,11 @@ def setting_of(
         raise CaptureError(
             "source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)"
         )
-    if math.isnan(capture.pixel_um):
-        raise CaptureError(
-            "pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted"
-        )
-    if math.isnan(capture.wavelength_um):
-        raise CaptureError(
-            "wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted"
-        )
+    for name in ("pixel_um", "wavelength_um"):
+        if math.isnan(getattr(capture, name)):
+            raise CaptureError(
+                f"{name} is missing: give it in capture.toml; it cannot be fitted"
+            )
     if capture.about.get("window") == "fixed" and capture.angle_rad.any():
         raise CaptureError(
             'window = "fixed" in capture.toml: at a field angle the middle pixel stands for the chief ray; cut the '
@@ -216,24 +213,13 @@ def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     priors = [KnownValue("wavelength_nm", offset, sigma_nm)]
     exact = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
     priors += [
-        KnownValue(name, _number(capture, name), 0.0)
+        KnownValue(name, float(capture.about[name]), 0.0)
         for name in exact
         if name in capture.about
     ]
     if "pixel_sigma_um" in capture.about:
         # of one colour of a mosaic, ``pixel_um`` is a multiple of the sensor's pitch
         pitch_um = capture.fill * capture.pixel_um
-        percent = 100 * _number(capture, "pixel_sigma_um") / pitch_um
+        percent = 100 * float(capture.about["pixel_sigma_um"]) / pitch_um
         priors.append(KnownValue("pixel_percent", 0.0, percent))
     return priors
-
-
-def _number(capture: Capture, name: str) -> float:
-    value = capture.about[name]
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or not math.isfinite(value)
-    ):
-        raise CaptureError(f"capture.toml: {name} = {value!r}; need a finite number")
-    return float(value)

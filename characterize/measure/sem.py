@@ -32,8 +32,6 @@ _COMMON, _PIXEL_ERROR = 0.05, 0.005
 # parameters of a disc: row, column, radius, r(t) terms of sin 2t and cos 2t, logarithm
 # of the blur, level of the gap, height above it
 _BLUR, _HEIGHT = 5, 7
-# Gauss-Newton: iterations, longest step and step that ends them, pixels
-_ITERATIONS, _LONGEST, _TOLERANCE = 30, 1.0, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +308,14 @@ def _rim_width(cells: Sequence[_Cell], discs: Array) -> float:
 
 
 def fit_blurred_disc(
-    cell: _Cell, mean: Array, sigma: Array, rim_px: float
+    cell: _Cell,
+    mean: Array,
+    sigma: Array,
+    rim_px: float,
+    *,
+    iterations: int = 30,
+    longest_px: float = 1.0,
+    tolerance_px: float = 1e-3,
 ) -> tuple[Array, Array]:
     """Gauss-Newton fit of a blurred disc to the pixels from the crest of its rim
     outwards, with white noise and Gaussian priors: (8,) parameters, standard errors.
@@ -320,20 +325,23 @@ def fit_blurred_disc(
         mean: (8,) start and mean of the prior.
         sigma: (8,) standard deviations of the prior.
         rim_px: distance from the edge to the inner end of the crest.
+        iterations: largest number of steps.
+        longest_px: longest step, beyond which edges next to each other are confused.
+        tolerance_px: step that ends the fit.
     """
     reach = np.hypot(*(cell.points - mean[:2, None]))
     order = np.argsort(reach)[np.count_nonzero(reach < mean[2] - rim_px) :]
     points, level = cell.points[:, order], cell.level[order]
     disc = mean.copy()
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         expected, slopes = blurred_disc_image(points, disc)
         residual = level - expected
         variance = residual @ residual / max(len(level) - 8, 1) + 1e-12 * mean[7] ** 2
         covariance = np.linalg.pinv(slopes.T @ slopes / variance + np.diag(sigma**-2))
         step = covariance @ (slopes.T @ residual / variance + (mean - disc) / sigma**2)
-        longest = np.abs(step[:5]).max()
-        disc += step * min(1, _LONGEST / longest)
-        if longest < _TOLERANCE:
+        length = np.abs(step[:5]).max()
+        disc += step * min(1, longest_px / length)
+        if length < tolerance_px:
             break
     return disc, np.sqrt(np.diag(covariance) + _PIXEL_ERROR**2)
 

@@ -13,6 +13,7 @@ from .parameters import KnownValue as KnownValue
 from .parameters import parameter_vector as parameter_vector
 from .parameters import process_state_of as process_state_of
 from .parameters import type_b_sigma as type_b_sigma
+from .parameters import typical_scales as typical_scales
 from .parameters import unfitted_sizes as unfitted_sizes
 from .parameters import usual_parameters as usual_parameters
 from .pillar_slopes import log_response_slopes as log_response_slopes

@@ -32,7 +32,6 @@ _SHARE_OF_P_CUT = 0.5
 _OFF_LENS = 0.1  # weight of directions off the lens in the low-rank terms
 Samples = tuple[int, float, float]  # number, first and last place of an axis, um
 _KEPT = 24  # sets of coupling terms: for the windows and distances of several fits
-_TURN = np.float32(2 * np.pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +253,7 @@ def wrapped_phasors(phase: Array) -> Array:
         return np.exp(1j * phase).astype(np.complex64)
     out = np.empty(np.shape(phase), np.complex64)
     turns = phase * (1 / (2 * np.pi))
-    wrapped = (turns - np.rint(turns)).astype(np.float32) * _TURN
+    wrapped = (turns - np.rint(turns)).astype(np.float32) * np.float32(2 * np.pi)
     out.real, out.imag = np.cos(wrapped), np.sin(wrapped)
     return out
 

@@ -166,6 +166,15 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
     return rows
 
 
+def typical_scales(names: Sequence[str]) -> Array:
+    """(n,) typical uncertainties of some parameters, each in its unit.
+
+    Args:
+        names: of the parameters.
+    """
+    return np.array([PARAMETERS[PLACE[name]].scale for name in names])
+
+
 def type_b_sigma(name: str, lens: Lens) -> float:
     """Type B standard deviation of a parameter or effect where nobody states it.
 

@@ -53,10 +53,6 @@ class FrameSetting:
             raise FitError(
                 "source depths must be finite and above 0; give them in stage.csv (depth_um)"
             )
-        if not (math.isfinite(self.pixel_um) and self.pixel_um > 0):
-            raise FitError(
-                "pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted"
-            )
 
     @property
     def edges(self) -> tuple[Array, Array]:
