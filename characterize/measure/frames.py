@@ -10,16 +10,14 @@ from scipy import ndimage, special
 
 from characterize.captures import Capture, to_electrons
 from characterize.measure import metrics
+from characterize.model import aperture_sine
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 from metalens.lens import Lens
 from metalens.psf import find_peak
 
-_FINE = 15  # samples a pixel side under the ideal spot
 # weights of the second and first neighbours that interpolate a pixel
 _CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6
-# alignments of the ideal spot: its distance shrinks to a half or less in each
-_ALIGNMENTS = 6
 Field = tuple[float, float]  # angle along x and y, degrees
 
 
@@ -166,7 +164,12 @@ def _metrics_row(
 
 
 def airy_pattern(
-    design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Array
+    design: Lens,
+    capture: Capture,
+    shape: tuple[int, ...],
+    *,
+    place_px: Array,
+    fine: int = 15,
 ) -> Array:
     """(y, x) Airy pattern (2 J1(u) / u)² of the lens's aperture, averaged over the
     pixels of a capture.
@@ -178,42 +181,36 @@ def airy_pattern(
         capture: gives the pixel, its fill factor and the wavelength.
         shape: (rows, columns).
         place_px: (row, column) of the pattern's middle from that of the window.
+        fine: samples along a pixel's side.
     """
     wavelength_um = (
         capture.wavelength_um
         if math.isfinite(capture.wavelength_um)
         else design.wavelength_um
     )
-    sine = design.diameters.radius_um / math.hypot(
-        design.diameters.radius_um, design.reduced_um
-    )
-    offsets = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
+    offsets = capture.fill * ((np.arange(fine) + 0.5) / fine - 0.5)
     y, x = (
         (np.arange(size)[:, None] - (size - 1) / 2 - place + offsets).ravel()
         for size, place in zip(shape, place_px.tolist(), strict=True)
     )
-    argument = (
-        2
-        * math.pi
-        * sine
-        / wavelength_um
-        * capture.pixel_um
-        * np.hypot(x[None], y[:, None])
-    )
-    safe = np.maximum(argument, 1e-9)
-    samples = np.where(argument > 1e-9, (2 * special.j1(safe) / safe) ** 2, 1.0)
-    return np.asarray(samples.reshape(shape[0], _FINE, shape[1], _FINE).mean((1, 3)))
+    per_pixel = 2 * math.pi * aperture_sine(design) / wavelength_um * capture.pixel_um
+    u = np.maximum(per_pixel * np.hypot(x[None], y[:, None]), 1e-9)
+    samples = (2 * special.j1(u) / u) ** 2
+    return np.asarray(samples.reshape(shape[0], fine, shape[1], fine).mean((1, 3)))
 
 
-def _strehl(image: Array, design: Lens, capture: Capture) -> float:
+def _strehl(
+    image: Array, design: Lens, capture: Capture, *, alignments: int = 6
+) -> float:
     """Strehl ratio of a spot against the Airy pattern of equal peak position.
 
     The position is that of the peaks of splines through the pixels, iterated until that
-    of the pattern is that of the spot.
+    of the pattern is that of the spot; its distance shrinks to a half or less in each
+    of the ``alignments``.
     """
     peak = np.array(find_peak(image)[:2])
     place = peak - (np.array(image.shape) - 1) / 2
-    for _ in range(_ALIGNMENTS):
+    for _ in range(alignments):
         ideal = airy_pattern(design, capture, image.shape, place_px=place)
         place = place + peak - find_peak(ideal)[:2]
     return metrics.strehl_ratio(image, ideal - np.median(_rim(ideal)))

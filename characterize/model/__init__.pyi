@@ -1,5 +1,6 @@
 from . import as_built as as_built
 from . import detector as detector
+from .detector import aperture_sine as aperture_sine
 from .detector import required_oversampling as required_oversampling
 from .forward import ForwardModel as ForwardModel
 from .glass import FilmStack as FilmStack

@@ -128,16 +128,19 @@ def fine_enough(pixel_um: float, highest: float) -> int:
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
 
+def aperture_sine(lens: Lens) -> float:
+    """Sine of the half aperture angle of a lens, seen from its sensor in air."""
+    radius_um = lens.diameters.radius_um
+    return radius_um / math.hypot(radius_um, lens.reduced_um)
+
+
 def required_oversampling(lens: Lens, pixel_um: float) -> int:
     """Samples along a pixel's side that are fine enough for the light of a lens.
 
     Args:
         pixel_um: pitch of the pixels, um.
     """
-    sine = lens.diameters.radius_um / math.hypot(
-        lens.diameters.radius_um, lens.reduced_um
-    )
-    return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
+    return fine_enough(pixel_um, 2 * aperture_sine(lens) / lens.wavelength_um)
 
 
 def pixel_transfer(fy: Array, fx: Array, pixel_um: float) -> Array:
