@@ -18,3 +18,5 @@ from .paper import ClaimLine as ClaimLine
 from .paper import MeasuredNumber as MeasuredNumber
 from .reader import ReaderConfig as ReaderConfig
 from .reader import judge_lenses as judge_lenses
+from .reader import judge_reader as judge_reader
+from .reader import train_reader as train_reader

@@ -2,6 +2,7 @@
 slippage errors rate the lens.
 """
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -38,6 +39,7 @@ BATCH = 32
 SPACE = SearchSpace(
     widths=(0.25,), depths=(2,), kernels=(3,), expansions=(3,), resolution=(1.0, 1.0)
 )
+ARCHITECTURE = smallest_architecture(SPACE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,7 @@ class ReaderConfig:
     electrons: float = 2000.0
     fwhm_nm: float = 0.0
     depths_mm: tuple[float, float] = (12.0, 50.0)
+    angle_deg: float = field(default=0.0, metadata={"signed": True})
     tolerance: float = field(default=0.03, metadata={"above": 0})
 
     def __post_init__(self) -> None:
@@ -80,6 +83,7 @@ class ReaderConfig:
             electrons=(LEAST, LARGEST),
             fwhm_nm=(0, LARGEST),
             depths_mm=(LEAST, LARGEST),
+            angle_deg=(-40, 40),
         )
 
     @property
@@ -102,12 +106,93 @@ class ReaderConfig:
         )
 
 
-def train_reader(lens: Lens, config: ReaderConfig) -> dict[str, float]:
-    """Train the smallest network of the supernet on images of a lens and test it.
+@dataclass(frozen=True, eq=False, slots=True)
+class TrainedReader:
+    """The reference reader of one lens.
+
+    lens, config: what it was trained on. trainer: with its network. stack: lens plane
+    that forms its images.
+    """
+
+    lens: Lens
+    config: ReaderConfig
+    trainer: Trainer
+    stack: PixelPsfStack
+
+    def scenes(self, stream: int) -> EyeScenes:
+        """Frames of one stream of the random generator."""
+        return _scenes_of(self.lens, self.config, stream)
+
+    def frames(self, stream: int, tolerance: float) -> assess.SensorFrames:
+        """Test frames of a stream, on images of a tolerance.
+
+        Args:
+            stream: of the random generator.
+            tolerance: relative L2 error of the image of a texture.
+        """
+        optics = replace(self.trainer.optics, image_tolerance=tolerance)
+        count = self.config.test // BATCH
+        return assess.sensor_frames(
+            self.trainer, self.scenes(stream), count, stack=self.stack, optics=optics
+        )
+
+
+def _scenes_of(lens: Lens, config: ReaderConfig, stream: int) -> EyeScenes:
+    seed = config.seed + 101
+    return EyeScenes(config.scenes, config.pitch_um, lens.reduced_um, seed, stream)
+
+
+@functools.lru_cache(maxsize=2)
+def _lens_plane(lens: Lens, window_um: float) -> Optics:
+    """Pillars of a lens with its films and distance; one for all readers of a lens."""
+    device = lens.wavelength_um, window_um, lens.sensor_distance_um
+    wave = PillarWave(lens, cell_um=cell_um(lens.layers, *device))
+    return Optics(wave, lens.layers, lens.sensor_distance_um)
+
+
+def train_reader(lens: Lens, config: ReaderConfig) -> TrainedReader:
+    """Train the smallest network of the supernet on images of a lens.
 
     Args:
         lens: content of a lens file; it stays as it is.
         config: frames, sensor and light of the reader.
+    """
+    optics = replace(
+        lens_settings(lens, config.fwhm_nm),
+        sample_um=config.pitch_um,
+        window_samples=2 * config.margin + 1,
+        depths_mm=config.depths_mm,
+        angle_deg=config.angle_deg,
+        image_tolerance=config.tolerance,
+    )
+    plane = _lens_plane(lens, optics.window_samples * optics.sample_um)
+    none = torch.zeros(0)
+    stack = PixelPsfStack(none, none, plane)
+    pool = render_pool(_scenes_of(lens, config, EXPERIMENT), config.pool)
+    learned = PoolScenes(pool, config.margin, config.scenes.scale, config.seed)
+    inner = InnerConfig(steps=config.frames // BATCH, batch=BATCH, seed=config.seed)
+    with torch.random.fork_rng(devices=[]):
+        model = make_model(
+            optics, pitch_um=config.pitch_um, seed=config.seed, space=SPACE
+        )
+    trainer = Trainer(
+        inner, optics, config.sensor, learned, model,
+        architecture=ARCHITECTURE, stacks=[stack],
+    )  # fmt: skip
+    for _ in trainer.run():
+        pass
+    assess.recalibrate_network(trainer, ARCHITECTURE)
+    return TrainedReader(lens, config, trainer, stack)
+
+
+def judge_reader(
+    reader: TrainedReader, tolerance: float | None = None
+) -> dict[str, float]:
+    """Errors of a reader on test frames that it has not seen.
+
+    Args:
+        reader: of one lens.
+        tolerance: of the images that judge; those of training without it.
 
     Returns:
         mean absolute errors of the test frames by name, the axial one with its 95 %
@@ -115,46 +200,13 @@ def train_reader(lens: Lens, config: ReaderConfig) -> dict[str, float]:
             interval_mm is the mean half width of the 90 % intervals, and covered the
             share of the frames that they hold.
     """
-    optics = replace(
-        lens_settings(lens, config.fwhm_nm),
-        sample_um=config.pitch_um,
-        window_samples=2 * config.margin + 1,
-        depths_mm=config.depths_mm,
-        image_tolerance=config.tolerance,
-    )
-    none, window_um = torch.zeros(0), optics.window_samples * optics.sample_um
-    device = lens.wavelength_um, window_um, lens.sensor_distance_um
-    wave = PillarWave(lens, cell_um=cell_um(lens.layers, *device))
-    plane = Optics(wave, lens.layers, lens.sensor_distance_um)
-    stack = PixelPsfStack(none, none, plane)
-
-    def scenes_of(stream: int) -> EyeScenes:
-        seed = config.seed + 101
-        return EyeScenes(config.scenes, config.pitch_um, lens.reduced_um, seed, stream)
-
-    pool = render_pool(scenes_of(EXPERIMENT), config.pool)
-    learned = PoolScenes(pool, config.margin, config.scenes.scale, config.seed)
-    inner = InnerConfig(steps=config.frames // BATCH, batch=BATCH, seed=config.seed)
-    architecture = smallest_architecture(SPACE)
-    with torch.random.fork_rng(devices=[]):
-        model = make_model(
-            optics, pitch_um=config.pitch_um, seed=config.seed, space=SPACE
-        )
-    trainer = Trainer(
-        inner, optics, config.sensor, learned, model,
-        architecture=architecture, stacks=[stack],
-    )  # fmt: skip
-    for _ in trainer.run():
-        pass
-    assess.recalibrate_network(trainer, architecture)
+    config, trainer = reader.config, reader.trainer
+    tolerance = tolerance or config.tolerance
     calibration, test = (
-        assess.sensor_frames(
-            trainer, scenes_of(stream), config.test // BATCH, stack=stack
-        )
-        for stream in (CALIBRATION, TEST)
+        reader.frames(stream, tolerance) for stream in (CALIBRATION, TEST)
     )
     judged, tested = (
-        assess.predict_frames(model.net, architecture, frames, inner)
+        assess.predict_frames(trainer.model.net, ARCHITECTURE, frames, trainer.inner)
         for frames in (calibration, test)
     )
     half_mm = results.conformal_quantiles(judged, calibration) * tested.slip_sd_mm[:, 2]
@@ -162,15 +214,19 @@ def train_reader(lens: Lens, config: ReaderConfig) -> dict[str, float]:
     error_mm = (tested.slip_mm - test.slip_mm).abs()
     low, high = bootstrap_interval(error_mm[:, 2].numpy())
     depth_mm = blur.depth_mm(test.vergence)
-    frame = config.pixels + 2 * config.margin
     imager = image_formation.make_imager(
-        optics, none, frame, margin=config.margin, made=stack
+        replace(trainer.optics, image_tolerance=tolerance),
+        torch.zeros(0),
+        config.pixels + 2 * config.margin,
+        margin=config.margin,
+        made=reader.stack,
     )
     return {
         "axial_mm": float(error_mm[:, 2].mean()),
         "axial_low_mm": low,
         "axial_high_mm": high,
         "lateral_mm": float(error_mm[:, :2].mean()),
+        "iou": float(tested.iou.mean()),
         "window_mm": summary["window_depth_mm"],
         "guess_mm": float((depth_mm - depth_mm.median()).abs().mean()),
         "covered": summary["axial_coverage_90"],
@@ -233,4 +289,4 @@ def judge_lenses(
             f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {nearest:g} to {farthest:g} mm before the lens"
         )
     for name, lens in lenses.items():
-        yield name, train_reader(lens, config)
+        yield name, judge_reader(train_reader(lens, config))
