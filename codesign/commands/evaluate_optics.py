@@ -14,11 +14,9 @@ import torch
 from codesign.commands.evaluate import distinct_names
 from codesign.commands.options.optics import Options
 from codesign.evaluate import (
-    FieldSetting,
     MeasurementSettings,
     ReaderConfig,
     SensitivityScenes,
-    field_page,
     judge_lenses,
     reader,
 )
@@ -38,13 +36,11 @@ SPREAD = "brings no light together in one bright spot of the sensor: its beams a
 class OpticsSettings:
     """The content of OPTICS.toml; every key may be left out.
 
-    axial: how the axial information is measured. over_field: what the designer's page
-    shows. scenes: what the scene
+    axial: how the axial information is measured. scenes: what the scene
     table is made of. reader: what the reference reader sees, with ``--reader``.
     """
 
     axial: MeasurementSettings = MeasurementSettings()
-    over_field: FieldSetting = FieldSetting()
     scenes: SensitivityScenes = SensitivityScenes()
     reader: ReaderConfig = ReaderConfig()
 
@@ -76,27 +72,25 @@ def run(options: Options) -> int:
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, compared, draft.path)
-    words = f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html"
+    words = f"{text}\n\n{folder}: tables.txt, optics.json, two pictures, report.html"
     return options.console.judged(values, words, values["failures"])
 
 
 def _measure(
     options: Options, settings: OpticsSettings, compared: dict[str, Lens], folder: Path
 ) -> tuple[dict[str, Any], str]:
-    """Axial information, field and scene energies of all lenses; the numbers, and
-    tables.
+    """Axial information and scene energies of all lenses; the numbers, and tables.
 
     Writes tables, numbers, pictures and page into the folder.
     """
     console, first = options.console, next(iter(compared.values()))
     setting = settings.axial.about(first)
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
-    axial, over_field, remarks = {}, {}, {}
+    axial, remarks = {}, {}
     for name, lens in console.track(
         compared.items(), total=len(compared), label="PSFs"
     ):
         axial[name] = evaluate_optics.measure_axial_information(lens, setting)
-        over_field[name] = settings.over_field.of(lens, first, setting.angles_deg)
         if not design.lens_has_focus(lens):
             remarks[name] = f"{name} {SPREAD}"
     try:
@@ -109,15 +103,11 @@ def _measure(
     tables = [
         evaluate_optics.axial_table(axial, setting, list(remarks.values())),
         evaluate_optics.scene_table(scenes),
-        *field_page.field_tables(over_field),
     ]
     values = evaluate_optics.table_values(axial, scenes, setting)
     values["failures"] = evaluate_optics.table_failures(axial, scenes, setting)
-    for name, result in over_field.items():
-        values["lenses"][name] |= {
-            "focuses": name not in remarks,
-            "field": field_page.field_values(result),
-        }
+    for name in compared:
+        values["lenses"][name]["focuses"] = name not in remarks
     if options.reader:
         steps = judge_lenses(compared, settings.reader)
         judged = dict(console.track(steps, total=len(compared), label="reader"))
@@ -130,12 +120,13 @@ def _measure(
     pictures = {
         "axial": evaluate_optics.plot_axial_information(axial, setting),
         "scenes": evaluate_optics.plot_scenes(scenes),
-        "field": field_page.plot_over_field(over_field),
     }
-    captions = evaluate_optics.CAPTIONS | {"field": field_page.CAPTION}
     for name, picture in pictures.items():
         store.write_bytes(folder / f"{name}.png", picture)
-    figures = [Figure(png, captions[name], wide=True) for name, png in pictures.items()]
+    figures = [
+        Figure(png, evaluate_optics.CAPTIONS[name], wide=True)
+        for name, png in pictures.items()
+    ]
     sections = [Section("Pictures", items=figures), Section("Tables", items=tables)]
     write_report(folder / "report.html", "Comparison of lenses", sections)
     return values, text

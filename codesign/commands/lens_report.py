@@ -13,7 +13,7 @@ import numpy as np
 from codesign.commands.options.lens_report import Options
 from codesign.evaluate import field_page
 from metalens import design, lens, psf
-from metalens.aberrations import OverField, over_field
+from metalens.aberrations import OverField, frequencies_per_mm, over_field
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
@@ -61,7 +61,10 @@ def run(options: Options) -> int:
     with options.claim(options.output, companions=(".json",)) as draft:
         measured = [
             measure_lens(
-                replace(device, wavelength_um=wave), view, tolerance=options.tolerance
+                replace(device, wavelength_um=wave),
+                view,
+                tolerance=options.tolerance,
+                frequencies=options.frequencies_per_mm or frequencies_per_mm(device),
             )
             for wave in options.console.track(
                 waves_um, total=len(waves_um), label="wavelengths"
@@ -71,9 +74,7 @@ def run(options: Options) -> int:
         text = json.dumps(values, indent=1) + "\n"
         store.write_text(draft.path.with_suffix(".json"), text)
         fields = {one.name: one.field for one in measured}
-        shown = [focus_table(measured)]
-        for table in field_page.field_tables(fields):
-            shown.append(replace(table, head=("wavelength", *table.head[1:])))
+        shown = [focus_table(measured), *field_page.field_tables(fields)]
         _write_page(draft.path, options.lens.name, measured, shown)
     failures = [
         f"{one.name}: the relative error {one.stack.error:.2g} is above the tolerance "
@@ -113,7 +114,11 @@ def _view(options: Options, device: lens.Lens) -> psf.View:
 
 
 def measure_lens(
-    device: lens.Lens, view: psf.View, *, tolerance: float
+    device: lens.Lens,
+    view: psf.View,
+    *,
+    tolerance: float,
+    frequencies: tuple[float, ...],
 ) -> LensAtWavelength:
     """Focus, efficiency and aberrations of a lens at its wavelength.
 
@@ -121,6 +126,7 @@ def measure_lens(
         device: the lens.
         view: one depth, angles and window.
         tolerance: relative L2 error of the PSFs.
+        frequencies: of the MTF over the field, per mm.
     """
     stack = psf.from_lens(device, view, tolerance=tolerance)
     focus = psf.focus_metrics(stack, device, power_error=design.power_error(device))
@@ -131,7 +137,9 @@ def measure_lens(
         within = one.efficiency / (passed * one.window_share)
         shares.append((passed, one.window_share, within))
     angles_deg = tuple(math.degrees(x) for x, _ in view.angles_rad)
-    field = over_field(device, angles_deg, depth_um=view.depths_um[0])
+    field = over_field(
+        device, angles_deg, depth_um=view.depths_um[0], frequencies=frequencies
+    )
     return LensAtWavelength(focus, np.array(shares), stack, field)
 
 

@@ -6,7 +6,6 @@ from . import own_frames as own_frames
 from . import paper as paper
 from . import reader as reader
 from . import scene_image as scene_image
-from .field_page import FieldSetting as FieldSetting
 from .gaze_experiment import AXIAL as AXIAL
 from .gaze_experiment import LATERAL as LATERAL
 from .gaze_experiment import RunResult as RunResult

@@ -1,73 +1,27 @@
-"""Tables and plots of lenses over the field angle: distortion, field curvature, light
+"""Tables and plots of a lens over the field angle: distortion, field curvature, light
 and MTF.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from codesign.settings import LEAST, check_ranges
-from metalens.aberrations import OverField, frequencies_per_mm, over_field
+from metalens.aberrations import OverField
 from metalens.core import report
 from metalens.core.arrays import Array
-from metalens.core.errors import ConfigError
 from metalens.core.report import Table, figure_png, make_figure
-from metalens.lens import Lens
 
 CAPTION = (
     "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays, tangential (drawn "
     "through) and sagittal (dashed); relative illumination and, dotted, vignetting; modulation transfer of all light "
     "through the lens, tangential drawn through, sagittal dashed."
 )
-
-
-@dataclass(frozen=True, slots=True)
-class FieldSetting:
-    """How lenses are looked at over the field.
-
-    angles_deg: field angles along x, of either sign; left out, those of [axial].
-    frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of 2 NA /
-    wavelength of the first lens.
-    depth_mm: of the sources, inf for collimated light; left out, the focus that each
-    lens was made for.
-    """
-
-    angles_deg: tuple[float, ...] | None = field(
-        default=None, metadata={"signed": True}
-    )
-    frequencies_per_mm: tuple[float, ...] | None = None
-    depth_mm: float | None = None
-
-    def __post_init__(self) -> None:
-        empty = [
-            name
-            for name in ("angles_deg", "frequencies_per_mm")
-            if getattr(self, name) == ()
-        ]
-        if empty:
-            raise ConfigError(f"{empty[0]} = (): need one or more")
-        above_0 = (LEAST, math.inf)
-        check_ranges(
-            self, angles_deg=(-84.9, 84.9), frequencies_per_mm=above_0, depth_mm=above_0
-        )
-
-    def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
-        """Aberrations of a lens over the field.
-
-        Args:
-            lens: lens to analyse.
-            first: lens that gives the default frequencies.
-            angles_deg: default field angles.
-        """
-        return over_field(
-            lens,
-            self.angles_deg or angles_deg,
-            depth_um=None if self.depth_mm is None else 1e3 * self.depth_mm,
-            frequencies=self.frequencies_per_mm or frequencies_per_mm(first),
-        )
+MTF_CAPTION = (
+    "Modulation transfer over the field, of all light through the lens (T tangential: "
+    "along x, S sagittal: along y)."
+)
 
 
 def field_values(aberrations: OverField) -> Any:
@@ -87,10 +41,10 @@ def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
     """Table of distortion, foci and light over the field angle, and table of the MTF.
 
     Args:
-        field_aberrations: aberrations over the field by name of the lens.
+        field_aberrations: aberrations over the field by wavelength.
     """
     head = (
-        "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
+        "wavelength", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
         "vignetting / %", "illumination",
     )  # fmt: skip
     rows, mtf_rows = [], []
@@ -108,9 +62,8 @@ def field_tables(field_aberrations: Mapping[str, OverField]) -> list[Table]:
     columns = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
     return [
         Table(head, rows, _caption(field_aberrations)),
-        Table(("lens", "angle / °", *columns), mtf_rows, "Modulation transfer over the field, of all light through the lens "
-              "(T tangential: along x, S sagittal: along y)."),
-    ]  # fmt: skip
+        Table(("wavelength", "angle / °", *columns), mtf_rows, MTF_CAPTION),
+    ]
 
 
 def _caption(field_aberrations: Mapping[str, OverField]) -> str:
@@ -126,9 +79,9 @@ def _caption(field_aberrations: Mapping[str, OverField]) -> str:
         for line in aberrations.left_out
     )
     return (
-        f"Over the field along x, sources at {', '.join(sorted(depths))}, at the "
-        "wavelength of each lens. Foci behind (+) or before the sensor, T tangential "
-        f"and S sagittal; illumination relative to 0°.{notes}"
+        f"Over the field along x, sources at {', '.join(sorted(depths))}. Foci behind "
+        "(+) or before the sensor, T tangential and S sagittal; illumination relative "
+        f"to 0°.{notes}"
     )
 
 
@@ -142,7 +95,7 @@ def plot_over_field(field_aberrations: Mapping[str, OverField]) -> bytes:
     every frequency, over the field angle.
 
     Args:
-        field_aberrations: aberrations over the field by name of the lens.
+        field_aberrations: aberrations over the field by wavelength.
     """
     frequencies = next(iter(field_aberrations.values())).frequencies_per_mm
     titles = [

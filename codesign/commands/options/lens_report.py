@@ -22,6 +22,8 @@ class Options(CommonOptions):
         wavelengths_nm: in vacuum; left out, the design wavelength.
         depth_mm: of the source, inf for collimated light; left out, the focus of the
             lens.
+        frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of
+            2 NA / wavelength.
         tolerance: relative L2 error of the PSFs.
     """
 
@@ -30,4 +32,5 @@ class Options(CommonOptions):
     angles_deg: tuple[float, ...] = ()
     wavelengths_nm: tuple[float, ...] = ()
     depth_mm: float | None = None
+    frequencies_per_mm: tuple[float, ...] = ()
     tolerance: float = 1e-3

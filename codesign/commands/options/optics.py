@@ -18,10 +18,9 @@ class Options(CommonOptions):
 
     Attributes:
         lenses: lens files; the first is what the others are compared with.
-        output: folder for optics.json, tables.txt, axial.png, scenes.png, field.png,
-            report.html.
-        config: OPTICS.toml with the tables [axial], [over_field], [scenes] and
-            [reader]; without it the defaults.
+        output: folder for optics.json, tables.txt, axial.png, scenes.png, report.html.
+        config: OPTICS.toml with the tables [axial], [scenes] and [reader]; without it
+            the defaults.
         scenes: number of scenes, in place of the one in the settings.
         reader: train the reference reader behind every lens and print what it reads:
             depth of windows, slippage, with

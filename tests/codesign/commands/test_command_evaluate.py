@@ -22,9 +22,6 @@ count = 3
 angles_deg = [0.0, 5.0]
 binnings = [1, 2]
 window_um = 60.0
-[over_field]
-angles_deg = [-6.0, 0.0, 11.0]
-frequencies_per_mm = [60.0, 120.0]
 [scenes]
 count = 2
 pixels = 24
@@ -78,15 +75,7 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
         for one in read.values()
     )
     assert "90 % interval" in (tmp_path / "out" / "tables.txt").read_text()
-    field = values["lenses"]["b"]["field"]
-    assert field["angles_deg"] == [-6.0, 0.0, 11.0]
-    assert field["chief_um"][2][0] == pytest.approx(
-        600.0 * math.tan(math.radians(11.0)), abs=0.01
-    )
-    assert np.shape(field["mtf"]) == (3, 2, 2)
-    assert "T at 60 / mm" in shown
-    assert "distortion / %" in shown
-    for name in ("axial.png", "scenes.png", "field.png", "report.html"):
+    for name in ("axial.png", "scenes.png", "report.html"):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 
 
@@ -127,7 +116,6 @@ def test_a_deflector_is_told_to_have_no_focus(tmp_path, capsys):
     )
     lens.save(tmp_path / "prism.h5", found[0])
     few = TOML.replace("count = 3", "count = 1").replace("angles_deg = [0.0, 5.0]", "")
-    few = few.replace("[-6.0, 0.0, 11.0]", "[0.0]")
     (tmp_path / "o.toml").write_text(few)
     words = f"{tmp_path}/prism.h5 --config {tmp_path}/o.toml --scenes 1"
     call(f"evaluate optics {words} -o {tmp_path}/out")

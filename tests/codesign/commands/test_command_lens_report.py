@@ -30,7 +30,7 @@ def report(tmp_path_factory):
     )  # fmt: skip
     lens.save(folder / "lens.h5", made)
     words = f"lens-report {folder}/lens.h5 -o {folder}/lens.html --quiet"
-    assert call(f"{words} --angles-deg 0 7 13") == 0
+    assert call(f"{words} --angles-deg 0 7 13 --frequencies-per-mm 60 120") == 0
     (numbers,) = json.loads((folder / "lens.json").read_text()).values()
     return folder, numbers
 
@@ -42,6 +42,8 @@ def test_rays_over_the_field_are_those_of_a_thin_flat_lens(report):
     field = report[1]["field"]
     cosine = np.cos(np.radians([0, 7, 13]))
     assert np.abs(field["distortion"]).max() < 2e-6
+    chief_um = FOCUS_UM * math.tan(math.radians(13))
+    assert field["chief_um"][2][0] == pytest.approx(chief_um, abs=0.01)
     want = FOCUS_UM * (np.stack([cosine**3, cosine], 1) - 1)
     errors = np.array(field["close_error_um"])
     assert (np.abs(field["close_um"] - want) < 5 * errors + 0.2).all()
@@ -73,7 +75,13 @@ def test_the_focus_on_the_axis_is_the_airy_pattern_and_the_pillars_pass_their_le
 def test_the_page_shows_curves_psfs_and_tables(report):
     page = (report[0] / "lens.html").read_text("utf-8")
     assert page.count("data:image/png") == 3
-    for words in ("distortion / %", "FWHM / µm", "Strehl", "behind the pillars"):
+    for words in (
+        "distortion / %",
+        "T at 60 / mm",
+        "FWHM / µm",
+        "Strehl",
+        "behind the pillars",
+    ):
         assert words in page
 
 
