@@ -1,6 +1,4 @@
-"""The page of a retraining: what the made lens cost, what training on bought back, what
-the next mask should draw.
-"""
+"""The page of a retraining: accuracy before and after it, and the next mask."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

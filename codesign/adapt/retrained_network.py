@@ -1,6 +1,4 @@
-"""A retraining taken up again: its network, with the lens it was trained on for, as
-experiments show them.
-"""
+"""Finished retrainings: their network with the fabricated lens."""
 
 import json
 import os
@@ -12,14 +10,12 @@ from characterize.inference import AsBuilt
 from codesign.adapt import train as retraining
 from codesign.adapt.source import (
     FinishedRun,
+    fabricated_lens,
     is_retraining,
-    lens_file,
     load_finished_run,
 )
-from codesign.optics import MadeLens
 from codesign.settings import RetrainConfig
 from codesign.train import RunConfig, checkpoint
-from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.errors import TrainingError
 
@@ -57,27 +53,6 @@ def relative_inputs(
     }
 
 
-def run_of(path: Path) -> Path:
-    """The folder of a run: for a retraining that of its run, else the path itself."""
-    folder = _folder(path)
-    if not is_retraining(folder):
-        return path
-    return _input_paths(folder)["run"] or path
-
-
-def lens_of(path: Path) -> str:
-    """Which lens forms the images: "as designed", or of a retraining "as fitted", or
-    "as made" where that is known.
-
-    Args:
-        path: of the file.
-    """
-    folder = _folder(path)
-    if not is_retraining(folder):
-        return "as designed"
-    return "as made" if _input_paths(folder)["truth"] else "as fitted"
-
-
 def load_retrained(path: Path) -> FinishedRun:
     """A finished run, or a retraining as one: its network with the PSFs of the made
     lens.
@@ -94,7 +69,7 @@ def load_retrained(path: Path) -> FinishedRun:
         TrainingError: no finished run or retraining, or one whose run, fit or truth has
             changed.
     """
-    folder = _folder(path)
+    folder = path.parent if path.suffix == ".safetensors" else path
     if not is_retraining(folder):
         return load_finished_run(path)
     job = "retrained" if path == folder else path.stem
@@ -103,15 +78,14 @@ def load_retrained(path: Path) -> FinishedRun:
     run_dir = _unchanged(folder, "run", recipe.weights)
     built = AsBuilt.load(_unchanged(folder, "asbuilt", recipe.asbuilt))
     source = load_finished_run(run_dir, budget_mmacs=recipe.settings.budget_mmacs)
-    design = lenses.load_plain(
-        lens_file(run_dir, source.settings, source.row["budget_mmacs"])
-    )
-    lens = MadeLens(design, source.settings.optics, response=built.response)
+    lens = fabricated_lens(source, built, insist=True)
     made = fitted = lens.stack(built.parameters())
+    which_lens = "as fitted"
     stacks = {"nominal": lens.stack(), "retrained": fitted}
     if recipe.truth:
         truth = config.load(_unchanged(folder, "truth", recipe.truth), HiddenLens)
         made = stacks["known"] = lens.stack(truth.vector())
+        which_lens = "as made"
     if job not in stacks or not (folder / f"{job}.safetensors").is_file():
         available = ", ".join(f"{name}.safetensors" for name in stacks)
         raise TrainingError(
@@ -121,11 +95,8 @@ def load_retrained(path: Path) -> FinishedRun:
     trainer = retraining.make_trainer(source, recipe.settings, (stacks[job],))
     state = checkpoint.load_checkpoint(folder / f"{job}.safetensors", settings=recipe)
     trainer.model.restore(state["trainer"])
-    return replace(source, run=replace(source.run, trainer=trainer), made=made)
-
-
-def _folder(path: Path) -> Path:
-    return path.parent if path.suffix == ".safetensors" else path
+    run = replace(source.run, trainer=trainer)
+    return replace(source, run=run, made=made, lens=which_lens)
 
 
 def _input_paths(folder: Path) -> dict[str, Path | None]:

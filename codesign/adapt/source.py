@@ -11,12 +11,12 @@ import numpy as np
 
 from characterize.inference import AsBuilt
 from codesign.network import Architecture
-from codesign.optics import PixelPsfStack
+from codesign.optics import MadeLens, PixelPsfStack
 from codesign.train import CodesignRun, RunConfig, checkpoint, evolution
 from codesign.train import run as runs
 from metalens.core import transaction
 from metalens.core.errors import FitError, TrainingError
-from metalens.lens import Lens
+from metalens.lens import Lens, load_plain
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,14 +24,16 @@ class FinishedRun:
     """A finished run that is trained on: its network, the architecture that was chosen,
     its row of result.json.
 
-    made: of a retraining, the lens as made; None where images are those of the run's
-    own lens.
+    folder: of the run. made: of a retraining, the fabricated lens; None where images
+    are those of the run's own lens. lens: which of them forms the images, in words.
     """
 
+    folder: Path
     run: CodesignRun
     architecture: Architecture
     row: dict[str, Any]
     made: PixelPsfStack | None = None
+    lens: str = "as designed"
 
     @property
     def settings(self) -> RunConfig:
@@ -68,10 +70,9 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
             f"{folder} is a half-written run: {', '.join(missing)} missing; finish it with "
             f"`metalens codesign RUN.toml -o {folder} --resume`"
         )
-    transaction.check_manifest(folder)
+    rows = rows_of(folder)
     settings = runs.load_run_settings(folder / "run.toml")
     run = runs.resume_run(folder / "checkpoint.safetensors", settings)
-    rows = rows_of(folder)
     selected = (
         [r for r in rows if r["budget_mmacs"] == budget_mmacs]
         if budget_mmacs
@@ -92,7 +93,7 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
     if settings.run.finetune_steps or settings.search.inner_steps:
         file = weights_file(folder, selected[0]["budget_mmacs"])
         run.trainer.model.restore(checkpoint.load_checkpoint(file, settings=settings))
-    return FinishedRun(run, best.architecture, selected[0])
+    return FinishedRun(folder, run, best.architecture, selected[0])
 
 
 def weights_file(folder: Path, budget_mmacs: float) -> Path:
@@ -155,6 +156,24 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
             f"{path}: cut short or of another version ({error!r}); resume the run"
         ) from None
     return rows
+
+
+def fabricated_lens(
+    source: FinishedRun, result: AsBuilt, *, insist: bool = False
+) -> MadeLens:
+    """The designed lens of a run, ready to be perturbed as a fit found it.
+
+    Args:
+        source: finished run. result: of the fit to captures of its lens.
+        insist: accept a fit that failed its own checks.
+
+    Raises:
+        FitError: see :func:`check_lens`.
+    """
+    budget_mmacs = source.row["budget_mmacs"]
+    design = load_plain(lens_file(source.folder, source.settings, budget_mmacs))
+    check_lens(design, result, insist=insist)
+    return MadeLens(design, source.settings.optics, response=result.response)
 
 
 def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:

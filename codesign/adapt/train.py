@@ -1,6 +1,4 @@
-"""The network trained on for the lens that was made: the inner loop on its PSFs, with
-the optics fixed.
-"""
+"""The network retrained for the fabricated lens: the inner loop with fixed optics."""
 
 import copy
 import math
@@ -13,9 +11,9 @@ from torch import Tensor
 
 from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
-from codesign.adapt.source import FinishedRun, check_lens, lens_file, load_finished_run
+from codesign.adapt.source import FinishedRun, fabricated_lens, load_finished_run
 from codesign.batches import TEST, FrameBatch
-from codesign.optics import MadeLens, PixelPsfStack, as_built_lens
+from codesign.optics import MadeLens, PixelPsfStack
 from codesign.settings import RetrainConfig
 from codesign.train import (
     InnerConfig,
@@ -25,7 +23,7 @@ from codesign.train import (
     assess,
     checkpoint,
 )
-from metalens import lens as lenses
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,7 +73,7 @@ class LensPsfs:
 
     nominal: as designed. best: of the fitted values. drawn: from the posterior, for
     training. judges: for testing: the truth where it is known, else further draws.
-    known: whether it is.
+    known: whether it is. judge_parameters: all parameters of the first judge.
     """
 
     nominal: PixelPsfStack
@@ -83,6 +81,7 @@ class LensPsfs:
     drawn: tuple[PixelPsfStack, ...]
     judges: tuple[PixelPsfStack, ...]
     known: bool
+    judge_parameters: Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -148,11 +147,8 @@ def lens_psfs(
         config: of the retraining; numbers of posterior draws.
         truth: lens of a virtual bench; None of a real one.
     """
-    rows = list(
-        as_built_lens.posterior_parameters(
-            result, config.draws + config.judge, seed=config.seed
-        )
-    )
+    samples = result.lens_samples(config.draws + config.judge, seed=config.seed)
+    rows = [result.parameters(sample) for sample in samples]
     judge_rows = [truth.vector()] if truth else rows[config.draws :]
     return LensPsfs(
         lens_model.stack(),
@@ -160,6 +156,7 @@ def lens_psfs(
         tuple(lens_model.stack(row) for row in rows[: config.draws]),
         tuple(lens_model.stack(row) for row in judge_rows),
         truth is not None,
+        judge_rows[0],
     )
 
 
@@ -174,16 +171,14 @@ def make_trainer(
         source: finished run: its network, lens and sensor. config: of the retraining.
         stacks: PSFs of made lenses.
     """
-    settings = source.settings
     origin = source.run.trainer
-    trainer = Trainer(
-        fine_tuning(settings.inner, config),
-        settings.optics,
-        origin.sensor,
-        origin.scenes,
-        copy.deepcopy(origin.model),
+    trainer = replace(
+        origin,
+        inner=fine_tuning(source.settings.inner, config),
+        model=copy.deepcopy(origin.model),
         architecture=source.architecture,
         stacks=stacks,
+        budgets_mmacs=(),
     )
     trainer.light.device = origin.light.device
     return trainer
@@ -264,7 +259,7 @@ def judge_network(
     config: RetrainConfig,
     stacks: Sequence[PixelPsfStack],
     *,
-    frames: TestFrames | None = None,
+    frames: TestFrames,
     finer: bool = True,
 ) -> NetworkAccuracy:
     """Errors of a network on test frames, frame by frame the mean over lenses.
@@ -275,11 +270,10 @@ def judge_network(
         trainer: training with its network.
         source: finished run: its network, lens and sensor. config: of the retraining.
         stacks: PSFs of made lenses; at most ``config.judge`` are used.
-        frames: of :func:`render_test_frames`, where several cases are judged.
+        frames: of :func:`render_test_frames`.
         finer: judge on images formed at a quarter of the tolerance too.
     """
     assess.recalibrate_network(trainer, source.architecture)
-    frames = frames or render_test_frames(source, config)
     own, fine = [], []
     for stack in stacks[: config.judge]:
         given = trainer, frames, config.test_batches
@@ -371,14 +365,7 @@ def retrain(
     """
     config = config or RetrainConfig()
     source = load_finished_run(folder, budget_mmacs=config.budget_mmacs)
-    design = lenses.load(lens_file(folder, source.settings, source.row["budget_mmacs"]))
-    check_lens(design, result)
-    psfs = lens_psfs(
-        MadeLens(design, source.settings.optics, response=result.response),
-        result,
-        config,
-        truth,
-    )
+    psfs = lens_psfs(fabricated_lens(source, result), result, config, truth)
     trained = {
         name: make_trainer(source, config, stacks)
         for name, stacks in training_stacks(psfs).items()

@@ -114,17 +114,14 @@ def _simulate(
         steps, total=config.subjects, label="subjects"
     ):
         results = latest
-    paths = dict(zip(names, options.runs, strict=True))
-    run_results = {
-        name: retrained_network.run_of(path) / "result.json"
-        for name, path in paths.items()
-    }
     values = experiment_summary(results, config) | {
         "images": {
-            name: json.loads(path.read_text("utf-8")).get("image")
-            for name, path in run_results.items()
+            name: json.loads((source.folder / "result.json").read_text("utf-8")).get(
+                "image"
+            )
+            for name, source in sources.items()
         },
-        "lenses": {n: retrained_network.lens_of(path) for n, path in paths.items()},
+        "lenses": {name: source.lens for name, source in sources.items()},
         "beyond_training_mm": {
             name: sorted(
                 slip

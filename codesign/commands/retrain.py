@@ -10,7 +10,7 @@ from typing import Any
 from characterize import next_mask
 from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
-from codesign.adapt import FinishedRun, LensPsfs, lens_file
+from codesign.adapt import FinishedRun, LensPsfs
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained_network import (
@@ -19,9 +19,9 @@ from codesign.adapt.retrained_network import (
     RetrainingRecipe,
     relative_inputs,
 )
-from codesign.adapt.source import check_lens, load_finished_run
+from codesign.adapt.source import fabricated_lens, load_finished_run
 from codesign.commands.options.retrain import Options
-from codesign.optics import MadeLens, posterior_parameters, psf_error
+from codesign.optics import MadeLens, psf_error
 from codesign.train import (
     Trainer,
     assess,
@@ -30,7 +30,6 @@ from codesign.train import (
     place_on_device,
     results,
 )
-from metalens import lens
 from metalens.core import config, store
 from metalens.core.errors import TrainingError
 from metalens.core.transaction import OutputDraft
@@ -40,7 +39,7 @@ LOG = "log.jsonl"
 UNKNOWN = "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
 
 
-Given = tuple[FinishedRun, AsBuilt, lens.Lens, HiddenLens | None, Bias]
+Given = tuple[FinishedRun, AsBuilt, MadeLens, HiddenLens | None, Bias]
 
 
 def run(options: Options) -> int:
@@ -56,10 +55,7 @@ def run(options: Options) -> int:
     )
     place_on_device(source.run.trainer, device_of(options.device))
     result = AsBuilt.load(options.asbuilt)
-    design = lens.load_plain(
-        lens_file(options.run_dir, source.settings, source.row["budget_mmacs"])
-    )
-    check_lens(design, result, insist=options.insist)
+    lens_model = fabricated_lens(source, result, insist=options.insist)
     truth = config.load(options.truth, HiddenLens) if options.truth else None
     old = next_mask.present_bias(options.process)
     recipe = RetrainingRecipe(
@@ -74,7 +70,7 @@ def run(options: Options) -> int:
     ) as draft:
         _check_recipe(draft, recipe, resume=options.resume)
         story = _retrain_and_correct(
-            options, draft.path, recipe, (source, result, design, truth, old)
+            options, draft.path, recipe, (source, result, lens_model, truth, old)
         )
     return options.console.judged(
         _values(story, options), _text(story, options.output), [story.outcome.above]
@@ -87,27 +83,19 @@ def _retrain_and_correct(
     """Retrain, evaluate and correct; write the correction and networks into the
     folder.
     """
-    source, result, design, truth, old = inputs
-    made = MadeLens(design, source.settings.optics, response=result.response)
+    source, result, lens_model, truth, old = inputs
     console = options.console
     console.say(
         f"lenses: the design, the fit and {options.settings.draws} draws of its posterior"
     )
-    psfs = retraining.lens_psfs(made, result, options.settings, truth)
+    psfs = retraining.lens_psfs(lens_model, result, options.settings, truth)
     trained = {
         name: _train(options, folder, (recipe, source, psfs), name)
         for name in retraining.training_stacks(psfs)
     }
     console.say(f"judging: {len(trained) + 2} cases on the same frames")
     outcome = retraining.retraining_outcome(source, options.settings, psfs, trained)
-    if truth:
-        true_parameters = truth.vector()
-    else:
-        draws = posterior_parameters(
-            result, options.settings.draws + 1, seed=options.settings.seed
-        )
-        true_parameters = list(draws)[-1]
-    mask = next_mask.plan_next_mask(result, old=old, truths=[true_parameters])
+    mask = next_mask.plan_next_mask(result, old=old, truths=[psfs.judge_parameters])
     story = retrain_report.RetrainingResults(
         outcome,
         (psf_error(psfs.best, psfs.nominal), psf_error(psfs.judges[0], psfs.nominal)),

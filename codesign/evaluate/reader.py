@@ -1,5 +1,5 @@
-"""A fixed, small network that is trained on the images of any lens; its depth and
-slippage errors rate the lens.
+"""The reference reader: a small network trained on the images of a lens, whose errors
+rate that lens.
 """
 
 import functools

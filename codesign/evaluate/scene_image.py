@@ -15,7 +15,7 @@ from metalens.core import report, store
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
 from metalens.core.store import Provenance
-from metalens.image import Grid, Imager, imager
+from metalens.image import Grid, imager
 from metalens.lens import Lens
 from metalens.psf import Source, spectrum
 
@@ -60,48 +60,6 @@ def margin_of(pitch_um: float) -> int:
     return math.ceil(BLUR_UM / pitch_um)
 
 
-def lens_imager(
-    lens: Lens,
-    camera: PinholeCamera,
-    depths_um: tuple[float, float],
-    *,
-    fwhm_nm: float = 0.0,
-    tolerance: float = TOLERANCE,
-) -> Imager:
-    """Imager of a lens on the samples of a camera, for frames with a margin
-    (:func:`margin_of`).
-
-    Args:
-        lens: lens to image through.
-        camera: samples of the frame without margin.
-        depths_um: nearest and farthest depth of the scenes.
-        fwhm_nm: spectral width of the light; 0 for one wavelength.
-        tolerance: relative L2 error allowed.
-
-    Raises:
-        SceneError: see :func:`metalens.image.imager`.
-    """
-    margin = margin_of(camera.pitch_um)
-    grid = Grid(
-        (camera.pixels, camera.pixels),
-        camera.pitch_um,
-        depths_um,
-        margin,
-        2 * margin + 1,
-    )
-    return imager(lens, grid, spectrum=diode_source(lens, fwhm_nm), tolerance=tolerance)
-
-
-def diode_source(lens: Lens, fwhm_nm: float) -> Source | None:
-    """Light source of a width about the design wavelength; None for a width of 0.
-
-    Args:
-        lens: lens whose design wavelength is the middle.
-        fwhm_nm: spectral width of the light; 0 for one wavelength.
-    """
-    return Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
-
-
 @torch.no_grad()
 def image_first_frames(
     lens: Lens,
@@ -138,7 +96,10 @@ def image_first_frames(
             "farther from its sensor"
         )
     depths_um = 0.98 * float(visible_um.min()), 1.02 * float(visible_um.max())
-    optics = lens_imager(lens, camera, depths_um, fwhm_nm=fwhm_nm)
+    shape = (camera.pixels, camera.pixels)
+    grid = Grid(shape, camera.pitch_um, depths_um, margin, 2 * margin + 1)
+    source = Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
+    optics = imager(lens, grid, spectrum=source, tolerance=TOLERANCE)
     inner = slice(margin, margin + camera.pixels)
     scene = renderings.pinhole()[:, inner, inner]
     light = optics(renderings.frames)
@@ -152,7 +113,6 @@ def image_first_frames(
         np.degrees(np.arctan(place_um.numpy()[nodes] / lens.reduced_um))
         for place_um, nodes in ((optics.plan.y_um, rows), (optics.plan.x_um, columns))
     )
-    source = diode_source(lens, fwhm_nm)
     return ImagedFrames(
         scene.numpy().astype(np.float32),
         (light * (scene.sum() / light.sum())).numpy().astype(np.float32),

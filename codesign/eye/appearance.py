@@ -1,5 +1,5 @@
-"""What real frames have and the model of the eye has not: spectacles, make-up, lashes
-before the eye, uneven light, movement.
+"""Augmentations of rendered frames: spectacles, make-up, lashes, uneven light,
+movement.
 """
 
 import tomllib

@@ -1,6 +1,4 @@
-"""What a network reads of frames, in the units that gaze is calibrated in, and what
-calibrates a person with it.
-"""
+"""Network readings in the units of gaze calibration, and protocols of calibrators."""
 
 from dataclasses import dataclass
 from typing import Protocol

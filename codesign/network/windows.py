@@ -1,5 +1,5 @@
-"""What a window of the frame holds that blur changes: log powers of waves, and how its
-steps of brightness are spread.
+"""Features of blur in each window of a frame: log power spectra and statistics of
+brightness steps.
 """
 
 import functools

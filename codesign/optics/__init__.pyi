@@ -2,7 +2,6 @@ from . import as_built_lens as as_built_lens
 from . import image_formation as image_formation
 from . import stack as stack
 from .as_built_lens import MadeLens as MadeLens
-from .as_built_lens import posterior_parameters as posterior_parameters
 from .as_built_lens import psf_error as psf_error
 from .lens_errors import DrawnLensErrors as DrawnLensErrors
 from .lens_errors import LensErrors as LensErrors

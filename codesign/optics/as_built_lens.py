@@ -1,8 +1,7 @@
-"""PSFs of a lens as fabricated, on the samples of a run: the transmission of every pillar
-averaged over cells of the pupil.
+"""PSFs of a fabricated lens on the samples of a run, by means of the pillars over
+cells of the pupil.
 """
 
-from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -10,7 +9,6 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from characterize.inference import AsBuilt
 from characterize.model import PLACE, as_built, parameter_vector, process_state_of
 from codesign.optics.stack import OpticsConfig, PixelPsfStack, psfs_over_depth
 from metalens.core.arrays import Array
@@ -20,29 +18,6 @@ from metalens.image import Optics, SmoothWave, cell_um, interpolate_cells
 from metalens.lens import Lens
 
 OF_PROCESS = [PLACE[row.name] for row in PERTURBATIONS]
-
-
-def at_rest(x: Array) -> Array:
-    """All parameters with those of bench and light source reset to their defaults.
-
-    What a lens keeps when it leaves the bench: the process and its sensor distance.
-
-    x: all parameters, in the order of ``characterize.model.parameters.NAMES``.
-    """
-    kept = [*OF_PROCESS, PLACE["distance_um"]]
-    rest = parameter_vector()
-    rest[kept] = x[kept]
-    return rest
-
-
-def posterior_parameters(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
-    """All parameters of ``count`` lenses drawn from the posterior of a fit.
-
-    Args:
-        built: of the fit. seed: of the random generator.
-    """
-    for row in built.lens_samples(count, seed=seed):
-        yield built.parameters(row)
 
 
 def psf_error(one: PixelPsfStack, other: PixelPsfStack) -> float:
@@ -150,7 +125,7 @@ class MadeLens:
                 camera) are ignored.
         """
         design, settings = self.design, self.settings
-        parameters = at_rest(parameter_vector() if x is None else x)
+        parameters = parameter_vector() if x is None else x
         distance_um = design.sensor_distance_um + float(
             parameters[PLACE["distance_um"]]
         )

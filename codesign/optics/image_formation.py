@@ -1,5 +1,5 @@
-"""The image that training sees: true over field, depth and spectrum, or by one PSF a
-depth, as the settings say.
+"""The image that training sees: true over field, depth and spectrum, or of
+one PSF a depth.
 """
 
 import functools

@@ -1,5 +1,5 @@
-"""Lenses as they will be made, drawn while training: what the assembly and every cause
-of the table do to the light.
+"""Fabrication and assembly errors of lenses that training draws, and their effect
+on phase.
 """
 
 import dataclasses

@@ -1,5 +1,5 @@
-"""How well a network reads frames that it never saw: slippage, pupil mask, gaze, and
-whether it reads the optics.
+"""Accuracy of a network on frames that it never saw: slippage, pupil mask, gaze,
+response to depth.
 """
 
 import itertools

@@ -1,5 +1,5 @@
-"""What a network sees of a step: the images of the lens, kept while it stands and
-formed anew where it moved, and their frames on the sensor.
+"""Images of the lens for each training step, cached while it is fixed, and the
+sensor frames of them.
 """
 
 import functools

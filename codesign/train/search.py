@@ -58,15 +58,12 @@ def specialise_candidate(
         for inner, count in zip(
             (replace(joint, budget_mmacs=budget_mmacs), weights), steps, strict=True
         ):
-            trainer = Trainer(
-                inner,
-                source.optics,
-                source.sensor,
-                source.scenes,
-                model,
+            trainer = replace(
+                source,
+                inner=inner,
+                model=model,
                 architecture=architecture,
-                stacks=source.light.stacks,
-                triplets=source.triplets,
+                budgets_mmacs=(),
             )
             trainer.light.device = source.light.device
             for _ in trainer.run() if count else ():

@@ -1,5 +1,5 @@
-"""What training asks of the lens itself: Eqs. 4 to 6, how separably the sensor shows
-gaze and slippage, or the depth that blurred texture tells.
+"""Optics losses: separability of gaze and slippage (Eqs. 4 to 6), or depth
+information of blurred texture.
 """
 
 import math

@@ -1,5 +1,5 @@
-"""The inner loop: lens, pixel pitch and network weights move together against one loss
-(paper Eqs. 8 and 10), on a processor or a GPU.
+"""The inner loop: lens, pixel pitch and network weights trained with one loss
+(paper Eqs. 8 and 10).
 """
 # ruff: noqa: RUF009  (records of settings are frozen)
 

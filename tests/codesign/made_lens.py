@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from characterize.inference.asbuilt import AsBuilt
-from characterize.model.parameters import NAMES
+from characterize.model.parameters import NAMES, PLACE, parameter_vector
 from codesign.network.architecture import smallest_architecture
+from codesign.optics.as_built_lens import OF_PROCESS
 from codesign.optics.stack import OpticsConfig
 from codesign.train import evolution, run
 from codesign.train.evolution import EvaluatedCandidate, EvolutionState
@@ -71,6 +72,14 @@ OPTICS = OpticsConfig(
     0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11, image="uniform"
 )
 SEEN = replace(OPTICS, depths_mm=(12.0, 40.0))  # of TINY, where eyes are
+
+
+def at_rest(x):
+    """Parameters of process and sensor distance; the others at their defaults."""
+    kept = [*OF_PROCESS, PLACE["distance_um"]]
+    rest = parameter_vector()
+    rest[kept] = x[kept]
+    return rest
 
 
 @functools.lru_cache

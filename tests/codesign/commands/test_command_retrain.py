@@ -272,7 +272,8 @@ def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(
         (shutil.copytree if (folder / name).is_dir() else shutil.copy)(
             folder / name, tmp_path / name
         )
-    assert retrained_network.lens_of(tmp_path / "bowed") == "as fitted"
+    shown = retrained_network.load_retrained(tmp_path / "bowed")
+    assert shown.lens == "as fitted"
     assert _shown(tmp_path, "bowed/known.safetensors", out="shown") == 2
     assert (
         "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err

@@ -26,7 +26,7 @@ def _engine(x, settings):
     """The same PSFs from every pillar, integrated over samples whose light is
     low-passed to their grid.
     """
-    lens, known = m.small(), as_built_lens.at_rest(x)
+    lens, known = m.small(), m.at_rest(x)
     t = as_built.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
@@ -66,7 +66,7 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     """By which the true image of a made lens tells what cells of pillars leave out of
     it.
     """
-    known = as_built_lens.at_rest(X)
+    known = m.at_rest(X)
     want = as_built.as_built_transmission(
         m.small(), proxy_sensitivity(m.small()), known
     )
@@ -113,11 +113,10 @@ def test_only_what_the_lens_keeps_enters():
 
 
 def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
-    draws = np.array(
-        list(as_built_lens.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
-    )
-    again = np.array(
-        list(as_built_lens.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
+    built = m.asbuilt(sigma=0.5)
+    draws, again = (
+        np.array([built.parameters(row) for row in built.lens_samples(400, seed=3)])
+        for _ in range(2)
     )
     assert np.array_equal(draws, again)
     bias = draws[:, PLACE["bias_nm"]]

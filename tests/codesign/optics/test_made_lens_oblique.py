@@ -24,7 +24,7 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     light of other orders leave 3 % here.
     """
     settings = dataclasses.replace(m.OPTICS, angle_deg=angle_deg)
-    lens, known = m.small(), as_built_lens.at_rest(X)
+    lens, known = m.small(), m.at_rest(X)
     t = as_built.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
