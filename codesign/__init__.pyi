@@ -1,4 +1,4 @@
-from .adapt.train import retrain as retrain
+from .adapt.train import retrain_network as retrain_network
 from .eye.renderer import render as render
 from .network.cost import macs as macs
 from .network.supernet import Supernet as Supernet

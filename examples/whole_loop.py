@@ -105,7 +105,7 @@ made.save(work / "asbuilt.h5")
 # Training draws lenses from the posterior of the fit. `before` is the network that nobody warned.
 
 # %%
-told = retraining.retrain(
+told = retraining.retrain_network(
     work / "run",
     made,
     config=RetrainConfig(steps=20, draws=3, judge=1, test_batches=4),

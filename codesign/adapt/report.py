@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from characterize.next_mask import NextMask, table_rows
-from codesign.adapt.train import RetrainingOutcome
+from codesign.adapt.train import LensPsfs, RetrainingOutcome
 from metalens.core import report
 from metalens.core.report import Figure, Section, Table
 
@@ -24,15 +24,12 @@ CASES = {
 class RetrainingResults:
     """Content of the page.
 
-    psf_errors: of the fitted lens and of the judging lens, relative to the nominal one.
-    drawn: lenses of the posterior that training saw. known: whether the truth judges.
-    mask: correction of the next mask. cautions: in words.
+    psfs: of the lenses that trained and judged. mask: correction of the next mask.
+    cautions: in words.
     """
 
     outcome: RetrainingOutcome
-    psf_errors: tuple[float, float]
-    drawn: int
-    known: bool
+    psfs: LensPsfs
     mask: NextMask
     cautions: Sequence[str] = ()
 
@@ -43,10 +40,10 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     Args:
         path: of the file. story: everything that the page shows.
     """
-    outcome = story.outcome
+    outcome, psfs = story.outcome, story.psfs
     judge = (
         "the true lens of the virtual bench"
-        if story.known
+        if psfs.known
         else "other lenses of the posterior"
     )
     lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
@@ -54,8 +51,10 @@ def write_retraining_page(path: Path, story: RetrainingResults) -> None:
         "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
         "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
         "is formed at a quarter of the run's tolerance: a ratio near 1 says that results do not depend on it.\n\nPSFs of "
-        f"the fitted lens differ from the nominal ones by {story.psf_errors[0]:.1%} (relative L2 over all depths), those "
-        f"of the lens that judges by {story.psf_errors[1]:.1%}. Training drew {story.drawn} lenses from the posterior; "
+        f"the fitted lens differ from the nominal ones by {psfs.errors['fitted']:.1%} "
+        "(relative L2 over all depths), those "
+        f"of the lens that judges by {psfs.errors['judge']:.1%}. Training drew "
+        f"{len(psfs.drawn)} lenses from the posterior; "
         f"{gap_text(outcome)}."
     )
     bars = Figure(plot_error_bars(outcome), "Slippage error, with its 95 % interval.")

@@ -13,7 +13,7 @@ from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
 from codesign.adapt.source import FinishedRun, fabricated_lens, load_finished_run
 from codesign.batches import TEST, FrameBatch
-from codesign.optics import MadeLens, PixelPsfStack
+from codesign.optics import MadeLens, PixelPsfStack, psf_error
 from codesign.settings import RetrainConfig
 from codesign.train import (
     InnerConfig,
@@ -82,6 +82,14 @@ class LensPsfs:
     judges: tuple[PixelPsfStack, ...]
     known: bool
     judge_parameters: Array
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Relative L2 error of the PSFs of the fitted and of the first judging lens
+        against the nominal ones.
+        """
+        lenses = {"fitted": self.best, "judge": self.judges[0]}
+        return {name: psf_error(one, self.nominal) for name, one in lenses.items()}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -341,7 +349,7 @@ def retraining_outcome(
     )
 
 
-def retrain(
+def retrain_network(
     folder: Path,
     result: AsBuilt,
     *,

@@ -120,14 +120,13 @@ def gather_rows(part: Tensor, rows: Tensor, count: int) -> Tensor:
     return _differentiable_sum(whole.index_copy(0, rows.to(part.device), part))
 
 
-def mean_of(values: list[float]) -> list[float]:
+def mean_of(values: Tensor) -> Tensor:
     """Mean of numbers over the processes.
 
     Args:
-        values: of this process.
+        values: of this process, of any shape.
     """
-    total = torch.tensor(values, dtype=torch.float64)
-    return (_sum_in_place(total) / process_count()).tolist()
+    return _sum_in_place(values.clone()) / process_count()
 
 
 def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:

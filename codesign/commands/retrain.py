@@ -21,7 +21,7 @@ from codesign.adapt.retrained_network import (
 )
 from codesign.adapt.source import fabricated_lens, load_finished_run
 from codesign.commands.options.retrain import Options
-from codesign.optics import MadeLens, psf_error
+from codesign.optics import MadeLens
 from codesign.train import (
     Trainer,
     assess,
@@ -98,9 +98,7 @@ def _retrain_and_correct(
     mask = next_mask.plan_next_mask(result, old=old, truths=[psfs.judge_parameters])
     story = retrain_report.RetrainingResults(
         outcome,
-        (psf_error(psfs.best, psfs.nominal), psf_error(psfs.judges[0], psfs.nominal)),
-        len(psfs.drawn),
-        psfs.known,
+        psfs,
         mask,
         (*result.problems, *result.degeneracies, *([] if psfs.known else [UNKNOWN])),
     )
@@ -204,8 +202,8 @@ def _values(
         "gap_mm": outcome.gap_mm,
         "gap_sigma_mm": outcome.gap_sigma_mm,
         "recovered": outcome.recovered,
-        "psf_error": dict(zip(("fitted", "judge"), story.psf_errors, strict=True)),
-        "truth_known": story.known,
+        "psf_error": story.psfs.errors,
+        "truth_known": story.psfs.known,
         "next_lens": [
             {"name": step.name, "strehl": step.strehl, "light": step.light}
             for step in story.mask.steps

@@ -146,13 +146,9 @@ class RunningNorm(nn.Module):
     def _follow(self, x: Tensor) -> None:
         """Update the running moments by a batch; unchanged where it is not finite."""
         values = x.double()
-        moments = torch.stack([values.mean((0, 2, 3)), (values**2).mean((0, 2, 3))])
-        if parallel.process_count() > 1:
-            moments = (
-                torch.tensor(parallel.mean_of(moments.flatten().tolist()))
-                .to(moments)
-                .view_as(moments)
-            )
+        moments = parallel.mean_of(
+            torch.stack([values.mean((0, 2, 3)), (values**2).mean((0, 2, 3))])
+        )
         if bool(torch.isfinite(moments).all()):
             self.batches += 1
             share = 1 / min(int(self.batches), 100)

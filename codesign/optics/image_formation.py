@@ -37,6 +37,7 @@ def make_imager(
     margin: int,
     error: DrawnLensErrors | None = None,
     made: PixelPsfStack | None = None,
+    shared: bool = False,
     device: torch.device | str = "cpu",
 ) -> Imager:
     """Imager of square frames: shift-invariant PSFs, or the true image.
@@ -49,6 +50,7 @@ def make_imager(
         frame: samples along a side, margin included. margin: samples around the frame.
         error: one draw of the lens errors.
         made: a fabricated lens in place of the coefficients.
+        shared: as for :func:`codesign.optics.stack.lens_psf_stack`.
         device: where the frames are imaged, and the true image's PSFs are computed.
 
     Raises:
@@ -56,7 +58,9 @@ def make_imager(
             one chief ray alone.
     """
     if settings.image == "uniform":
-        stack = made or lens.lens_psf_stack(settings, coefficients_rad, error=error)
+        stack = made or lens.lens_psf_stack(
+            settings, coefficients_rad, error=error, shared=shared
+        )
         return lens.stack_imager(settings, stack, frame, margin=margin).to(device)
     grid = frame, margin, torch.device(device)
     if made is not None:

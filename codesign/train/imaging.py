@@ -18,7 +18,6 @@ from codesign.optics import (
     PixelPsfStack,
     image_formation,
 )
-from codesign.optics import stack as lens
 from metalens.image import Imager, Sensor, draw_nodes
 from metalens.image import sensor as camera
 from metalens.psf import pixel_count
@@ -95,7 +94,7 @@ class StepImaging:
         if self.stacks:
             return self._drawn(step, coefficients_rad, make)
         if self.optics.image == "uniform":
-            return self._uniform(step, coefficients_rad, frame, margin, live=live)
+            return self._uniform(step, coefficients_rad, make, live=live)
         imager = self._true(step, coefficients_rad.detach(), make, live=live)
         if not live:
             return imager
@@ -123,8 +122,7 @@ class StepImaging:
         self,
         step: int,
         coefficients_rad: Tensor,
-        frame: int,
-        margin: int,
+        make: Callable[..., Imager],
         *,
         live: bool,
     ) -> Imager:
@@ -134,12 +132,7 @@ class StepImaging:
         error = self.draw(step)
         if not live and error is None and self._ready is not None:
             return self._ready
-        stack = lens.lens_psf_stack(
-            self.optics, coefficients_rad, error=error, shared=True
-        )
-        imager = lens.stack_imager(self.optics, stack, frame, margin=margin).to(
-            self.device
-        )
+        imager = make(coefficients_rad=coefficients_rad, error=error, shared=True)
         self._ready = None if live or error is not None else imager
         return imager
 

@@ -272,17 +272,12 @@ def _finest_affordable_pitch_um(run: CodesignRun, *, moves: bool) -> float:
     smallest = smallest_architecture(settings.space)
     budget = min(settings.run.budgets_mmacs) * 1e6
     start_um = settings.run.pitch_um
-    count = _macs_by_pitch(run, smallest)
-    if count(start_um) > budget:
-        coarsest_um = cost.coarsest_um(run.window_um, settings.space.resolution[0])
-        affordable_um = finest_within(count, budget, start_um, coarsest_um)
-        advice = ""
-        if count(affordable_um) <= budget:
-            finest = math.ceil(affordable_um * 100) / 100
-            advice = f", or begin with run.pitch_um = {finest:g} or more"
+    macs = _macs_by_pitch(run, smallest)(start_um)
+    if macs > budget:
         raise TrainingError(
-            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(start_um) / 1e6:.2f} MMACs at "
-            f"run.pitch_um = {start_um:g}: raise run.budgets_mmacs{advice}"
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, "
+            f"{macs / 1e6:.2f} MMACs at run.pitch_um = {start_um:g}: raise "
+            "run.budgets_mmacs, or begin with coarser pixels"
         )
     return finest_pitch_um(run, smallest, budget, begins_um=start_um) if moves else 0.0
 
@@ -307,7 +302,8 @@ def _macs_by_pitch(
 def finest_pitch_um(
     run: CodesignRun, architecture: Architecture, budget: float, *, begins_um: float
 ) -> float:
-    """The finest pitch in um at which an architecture is within its budget.
+    """The finest pitch in um at which an architecture is within its budget, by
+    geometric bisection.
 
     0 where it is within it even at the sampling of the image; at most ``begins_um``.
 
@@ -319,27 +315,14 @@ def finest_pitch_um(
     finest = min(run.settings.optics.sample_um, begins_um)
     if count(finest) <= budget:
         return 0.0
-    return finest_within(count, budget, finest, begins_um)
-
-
-def finest_within(
-    count: Callable[[float], float], budget: float, low_um: float, high_um: float
-) -> float:
-    """The finest pitch in um within the budget, by geometric bisection over a range.
-
-    The low pitch is taken to be beyond the budget; the high one where no other is
-    within it.
-
-    Args:
-        count: multiply-accumulates at a pitch in um. budget: of them.
-        low_um: finest pitch. high_um: coarsest pitch.
-    """
+    affordable = begins_um
     for _ in range(40):
-        middle = math.sqrt(low_um * high_um)
-        low_um, high_um = (
-            (low_um, middle) if count(middle) <= budget else (middle, high_um)
-        )
-    return high_um
+        middle = math.sqrt(finest * affordable)
+        if count(middle) <= budget:
+            affordable = middle
+        else:
+            finest = middle
+    return affordable
 
 
 def save_run(path: Path, run: CodesignRun) -> None:

@@ -437,7 +437,7 @@ class Trainer:
         self.light.pass_on(self.model.coefficients_rad)
         parameters = [p for _, ps in self.groups.values() for p in ps]
         parallel.average_gradients(parameters)
-        finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
+        finite = math.isfinite(parallel.mean_of(total.detach()))
         finite = finite and has_finite_gradients(parameters)
         for buffer, before in () if finite else buffers:  # running means
             buffer.copy_(before)
@@ -445,8 +445,8 @@ class Trainer:
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs.mean() / 1e6)
         loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of(
-            [float(v.detach()) for v in values]
-        )
+            torch.tensor([float(v.detach()) for v in values], dtype=torch.float64)
+        ).tolist()
         return LogRecord(
             self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
         )

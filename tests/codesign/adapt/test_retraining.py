@@ -198,7 +198,7 @@ def test_only_weights_move(folder, found):
 
 
 def test_the_whole_story_in_one_call(folder):
-    told = codesign.retrain(folder, m.asbuilt(), config=SHORT, truth=TRUTH)
+    told = codesign.retrain_network(folder, m.asbuilt(), config=SHORT, truth=TRUTH)
     assert all(
         np.isfinite(v).all() for row in told.rows().values() for v in row.values()
     )

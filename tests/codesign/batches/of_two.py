@@ -112,7 +112,7 @@ def main(folder: Path) -> None:
         "searched": searched(),
         "part": parallel.batch_share(batch(6)),
         "refused": refused(),
-        "mean": parallel.mean_of([1.5 + rank, -2.0 * rank]),
+        "mean": parallel.mean_of(torch.tensor([1.5 + rank, -2.0 * rank])).tolist(),
         "each": parallel.share_work(
             lambda item: done.append(item) or 10.0 * item, ITEMS
         ),
@@ -122,7 +122,7 @@ def main(folder: Path) -> None:
     if rank == 0:
         try:
             while True:
-                parallel.mean_of([1.0])
+                parallel.mean_of(torch.ones(1))
         except TrainingError as error:
             found["lost"] = str(error)
     torch.save(found, folder / f"{rank}.pt")
