@@ -27,8 +27,6 @@ from metalens.library.record import Sweep, check_light
 from metalens.library.workers import FIT_SHARE, SOLVE_SHARE, SweepJournal, SweepTask
 
 KIND = "axes-library"
-# nodes along an axis: Chebyshev points of degree 6, which both others hold, 12 and 18
-LEVELS = 7, 13, 19
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -485,13 +483,20 @@ def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     return most
 
 
-def _choose_lines(nodes: _Nodes, sweep: Sweep) -> tuple[Array, Array]:
-    """(x, y) nodes: Chebyshev points of the least of ``LEVELS`` at which at most 3 % of
+def _choose_lines(
+    nodes: _Nodes, sweep: Sweep, counts: tuple[int, ...] = (7, 13, 19)
+) -> tuple[Array, Array]:
+    """(x, y) nodes: Chebyshev points of the least of ``counts`` at which at most 3 % of
     the pairs exceed the interpolation's share of the tolerance, else of the last.
+
+    Args:
+        nodes: solver of the wavelength.
+        sweep: settings with both ranges.
+        counts: of nodes along an axis; those of degree 6 are among those of 12 and 18.
     """
     spans = size_ranges(sweep)
     grid = np.linspace(*spans[0], 61), np.linspace(*spans[1], 61)
-    for count in LEVELS:
+    for count in counts:
         unit = -np.cos(np.pi * np.arange(count) / (count - 1))
         # rounded, so that nodes of two levels are equal
         x, y = (np.round(low + (high - low) * (unit + 1) / 2, 9) for low, high in spans)

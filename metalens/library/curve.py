@@ -15,8 +15,6 @@ from metalens.core.errors import DomainError
 
 Solver = Callable[[float], Response]
 FIT_SHARE = 0.2  # residual of the rational fit, as a share of the tolerance
-CALM = 2  # consecutive new nodes that the fit must predict within the tolerance
-FIRST = 13  # Chebyshev points at the start of a search
 # least spacing of nodes: no lithography resolves 20 pm, and solvers place narrow poles
 # no better
 FINEST_UM = 2e-5
@@ -284,27 +282,34 @@ class ResponseCurve:
         return np.column_stack([poles.real, np.abs(poles.imag)])
 
 
-def starting_diameters(low_um: float, high_um: float) -> list[float]:
-    """(FIRST,) Chebyshev points with both ends, um: the diameters that
+def starting_diameters(low_um: float, high_um: float, count: int = 13) -> list[float]:
+    """(count,) Chebyshev points with both ends, um: the diameters that
     :func:`sample_adaptively` solves first.
 
     Args:
         low_um: least size, um.
         high_um: largest size, um.
+        count: of the points.
     """
     middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
-    start = middle - half * np.cos(np.pi * np.arange(FIRST) / (FIRST - 1))
+    start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
     start[[0, -1]] = low_um, high_um
     return [float(v) for v in start]
 
 
 def sample_adaptively(
-    solve: Solver, low_um: float, high_um: float, *, tolerance: float, most: int = 80
+    solve: Solver,
+    low_um: float,
+    high_um: float,
+    *,
+    tolerance: float,
+    most: int = 80,
+    calm: int = 2,
 ) -> SolvedNodes:
     """Solve diameters one by one, each where rational fits disagree most, until the fit
     predicts new solves within the tolerance.
 
-    Stops after two consecutive predicted solves, or after ``most``.
+    Stops after ``calm`` consecutive predicted solves, or after ``most``.
 
     Args:
         solve: exact response at a diameter, on one discretisation (jumps look like
@@ -313,12 +318,13 @@ def sample_adaptively(
         high_um: largest size, um.
         tolerance: deviation at which predictions are accepted.
         most: solves at most; where they do not suffice ``converged`` is False.
+        calm: predicted solves in a row: one may agree by chance.
     """
     x = starting_diameters(low_um, high_um)
     responses = [solve(v) for v in x]
     earlier_fits: list[RationalFunction] = []
     predicted = 0
-    while predicted < CALM and len(x) < most:
+    while predicted < calm and len(x) < most:
         nodes = SolvedNodes.of(x, responses)
         fit, simpler = _fits(nodes.diameter_um, nodes.response, tolerance)
         place, doubt = _most_doubtful(fit, [simpler, *earlier_fits[-2:]], nodes)
@@ -335,7 +341,7 @@ def sample_adaptively(
         responses.append(response)
         earlier_fits.append(fit)
         predicted = predicted + 1 if agreed and error < tolerance else 0
-    return SolvedNodes.of(x, responses, converged=predicted == CALM)
+    return SolvedNodes.of(x, responses, converged=predicted == calm)
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:

@@ -26,7 +26,6 @@ REACH = 2.0  # half-widths on either side of a narrow resonance that are exclude
 UNKNOWN = 0.5  # largest error bar of a usable entry, as a share of |t|
 # default tolerances: an absolute deviation, and a share of the entries' error bars
 FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
-HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,8 +514,8 @@ def _fit_power(data: MonotonicBranch, power: int, terms: int) -> Proxy:
     level = _fit_chebyshev(axes, data.level, terms)
     points = 64 if level.size > terms else 512
     _, upper_bound = polynomial.certified_bounds(level, points=points)
-    if upper_bound > 1 - HEADROOM:
-        level = level * ((1 - HEADROOM) / upper_bound)
+    if upper_bound > 1:
+        level = level / upper_bound
     errors = [
         float(np.abs(chebyshev.chebgrid3d(*axes, coefficients) - values).max())
         for coefficients, values in ((phase, data.phase), (level, data.level))

@@ -14,9 +14,6 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa import SAFETY, jones
 
-# turns that are solved, evenly up to half the angle after which the lattice repeats
-STEPS = 3
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GeometricPhase:
@@ -163,7 +160,12 @@ def check_geometric_phase(cell: Cell, size_um: float) -> None:
 
 
 def solve_rotations(
-    cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    tolerance: float,
+    steps: int = 3,
 ) -> GeometricPhase:
     """Solve the pillar at turns over one period of its lattice; the negative turns
     follow from the mirror image.
@@ -173,6 +175,7 @@ def solve_rotations(
         size_um: of the pillar, um.
         wavelength_um: vacuum wavelength, um.
         tolerance: error of t that is asked for.
+        steps: even ones up to half the angle after which the lattice repeats.
 
     Raises:
         CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or
@@ -180,7 +183,7 @@ def solve_rotations(
     """
     check_geometric_phase(cell, size_um)
     period = period_rad(cell)
-    angles = np.arange(STEPS + 1) / (2 * STEPS) * period
+    angles = np.arange(steps + 1) / (2 * steps) * period
     shapes = [dataclasses.replace(cell.shape, angle_rad=a) for a in angles.tolist()]
     solutions = [
         jones(
@@ -195,7 +198,7 @@ def solve_rotations(
         np.array([getattr(solution, name) for solution in solutions])
         for name in ("t", "t_error", "earlier")
     )
-    mirrored = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
+    mirrored = slice(steps - 1, 0, -1)  # neither 0 nor half the period again
     return GeometricPhase(
         size_um,
         wavelength_um,

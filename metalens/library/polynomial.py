@@ -18,9 +18,6 @@ from metalens.core.executor import usable_cores
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 Intervals = tuple[tuple[float, float], ...]
-CHUNK = 65536  # pillars per pass: its work arrays stay in the cache
-EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
-TABLE = 4096  # entries of the table from which Newton's steps start
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,24 +126,27 @@ def _sum_powers(p: ChebyshevCurve, d: Any) -> Any:
     return total.clip(max=p.ceiling) if math.isfinite(p.ceiling) else total
 
 
-def _over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
+def _over_chunks(
+    work: Callable[[Array], Array], values: Array, chunk: int = 65536
+) -> Array:
     """Elementwise ``work`` on an array, in cache-sized chunks on all cores that the
     process may use.
 
     Args:
         work: function of a 1-D array that keeps its shape and dtype.
         values: array of any shape.
+        chunk: pillars per pass, whose work arrays stay in the cache.
     """
     flat = np.ascontiguousarray(values).ravel()
-    if flat.size <= CHUNK:
+    if flat.size <= chunk:
         return work(flat).reshape(values.shape)
     out = np.empty_like(flat)
 
     def fill(start: int) -> None:
-        out[start : start + CHUNK] = work(flat[start : start + CHUNK])
+        out[start : start + chunk] = work(flat[start : start + chunk])
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        list(pool.map(fill, range(0, flat.size, CHUNK)))
+        list(pool.map(fill, range(0, flat.size, chunk)))
     return out.reshape(values.shape)
 
 
@@ -176,11 +176,12 @@ def _torch_curve() -> Callable[[Any, ChebyshevCurve], Any]:
     return apply
 
 
-def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
+def check_domain(p: ChebyshevCurve, diameter: Any, edge_um: float = 1e-6) -> None:
     """Refuse diameters (NumPy or torch, um) outside the domain of ``p``.
 
     Args:
         diameter: array or tensor of diameters, um.
+        edge_um: what a diameter outside may be by rounding.
 
     Raises:
         DomainError: naming both ranges.
@@ -188,7 +189,7 @@ def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
     if 0 in diameter.shape:
         return
     least, most = float(diameter.min()), float(diameter.max())
-    if not (least >= p.low - EDGE_UM and most <= p.high + EDGE_UM):
+    if not (least >= p.low - edge_um and most <= p.high + edge_um):
         raise DomainError(
             f"diameters run from {least:.6g} to {most:.6g} um, but the proxy holds from "
             f"{p.low:.6g} to {p.high:.6g} um; keep the diameters inside, or sweep a "
@@ -246,6 +247,7 @@ def invert_phase(
     within_um: tuple[float, float] | None,
     gap: str,
     excluded_um: Intervals = (),
+    entries: int = 4096,
 ) -> Values:
     """Diameters in um whose phase on a curve is ``phase_rad`` modulo 2 pi; see
     :meth:`metalens.library.Proxy.diameter_um`.
@@ -261,6 +263,7 @@ def invert_phase(
         gap: refuse or nearest, for phases that no pillar has.
         excluded_um: (least, largest) of intervals of diameters; one inside is moved to
             the closer end.
+        entries: of the table from which Newton's steps start.
 
     Raises:
         DomainError: the phase is not monotone there, or no pillar has a phase.
@@ -294,7 +297,7 @@ def invert_phase(
             f"phase at index {_first(~np.isfinite(values))} is not finite"
         )
     # the table of the inverse, from the end of least phase
-    d = np.linspace(low, high, 16 * TABLE)
+    d = np.linspace(low, high, 16 * entries)
     phases = evaluate_curve(p, d)
     if phases[-1] < phases[0]:
         d, phases = d[::-1], phases[::-1]
@@ -307,14 +310,14 @@ def invert_phase(
                 f"they cover {cover / math.tau:.3f} of a turn ({int(missing.sum())} sites); "
                 "widen the diameters, change the cell, or take the nearest with gap='nearest'"
             )
-    table = np.interp(np.linspace(start, start + cover, TABLE), phases, d)
+    table = np.interp(np.linspace(start, start + cover, entries), phases, d)
 
     def invert(chunk: Array) -> Array:
         target = (chunk.astype(float) - start) % math.tau
         beyond = target > cover
         nearest = target - cover <= math.tau - target
         target[beyond] = np.where(nearest[beyond], cover, 0.0)
-        diameter = _newton(p, start + target, target * ((TABLE - 1) / cover), table)
+        diameter = _newton(p, start + target, target * ((entries - 1) / cover), table)
         for least, most in excluded_um:
             # an end outside the considered range is no place to move to
             middle = np.inf if most > high else (least + most) / 2
@@ -337,9 +340,9 @@ def _newton(p: ChebyshevCurve, phase: Array, place: Array, table: Array) -> Arra
         p: monotone phase over the diameter.
         phase: (n,) rad.
         place: (n,) place in the table.
-        table: (TABLE,) diameters at even steps of the phase, um.
+        table: (entries,) diameters at even steps of the phase, um.
     """
-    index = np.minimum(place.astype(np.int64), TABLE - 2)
+    index = np.minimum(place.astype(np.int64), len(table) - 2)
     d = table[index] + (place - index) * np.diff(table)[index]
     for _ in range(54):  # a double has 53 bits
         error = _sum_powers(p, d) - phase

@@ -22,8 +22,6 @@ from metalens.library.record import PillarLibrary, Sweep, check_sweep
 from metalens.library.workers import SweepJournal, SweepTask
 
 Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
-POINTS = 8  # entries per task when solved one by one
-NODES = 5  # values of an axis that are solved first, where it has more than six
 
 
 def sweep(
@@ -114,7 +112,7 @@ class _SweepRun:
         solve_count = sum(
             len(curve.nodes.diameter_um) for curve in self.curves.values()
         )
-        solve_count += sum(len(task.sizes_um) for task in points)
+        solve_count += len(points)
         result = self.record(diameters, rows, solve_count)
         self.journal.finish()
         return result
@@ -189,12 +187,10 @@ class _SweepRun:
                 self.cell, curve.nodes.error, bar * workers.SOLVE_SHARE
             ):
                 misses &= curve.solver_error(diameters) <= bar
-            inaccurate = diameters[misses].tolist()
-            for start in range(0, len(inaccurate), POINTS):
-                sizes = tuple(inaccurate[start : start + POINTS])
-                tasks.append(
-                    SweepTask("points", self.cell, light, sizes, bar, self.engine)
-                )
+            tasks += [
+                SweepTask("point", self.cell, light, (diameter,), bar, self.engine)
+                for diameter in diameters[misses].tolist()
+            ]
         return tasks
 
     def record(self, diameters: Array, rows: Rows, solves: int) -> PillarLibrary:
@@ -238,17 +234,22 @@ class _SweepRun:
         )
 
 
-def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
-    """The values to solve first: all of up to six, else five Leja points.
+def pick_nodes(values: tuple[float, ...], count: int = 5) -> tuple[float, ...]:
+    """The values to solve first: ``count`` Leja points, or all where that leaves out
+    one at most.
 
     Each Leja point maximises the product of its distances to those before it. This
     keeps the error factor of the polynomial through them small everywhere.
+
+    Args:
+        values: rising.
+        count: with five, three are left where :func:`interpolate_row` leaves out two.
     """
-    if len(values) <= NODES + 1:
+    if len(values) <= count + 1:
         return values
     x = np.array(values)
     chosen = [0, len(x) - 1]
-    while len(chosen) < NODES:
+    while len(chosen) < count:
         chosen.append(int(np.argmax(np.prod(np.abs(x[:, None] - x[chosen]), axis=1))))
     return tuple(values[i] for i in sorted(chosen))
 
@@ -260,7 +261,7 @@ def _interpolate_family(
     diameters: Array,
 ) -> None:
     """Add the missing rows of a family by polynomials through its rows, in place, where
-    at least five exist.
+    as many exist as :func:`pick_nodes` takes.
 
     Where a narrow resonance moves from one node to the next, the diameters that it
     passes get an error of 1: they must be solved.
@@ -272,7 +273,7 @@ def _interpolate_family(
         diameters: (n,) um.
     """
     solved = {x: wave for x, wave in family.items() if wave in rows}
-    if len(solved) < NODES:
+    if len(solved) < len(pick_nodes(tuple(family))):
         return
     nodes = np.array(list(solved))
     table = np.stack([rows[wave] for wave in solved.values()])

@@ -18,15 +18,13 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, StoreError
 from metalens.core.report import CommandConsole
 from metalens.library import curve
-from metalens.library.curve import FIRST, ResponseCurve, SolvedNodes, starting_diameters
+from metalens.library.curve import ResponseCurve, SolvedNodes, starting_diameters
 
 # shares of an entry's tolerance: for the solver, and for the rational fit
 SOLVE_SHARE, FIT_SHARE = 0.5, 0.4
 
 # indices in the starting diameters of a curve: 0.25, 0.63 and 1 of the span
-PROBES = [4, 7, FIRST - 1]
-# modal meshes of a curve: one for most diameters, and finer ones near a resonance
-MESHES = 3
+PROBES = [4, 7, 12]
 
 
 def choose_engine(cell: Cell, engine: str = "auto") -> str:
@@ -70,6 +68,7 @@ def solver_at_common_discretization(
     *,
     tolerance: float,
     engine: str,
+    meshes: int = 3,
 ) -> Callable[[float], Response]:
     """Solver on the coarsest common discretisation that meets the tolerance at three
     probe diameters; responses are cached.
@@ -87,6 +86,8 @@ def solver_at_common_discretization(
         span_um: (least, largest) size, um.
         tolerance: error of t that is asked for.
         engine: rcwa or modal.
+        meshes: of the modal method: one for most diameters, and finer ones near a
+            resonance.
     """
     if cell.height_um == 0 or (engine == "modal" and cell.sidewall_rad):
         return functools.cache(
@@ -104,7 +105,7 @@ def solver_at_common_discretization(
             on_mesh = on_meshes((level,))
             if sum(not on_mesh(probe).converged for probe in probes) <= 1:
                 break
-        return functools.cache(on_meshes(levels[level - 1 : level - 1 + MESHES]))
+        return functools.cache(on_meshes(levels[level - 1 : level - 1 + meshes]))
     for solve in map(functools.cache, _rcwa_levels(cell, light, span_um[1], tolerance)):
         if all(solve(probe).converged for probe in probes):
             break
@@ -183,18 +184,18 @@ class SweepTask:
     """Exact solves of one cell.
 
     kind: ``curve``: t(D) over a range of sizes, at sizes that are chosen adaptively
-        (:func:`metalens.library.curve.sample_adaptively`). ``points``: the sizes
-        themselves, each refined to the tolerance. ``jones``: both polarisations of one
-        size at a fixed truncation; its rows are xx, xy, yx, yy (the polarisation that
-        leaves, then that comes).
+        (:func:`metalens.library.curve.sample_adaptively`). ``point``: one size, refined
+        to the tolerance. ``jones``: both polarisations of one size at a fixed
+        truncation; its rows are xx, xy, yx, yy (the polarisation that leaves, then that
+        comes).
     light: plane wave that comes.
-    sizes_um: (least, largest) of a curve; else the sizes.
+    sizes_um: (least, largest) of a curve; else the size.
     tolerance: of t.
     engine: rcwa or modal.
     harmonics: largest diffraction order along an axis, of ``jones``.
     """
 
-    kind: Literal["curve", "points", "jones"]
+    kind: Literal["curve", "point", "jones"]
     cell: Cell
     light: Incidence
     sizes_um: tuple[float, ...]
@@ -206,18 +207,18 @@ class SweepTask:
 def run_task(task: SweepTask) -> SolvedNodes:
     """Solve a task: four rows of t and r of ``jones``, else a row per size."""
     cell, light = task.cell, task.light
+    size = task.sizes_um[0]
     if task.kind == "jones":
         from metalens.rcwa import jones
 
-        size = task.sizes_um[0]
         solution = jones(cell, size, light.wavelength_um, harmonics=task.harmonics)
         response = np.stack([solution.t.ravel(), solution.r.ravel()], 1)
         return SolvedNodes(np.full(4, size), response, np.full(4, solution.t_error))
-    if task.kind == "points":
+    if task.kind == "point":
         solve = solve_to_tolerance(
             cell, light, tolerance=task.tolerance, engine=task.engine
         )
-        return SolvedNodes.of(task.sizes_um, [solve(d) for d in task.sizes_um])
+        return SolvedNodes.of([size], [solve(size)])
     low, high = task.sizes_um
     solve = solver_at_common_discretization(
         cell,
