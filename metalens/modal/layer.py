@@ -3,6 +3,7 @@ the few that carry light over it.
 """
 
 import math
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,6 @@ import scipy.linalg as sl
 
 from metalens.modal.case import ModalCase
 from metalens.modal.spaces import HomogeneousBasis
-
-# modes that decay below this over the height cannot change a result of double precision
-CARRY = 1e-13
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,7 +96,8 @@ def layer_modes(
         level[:, None] * np.linalg.solve(balanced, level[:, None] * growth)
     )
     q = axial_wavenumber(-1 / value)
-    carry = np.flatnonzero(np.abs(np.exp(1j * q * case.height)) > CARRY)
+    fade = np.abs(np.exp(1j * q * case.height))
+    carry = np.flatnonzero(fade > sys.float_info.epsilon)
     norm = vectors.T @ growth @ vectors
     return LayerModes(
         q[carry],
@@ -114,9 +113,6 @@ def layer_modes(
 
 # --- the modes that carry light over a layer, and all others in one matrix root
 
-LOW = 32.0  # times the contrast: levels above are not diagonalised
-SPARE, EXTRA = 3.0, 60.0  # trial levels: so many times that of the weakest, and further
-STEPS = 80  # of the fixed point, at most
 # accuracy of a root in single precision, whose errors matter ten times less, and in
 # double
 ROUGH, ROUNDING = 3e-7, 1e-14
@@ -147,19 +143,20 @@ def is_lossless(case: ModalCase) -> bool:
 
 
 def diagonalize_low(
-    block: np.ndarray, contrast: float
+    block: np.ndarray, contrast: float, low: float = 32.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """A symmetric matrix with its low levels diagonalised, and the turn (n, n).
 
     Args:
         block: (n, n), a rising diagonal plus a perturbation.
-        contrast: size of the perturbation; levels of ``LOW`` times it hardly change.
+        contrast: size of the perturbation.
+        low: levels above this, times the contrast, hardly change and are left.
     """
-    m = max(1, int(np.searchsorted(block.diagonal(), LOW * contrast)))
+    m = max(1, int(np.searchsorted(block.diagonal(), low * contrast)))
     turn = np.eye(len(block))
-    turn[:m, :m] = low = np.linalg.eigh(block[:m, :m], UPLO="U")[1]
-    block[:m] = low.T @ block[:m]
-    block[:, :m] = block[:, :m] @ low
+    turn[:m, :m] = modes = np.linalg.eigh(block[:m, :m], UPLO="U")[1]
+    block[:m] = modes.T @ block[:m]
+    block[:, :m] = block[:, :m] @ modes
     return block, turn
 
 
@@ -210,7 +207,11 @@ def layer_pencil(
 
 
 def carrying_modes(
-    pencil: LayerPencil, height: float, weak: float, accuracy: float
+    pencil: LayerPencil,
+    height: float,
+    weak: float,
+    accuracy: float,
+    spare: tuple[float, float] = (3.0, 60.0),
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """-q^2 (c,) and vectors (n, c) of the modes that carry light, by Davidson's method.
 
@@ -221,13 +222,16 @@ def carrying_modes(
     Args:
         pencil: of the layer, of this ``height``. weak: as in :func:`few_modes`.
         accuracy: of the vectors, relative.
+        spare: factor on the level of the weakest mode, and what is added, up to which
+            levels are tried first; it decides the number of rounds alone.
 
     Returns:
         None if the modes are too many.
     """
     square, sign, a = pencil.square, pencil.sign, pencil.te_count
     level, n = square.diagonal(), len(sign)
-    low = level < SPARE * (math.log(weak) / height) ** 2 + EXTRA
+    factor, further = spare
+    low = level < factor * (math.log(weak) / height) ** 2 + further
     trial = np.eye(n)[:, low]
     te_high, tm_high = (~low & (np.arange(n) < a)), (~low & (np.arange(n) >= a))
     if (sign[te_high] < 0).any() or (sign[tm_high] > 0).any():
@@ -254,7 +258,11 @@ def carrying_modes(
 
 
 def matrix_root(
-    square: np.ndarray, sign: np.ndarray, least: float, accuracy: float
+    square: np.ndarray,
+    sign: np.ndarray,
+    least: float,
+    accuracy: float,
+    most_steps: int = 80,
 ) -> np.ndarray | None:
     """Matrix square root X with eigenvalues in the right half plane; None if the
     iteration does not converge.
@@ -266,6 +274,7 @@ def matrix_root(
         square: X². sign: of growth, with respect to which it is symmetric.
         least: levels of the diagonal below it are raised to it.
         accuracy: relative, of the result.
+        most_steps: of the fixed point in either precision.
     """
     root = np.sqrt(np.maximum(square.diagonal(), least))
     mirror = sign[:, None] * sign
@@ -283,7 +292,7 @@ def matrix_root(
         weight, offset = exact_weight.astype(kind), exact_offset.astype(kind)
         e = correction.astype(kind)
         change = first = math.inf
-        for _ in range(STEPS):
+        for _ in range(most_steps):
             moved = offset - weight * (e @ e)
             change = float(np.abs(moved - e).max())
             first, e = min(first, change), moved

@@ -11,11 +11,6 @@ from metalens.modal.case import Films
 from metalens.modal.layer import LayerModes, axial_wavenumber
 from metalens.modal.spaces import HomogeneousBasis
 
-# relative distance of k² from its cutoff within which an order takes its exact
-# wavenumber
-NEAR = 0.4
-KNOWN = 0.02  # relative error of k² up to which a mode of the mesh counts as an order
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfSpace:
@@ -109,8 +104,15 @@ def half_space(
     )
 
 
-def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
-    """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the
+def near_cutoff(
+    square: np.ndarray,
+    cutoff: float,
+    bloch: float,
+    *,
+    near: float = 0.4,
+    known: float = 0.02,
+) -> np.ndarray:
+    """Transverse wavenumbers squared (n,), those near the cutoff as the
     lattice has them: (bloch + pi m)^2 + (pi n)^2, each the nearest.
 
     Near its cutoff an order's admittance is the root of a small difference, in which
@@ -118,9 +120,11 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
 
     Args:
         square: of the mesh. cutoff: k0^2 times the permittivity. bloch: kx.
+        near: relative distance from the cutoff within which an order is replaced.
+        known: relative error up to which a mode of the mesh counts as an order.
     """
     close = np.flatnonzero(
-        (np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9))
+        (np.abs(square - cutoff) < near * cutoff) & (square > bloch**2 * (1 + 1e-9))
     )
     if not len(close):
         return square
@@ -129,7 +133,7 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     along = bloch + np.pi * np.arange(-reach, reach + 1)
     exact = (along[:, None] ** 2 + (np.pi * np.arange(reach + 1)) ** 2).ravel()
     nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
-    reliable = np.abs(nearest - square[close]) < KNOWN * nearest
+    reliable = np.abs(nearest - square[close]) < known * nearest
     corrected = square.copy()
     corrected[close[reliable]] = nearest[reliable]
     return corrected

@@ -145,26 +145,31 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
     )
 
 
-def mesh_of_degree(degree: int) -> MeshPlan:
+def mesh_of_degree(degree: int, grading: float = 0.15) -> MeshPlan:
     """Mesh of a polynomial ``degree``, one more along the rim, where the gap between
     wide discs varies.
 
     From degree 5 on rings narrow geometrically towards the rim: the field is singular
     there, and degree alone gains little.
+
+    Args:
+        degree: across the rim.
+        grading: width of a ring over that of the next; 0.15 is the rule of hp elements
+            at a singular point (Szabo and Babuska, Finite Element Analysis (1991)).
     """
     rings = (degree - 3) // 2 if degree > 4 else 0
-    ends = tuple(GRADING**k for k in range(rings, 0, -1))
+    ends = tuple(grading**k for k in range(rings, 0, -1))
     return MeshPlan(degree, degree + 1, ends)
 
 
-GRADING = 0.15
 LEVELS = tuple(mesh_of_degree(degree) for degree in range(2, 8))
-SAFETY = 2.0
 LARGEST = 2.0  # error of a passive cell
 
 
-def estimate_level_error(coarser: MeshSolution, finer: MeshSolution) -> float:
-    """Error estimate of the ``finer`` of two successive levels: ``SAFETY`` times the
+def estimate_level_error(
+    coarser: MeshSolution, finer: MeshSolution, safety: float = 2.0
+) -> float:
+    """Error estimate of the ``finer`` of two successive levels: ``safety`` times the
     geometric mean of its change from the ``coarser`` and half the difference of its two
     forms, but at least that half.
 
@@ -176,7 +181,7 @@ def estimate_level_error(coarser: MeshSolution, finer: MeshSolution) -> float:
     half = finer.half_difference
     if half > coarser.half_difference + coarser.loss:
         return LARGEST
-    return max(half, SAFETY * math.sqrt(change * half)) + finer.loss
+    return max(half, safety * math.sqrt(change * half)) + finer.loss
 
 
 def resolves_waves(case: ModalCase, plan: MeshPlan) -> bool:

@@ -21,11 +21,6 @@ from metalens.modal.mesh import (
     gradient_matrix,
 )
 
-# half Bloch phases below it lose digits in the squared problem of the gradients
-SMALL_PHASE_RAD = 0.05
-TYPICAL = 0.5  # pitches: diameter of the disc whose mass weights the cotree
-
-
 Unknowns = tuple[np.ndarray, np.ndarray]  # places of the functions, complex weights
 
 
@@ -90,7 +85,10 @@ class SymmetryClass:
 
 @lru_cache(maxsize=32)
 def symmetry_class(
-    plan: MeshPlan, electric: bool, half_phase_rad: float | None
+    plan: MeshPlan,
+    electric: bool,
+    half_phase_rad: float | None,
+    typical_rho: float = 0.5,
 ) -> SymmetryClass:
     """Unknowns, gradient and cotree of a symmetry class; cached.
 
@@ -100,6 +98,7 @@ def symmetry_class(
     Args:
         plan: of the mesh. electric: whether the y walls are electric, else natural.
         half_phase_rad: Bloch phase over half a pitch, or None.
+        typical_rho: diameter of that disc, in pitches.
     """
     mesh = build_mesh(plan)
     vectors, scalars = (
@@ -107,7 +106,7 @@ def symmetry_class(
         for wall in (mesh.vector_wall, mesh.scalar_wall)
     )
     gradient = restrict_matrix(gradient_matrix(plan), vectors, scalars)
-    mass = restrict_matrix(assemble_disc(TYPICAL, plan)[0].mass, vectors, vectors)
+    mass = restrict_matrix(assemble_disc(typical_rho, plan)[0].mass, vectors, vectors)
     weighted = np.sqrt(mass.diagonal()) * gradient.T
     pivots = sl.qr(weighted, mode="r", pivoting=True)[1]
     cotree = np.sort(pivots[gradient.shape[1] :])
@@ -170,6 +169,7 @@ def homogeneous_modes(
     *,
     electric: bool,
     half_phase_rad: float | None,
+    small_phase_rad: float = 0.05,
 ) -> HomogeneousBasis:
     """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients.
 
@@ -181,6 +181,8 @@ def homogeneous_modes(
         geometry: matrices of the quarter cell and of its part inside the disc.
         plan: of their mesh. electric: whether the y walls are electric, else natural.
         half_phase_rad: Bloch phase over half a pitch, or None.
+        small_phase_rad: phases below it lose digits in the squared problem of the
+            gradients.
 
     Accuracy: the difference loses digits, 1e-8 of t at worst.
     """
@@ -190,7 +192,7 @@ def homogeneous_modes(
     scalar_mass = restrict_matrix(whole.scalar, scalars, scalars)
     mass = restrict_matrix(whole.mass, vectors, vectors)
     mass_gradient = (space.gradient.T @ mass).T
-    if 0 < (half_phase_rad or 0.0) < SMALL_PHASE_RAD:
+    if 0 < (half_phase_rad or 0.0) < small_phase_rad:
         # singular values keep all digits of a nearly uniform field
         lower = np.linalg.cholesky(scalar_mass)
         field = np.linalg.cholesky(mass).T @ space.gradient.toarray()

@@ -9,22 +9,13 @@ for upright pillars of every diameter D of the wall corrects the tilted pillar.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from metalens.cell import Cell, Incidence, Response
 from metalens.core.arrays import Array
 from metalens.rcwa import CellProblem, count_orders, problem_of_light, solve_problem
-
-REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
-COMPARED = 4
-NODES = 4  # diameters between foot and top at which (1) is solved
-STEPS = 3  # of Gauss-Newton for (1)
-STEP_UM = 1e-4  # of width, for the slope of t and r
-MOST_UM = 0.01  # of a shift
-UNEXPLAINED = 0.5  # share of the misfit of t after (1) that counts as error
-SHARE = 0.2  # of the tolerance, for the modal solves
 
 
 def solve_tilted(
@@ -34,6 +25,11 @@ def solve_tilted(
     upright: Callable[[Cell, float, float], Response],
     *,
     tolerance: float,
+    truncations: Sequence[int] = (4, 5, 6, 7, 8, 9),
+    compared: int = 4,
+    node_count: int = 4,
+    modal_share: float = 0.2,
+    unexplained_share: float = 0.5,
 ) -> Response:
     """Zero-order response of a round pillar with a tilted wall, films allowed.
 
@@ -42,10 +38,16 @@ def solve_tilted(
         light: plane wave.
         upright: modal response of an upright cell and diameter to a tolerance.
         tolerance: of t and r.
+        truncations: harmonics, tried until any ``compared`` neighbours agree.
+        compared: number of truncations in the mean.
+        node_count: diameters between foot and top at which (1) is solved.
+        modal_share: of the tolerance, for the modal solves.
+        unexplained_share: of the misfit of t after (1) that counts as error.
 
     Returns:
-        Mean of four truncations. ``t_error`` is the sum of the largest difference from
-        it, half the misfit of (1), and the errors of modal solves and staircases.
+        Mean of the compared truncations. ``t_error`` is the sum of the largest
+        difference from it, the share of the misfit of (1), and the errors of modal
+        solves and staircases.
 
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
@@ -54,24 +56,26 @@ def solve_tilted(
     column = problem.columns[0]
     plain = dataclasses.replace(cell, sidewall_rad=0.0, under=(), over=())
     half = abs(math.tan(cell.sidewall_rad)) * cell.height_um
-    nodes = diameter_um + half * np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
-    anchors = [upright(plain, d, max(SHARE * tolerance, 2e-6)) for d in nodes.tolist()]
+    angles = np.pi * (np.arange(node_count) + 0.5) / node_count
+    nodes = diameter_um + half * np.cos(angles)
+    modal_tolerance = max(modal_share * tolerance, 2e-6)
+    anchors = [upright(plain, d, modal_tolerance) for d in nodes.tolist()]
     modal_amplitudes = np.array([(anchor.t, anchor.r) for anchor in anchors])
     bare = [problem_of_light(plain, d, light) for d in nodes.tolist()]
     results, unexplained = [], []
-    for reach in REACHES:
+    for reach in truncations:
         shift, misfit = _fit_shift(bare, nodes, modal_amplitudes, reach)
         shifted = dataclasses.replace(problem, shift=shift)
         truncation = solve_problem(shifted, reach, tolerance)
         results.append((*truncation.both[:, column, column], truncation.energy[column]))
         unexplained.append(misfit)
-        if len(results) < COMPARED:
+        if len(results) < compared:
             continue
-        last = np.array(results[-COMPARED:])
+        last = np.array(results[-compared:])
         t, r, energy = last.mean(axis=0)
         error = float(
             np.abs(last[:, :2] - (t, r)).max()
-            + UNEXPLAINED * np.mean(unexplained[-COMPARED:])
+            + unexplained_share * np.mean(unexplained[-compared:])
             + max(anchor.t_error for anchor in anchors)
             + truncation.wall_error
         )
@@ -93,19 +97,28 @@ def solve_tilted(
 
 
 def _fit_shift(
-    bare: list[CellProblem], nodes: Array, modal_amplitudes: Array, reach: int
+    bare: list[CellProblem],
+    nodes: Array,
+    modal_amplitudes: Array,
+    reach: int,
+    *,
+    steps: int = 3,
+    slope_step_um: float = 1e-4,
+    most_um: float = 0.01,
 ) -> tuple[np.polynomial.Polynomial, float]:
     """Width shift that solves (1) at one truncation, as a polynomial of the diameter,
     and the root-mean-square misfit of t.
 
     Gauss-Newton on t and r of the upright pillar at each node, with the derivative by a
-    finite difference and the shift limited to ``MOST_UM``.
+    finite difference.
 
     Args:
         bare: upright pillars at the nodes, without films.
         nodes: (k,) diameters, um.
         modal_amplitudes: (k, 2) t and r of the modal solution.
         reach: harmonics.
+        steps: of Gauss-Newton. slope_step_um: of width, for the slope of t and r.
+        most_um: of a shift.
     """
 
     def amplitudes(shift: Array) -> Array:
@@ -117,12 +130,12 @@ def _fit_shift(
         return np.array(responses)
 
     shift = np.zeros(len(nodes))
-    for _ in range(STEPS):
+    for _ in range(steps):
         current = amplitudes(shift)
-        slope = (amplitudes(shift + STEP_UM) - current) / STEP_UM
+        slope = (amplitudes(shift + slope_step_um) - current) / slope_step_um
         change = (slope.conj() * (modal_amplitudes - current)).sum(axis=1).real
         shift = shift + change / (np.abs(slope) ** 2).sum(axis=1)
-        shift = np.clip(shift, -MOST_UM, MOST_UM)
+        shift = np.clip(shift, -most_um, most_um)
     misfit = np.abs(modal_amplitudes - amplitudes(shift))[:, 0]
     polynomial = np.polynomial.Polynomial.fit(nodes, shift, len(nodes) - 1)
     return polynomial, float(np.sqrt((misfit**2).mean()))

@@ -3,6 +3,7 @@ lattice and light share, and the plane waves of these orders.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,8 +14,7 @@ from metalens.core.arrays import Array
 
 Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
 Operation = tuple[int, int, Sign]  # (x, y) -> (sx x, sy y)
-EX, EY, EZ, MIXED = range(4)  # places in ReducedOrders.links
-_STRAIGHT = 1e-12  # a component of k this small is 0 but for rounding
+ROUNDING = 1e-13  # relative: a difference this small is 0 but for rounding
 
 
 def symmetry_operation(sx: int, sy: int, ex: int = 1) -> Operation:
@@ -57,7 +57,7 @@ def tangential_wave(
     check_direction(angle_rad, azimuth_rad)
     sine = math.sin(angle_rad)
     kx, ky = (
-        0.0 if abs(part) < _STRAIGHT else part
+        0.0 if abs(part) < ROUNDING else part
         for part in (sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad))
     )
     return TangentialWave(kx, ky, azimuth_rad if kx or ky else 0.0, wavelength_um)
@@ -85,8 +85,8 @@ class ReducedOrders:
     """The reduced sets of one truncation.
 
     reach: largest orders (m, n); coefficients are tabled from -2 reach to 2 reach.
-    links: for products in (Ex, Ex), (Ey, Ey), (Ez, Ez) and (Ex, Ey): (k, l, operations)
-        places in a table of coefficients, and their weights.
+    links: for products in ``ex``, ``ey``, ``ez`` and from Ey to Ex (``mixed``): (k, l,
+        operations) places in a table of coefficients, and their weights.
     """
 
     ex: OrderSet
@@ -94,7 +94,7 @@ class ReducedOrders:
     ez: OrderSet
     hz: OrderSet
     reach: tuple[int, int]
-    links: tuple[tuple[Array, Array], ...]
+    links: Mapping[str, tuple[Array, Array]]
 
 
 @lru_cache(maxsize=24)
@@ -121,10 +121,11 @@ def reduced_orders(
         inside &= (m + n) % 2 == 0
     m, n = m[inside], n[inside]
     ex, ey, ez, hz = (_reduced(m, n, operations, field) for field in range(4))
-    links = tuple(
-        _link(rows, columns, operations, reach)
-        for rows, columns in ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
-    )
+    pairs = {"ex": (ex, ex), "ey": (ey, ey), "ez": (ez, ez), "mixed": (ex, ey)}
+    links = {
+        name: _link(rows, columns, operations, reach)
+        for name, (rows, columns) in pairs.items()
+    }
     return ReducedOrders(ex, ey, ez, hz, reach, links)
 
 
@@ -181,11 +182,11 @@ def _link(
     return place, share[..., None] * np.array(columns.signs, float)
 
 
-def toeplitz_matrix(space: ReducedOrders, table: Array, link: int) -> Array:
+def toeplitz_matrix(space: ReducedOrders, table: Array, link: str) -> Array:
     """Toeplitz matrix (k, l) of the product with a function, reduced by symmetry.
 
     Args:
-        space: the orders. link: one of EX, EY, EZ, MIXED.
+        space: the orders. link: ``ex``, ``ey``, ``ez`` or ``mixed``.
         table: (4 reach_x + 1, 4 reach_y + 1) Fourier coefficients of the function.
     """
     place, weight = space.links[link]

@@ -10,7 +10,7 @@ from metalens.cell import Cell, Incidence, check_tolerance
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa.basis import (
-    EZ,
+    ROUNDING,
     Operation,
     OrderSet,
     ReducedOrders,
@@ -37,11 +37,8 @@ from metalens.rcwa.solver import (
     truncation_sequence,
 )
 
-MOST_POINTS = 4_000_000  # of one call: 1 GB with the truncations that are compared
 # factor on the largest change from an earlier truncation, from so many harmonics on
 _SAFETY, _ENOUGH = 2.5, 7
-_STEPS = 12  # of a tilted wall, as a staircase; half as many tell what they leave
-_ON = 1e-12  # of the height: a point so little below an interface lies on it
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,7 +110,8 @@ class _Stack:
 
     def places(self, z_um: Array) -> list[int]:
         """(nz,) places among the slabs of heights over the foot."""
-        on = _ON * (self.ends[-1] - self.ends[0])
+        # a point on an interface may lie below it by rounding
+        on = ROUNDING * (self.ends[-1] - self.ends[0])
         places: list[int] = np.searchsorted(
             self.ends, self.k0 * z_um + on, "right"
         ).tolist()
@@ -158,6 +156,8 @@ def near_fields(
     *,
     tolerance: float = 0.05,
     harmonics: int | None = None,
+    steps: int = 12,
+    most_points: int = 4_000_000,
 ) -> list[NearField]:
     """Near field by RCWA: E and H of a cell of any shape, lattice, layers and films.
 
@@ -171,6 +171,8 @@ def near_fields(
         grids: points of each result.
         tolerance: of the relative root-mean-square error over the points of any grid.
         harmonics: fix the largest truncation instead.
+        steps: of a tilted wall, as a staircase; half as many tell what they leave.
+        most_points: of all grids: 1 GB with the truncations that are compared.
 
     Raises:
         CellError: as :func:`metalens.rcwa.jones`; too many points.
@@ -179,21 +181,20 @@ def near_fields(
     Accuracy: ``error`` is 2.5 times the largest change from the four truncations before
         the last (six where something is narrow), more below seven harmonics. Within a
         few nm of an edge along z the field has no bound and no truncation is near. A
-        tilted wall is a staircase of twelve steps; its error is the change from six
-        steps.
+        tilted wall is a staircase; its error is the change from half the steps.
     """
     check_tolerance(tolerance)
     count = sum(math.prod(grid.shape) for grid in grids)
-    if not 0 < count <= MOST_POINTS:
+    if not 0 < count <= most_points:
         raise CellError(
-            f"{count} points: need 1 to {MOST_POINTS} in one call; take cuts, or fewer "
+            f"{count} points: need 1 to {most_points} in one call; take cuts, or fewer "
             "samples"
         )
     problem = cell_problem(
         cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad
     )
     sequence = truncation_sequence(problem, harmonics)
-    steps = _STEPS if cell.sidewall_rad else 1
+    steps = steps if cell.sidewall_rad else 1
     stack, staircase_error = _stack(problem, steps), np.zeros(len(grids))
     if steps > 1:
         coarse = min(sequence.reaches[-1], sequence.reaches[0] + 2)
@@ -338,7 +339,7 @@ def _solve_class(
         permittivity_coefficients(section, cell, space.reach)[0]
         for section, _ in stack.slabs
     )
-    inverse_z = [np.linalg.inv(toeplitz_matrix(space, eps, EZ)) for eps in tables]
+    inverse_z = [np.linalg.inv(toeplitz_matrix(space, eps, "ez")) for eps in tables]
     substrate, cover = (half_space(waves, index) for index in problem.indices)
     source = 2 * substrate[0] * substrate[1] * incident
     symmetric = cell.outline(problem.size_um).keeps(-1, -1)

@@ -15,21 +15,10 @@ from metalens.cell import Cell, Layer, materials
 from metalens.cell.shapes import Outline
 from metalens.cell.shapes.outline import EllipseArc
 from metalens.core.arrays import Array
-from metalens.rcwa.basis import (
-    EX,
-    EY,
-    EZ,
-    MIXED,
-    PlaneWaves,
-    ReducedOrders,
-    toeplitz_matrix,
-)
+from metalens.rcwa.basis import ROUNDING, PlaneWaves, ReducedOrders, toeplitz_matrix
 from metalens.rcwa.smatrix import FourierModes, film_modes, solve_eigenmodes
 
 _GRID = 192  # points along the pitch on which normals are sampled
-# distance to a boundary at which the weight w falls to 1/2, over the largest distance
-_FAR = 0.5
-_TIE = 1e-9  # relative difference of distances that are equal
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,8 +209,8 @@ def _sampled_normals(
 ) -> tuple[Array, Array, Array]:
     """As :func:`normal_tables`, by the FFT of samples; orders from -reach to reach.
 
-    The weight 1 / (1 + (d / d0)^4) falls with the distance d to the boundary. The
-    coefficients are averaged over the mirror images, which cancels rounding.
+    The weight falls with the distance to the boundary. The coefficients are averaged
+    over the mirror images, which cancels rounding.
 
     Args:
         outlines: whose boundaries count. cell: its lattice.
@@ -240,7 +229,7 @@ def _sampled_normals(
     )
     px, py = px - x * (px > x / 2), py - y * (py > y / 2)
     products, distance = _nearest(outlines, cell, px, py)
-    weight = 1 / (1 + (distance / (_FAR * distance.max())) ** 4)
+    weight = boundary_weight(distance, distance.max())
     mirrors = [
         flip
         for flip in itertools.product((1, -1), repeat=2)
@@ -286,7 +275,7 @@ def _nearest(
     distances, nearest = cKDTree(copies).query(np.stack([px, py], axis=-1), k=2)
     nx, ny = np.tile(normals, (len(sites), 1))[nearest].transpose(3, 0, 1, 2)
     products = np.stack([nx**2, ny**2, nx * ny])
-    tie = distances[..., 1] - distances[..., 0] < _TIE * cell.pitch_um
+    tie = distances[..., 1] - distances[..., 0] < ROUNDING * cell.pitch_um
     mean = np.where(tie, products.mean(axis=-1), products[..., 0])
     return mean, np.asarray(distances[..., 0])
 
@@ -303,7 +292,7 @@ def _nearest_circle(
         centres: (k, 2), um. radii: (k,), um.
         px, py: (...) points, um.
     """
-    tie = _TIE * radii.min()
+    tie = ROUNDING * radii.min()
     least = np.full(px.shape, np.inf)
     for (x, y), radius in zip(centres, radii, strict=True):
         least = np.minimum(least, np.abs(np.hypot(px - x, py - y) - radius))
@@ -349,11 +338,19 @@ def normals_at(
         np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / min(edges)))
         for edge in edges
     )
-    half_distance = (
-        _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
-    )
+    largest_um = _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
     products, distance = _nearest(outlines, cell, *_wrapped(cell, x_um, y_um))
-    return np.asarray(products / (1 + (distance / half_distance) ** 4))
+    return products * boundary_weight(distance, largest_um)
+
+
+def boundary_weight(distance: Array, largest: float, half: float = 0.5) -> Array:
+    """Weight 1 / (1 + (d / d0)^4) of the normals at a distance d from the boundary.
+
+    Args:
+        distance: (...) from the boundary. largest: of them in the cell.
+        half: d0 over the largest distance, where the weight is 1/2.
+    """
+    return np.asarray(1 / (1 + (distance / (half * largest)) ** 4))
 
 
 def permittivity_at(
@@ -398,14 +395,14 @@ def section_operators(
     direct, inverse = permittivity_coefficients(section, cell, space.reach)
     outlines = section.outlines if normals is None else normals
     xx, yy, xy = normal_tables(outlines, cell, space.reach)
-    laurent = [toeplitz_matrix(space, direct, link) for link in (EX, EY)]
+    laurent = [toeplitz_matrix(space, direct, link) for link in ("ex", "ey")]
     excess = [
         matrix - np.linalg.inv(toeplitz_matrix(space, inverse, link))
-        for matrix, link in zip(laurent, (EX, EY), strict=True)
+        for matrix, link in zip(laurent, ("ex", "ey"), strict=True)
     ]
     nx, ny, mixed = (
         toeplitz_matrix(space, table, link)
-        for table, link in ((xx, EX), (yy, EY), (xy, MIXED))
+        for table, link in ((xx, "ex"), (yy, "ey"), (xy, "mixed"))
     )
     upper_left = laurent[0] - (excess[0] @ nx + nx @ excess[0]) / 2
     lower_right = laurent[1] - (excess[1] @ ny + ny @ excess[1]) / 2
@@ -422,7 +419,7 @@ def section_operators(
     P = np.eye(len(waves.kappa), dtype=Q.dtype)
     with_ez = slice(waves.bare, waves.p_count)
     kappa = waves.kappa[with_ez]
-    inverse_z = np.linalg.inv(toeplitz_matrix(space, direct, EZ))
+    inverse_z = np.linalg.inv(toeplitz_matrix(space, direct, "ez"))
     P[with_ez, with_ez] -= kappa[:, None] * inverse_z * kappa
     return P, Q
 

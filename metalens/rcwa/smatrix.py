@@ -2,6 +2,8 @@
 patterned layers, matched without growing exponentials.
 """
 
+import math
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +12,8 @@ from metalens.core.arrays import Array
 from metalens.rcwa.basis import PlaneWaves, half_space, normal_component
 
 Pair = tuple[Array, Array]
-_TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincide
-_FADED = 41.0  # exp(-41) = 1.6e-18: waves that do not reach the other end of a layer
+# a mode exactly at its cut-off, where q² is rounding: up and down waves may not coincide
+_TINY = math.sqrt(sys.float_info.epsilon)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -180,7 +182,7 @@ def _layer_reflection(
         symmetric: as in :func:`match_layers`.
     """
     exponent = modes.q * modes.height
-    reaching = int(np.count_nonzero(exponent.imag < _FADED))
+    reaching = int(np.count_nonzero(np.exp(-exponent.imag) > sys.float_info.epsilon))
     fade = np.exp(1j * exponent[:reaching])
     U, V = pair
     if not symmetric:

@@ -23,6 +23,7 @@ from metalens.cell.shapes import Outline
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.rcwa.basis import (
+    ROUNDING,
     Operation,
     TangentialWave,
     count_orders,
@@ -39,7 +40,6 @@ from metalens.rcwa.permittivity import (
 )
 from metalens.rcwa.smatrix import film_modes, scatter_zero_order
 
-_ROUNDING = 1e-13
 # The error estimate: the largest change from four (six where a gap, wall or hole is
 # narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
 _FIRST = 3  # harmonics of the first truncation where four are compared
@@ -49,7 +49,6 @@ _COMPARED, MOST_COMPARED = 4, 6
 _OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow width
 _TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
 SAFETY = 7.0
-STEPS = (4, 6, 8, 12, 16, 24)  # of the staircases from which a wall is extrapolated
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -205,13 +204,13 @@ def check_size(cell: Cell, size_um: float) -> None:
     for layer, grow in cell.tilted_sections:
         for end, share in (("foot", -0.5), ("top", 0.5)):
             width = layer.grow_um + grow + share * cell.width_slope * layer.height_um
-            if cell.round and size_um + width < -_ROUNDING:
+            if cell.round and size_um + width < -ROUNDING:
                 raise CellError(
                     f"diameter {size_um:g} um: the wall of {cell.sidewall_rad:.4g} rad "
                     f"closes the pillar below its {end}; need at least {-width:.6g} um"
                 )
             if cell.round:
-                overlaps = size_um + width > cell.pitch_um + _ROUNDING
+                overlaps = size_um + width > cell.pitch_um + ROUNDING
             else:
                 grown = width + 2 * layer.coat_um
                 overlaps = cell.gap_um(size_um, grow_um=grown) <= 0
@@ -233,7 +232,7 @@ def symmetry_classes(
     Args:
         cell, size_um: the pillar, whose mirrors count. light: its direction.
     """
-    outline = cell.outline(max(size_um, _ROUNDING))
+    outline = cell.outline(max(size_um, ROUNDING))
     identity, half_turn = symmetry_operation(1, 1), symmetry_operation(-1, -1)
     mirrors = []
     if light.kx == 0 and outline.keeps(-1, 1):
@@ -495,7 +494,7 @@ def _refine(
     film = _film_response(problem)
     if _is_homogeneous(problem):
         k0 = 2 * math.pi / problem.light.wavelength_um
-        rounding = _ROUNDING * (1 + k0 * problem.cell.height_um)
+        rounding = ROUNDING * (1 + k0 * problem.cell.height_um)
         return _response(problem, 0, film, rounding, True, "a homogeneous layer: exact")
     history: list[Array] = []
     for reach in sequence.reaches:
@@ -545,7 +544,7 @@ def estimate_error(history: list[Array], reach: int, compared: int) -> float:
         share * float(np.abs(history[-1] - both).max())
         for share, both in zip(shares, earlier, strict=True)
     ]
-    return safety_factor(reach) * max(changes, default=1.0) + _ROUNDING
+    return safety_factor(reach) * max(changes, default=1.0) + ROUNDING
 
 
 def most_harmonics(
@@ -583,7 +582,10 @@ def _is_square(problem: CellProblem) -> bool:
 
 
 def solve_problem(
-    problem: CellProblem, reach: int, tolerance: float = 1e-5
+    problem: CellProblem,
+    reach: int,
+    tolerance: float = 1e-5,
+    staircases: tuple[int, ...] = (4, 6, 8, 12, 16, 24),
 ) -> TruncatedSolution:
     """t and r of the problem's polarisations at one truncation.
 
@@ -594,12 +596,13 @@ def solve_problem(
     Args:
         problem: cell and light. reach: harmonics.
         tolerance: of t and r, of which the wall has a tenth.
+        staircases: numbers of steps, tried until the extrapolation meets it.
     """
     row: list[Array] = []  # extrapolated amplitudes, of rising order
-    for i, steps in enumerate(STEPS if problem.cell.sidewall_rad else (1,)):
+    for i, steps in enumerate(staircases if problem.cell.sidewall_rad else (1,)):
         previous, row = row, [_solve_staircase(problem, reach, steps)]
         for k, coarser in enumerate(previous):
-            ratio = (steps / STEPS[i - 1 - k]) ** 2
+            ratio = (steps / staircases[i - 1 - k]) ** 2
             row.append(row[-1] + (row[-1] - coarser) / (ratio - 1))
         error = float(np.abs(row[-1] - previous[-1])[:2].max()) if previous else 0.0
         if previous and error <= tolerance / 10:
@@ -677,7 +680,7 @@ def _is_homogeneous(problem: CellProblem) -> bool:
         height * max((abs(eps - section.outside) for eps in section.inside), default=0)
         for section, height in stack_sections(problem, 1)
     )
-    return share * effect < _ROUNDING
+    return share * effect < ROUNDING
 
 
 def _response(
