@@ -5,7 +5,6 @@ inverse and certified bounds, for NumPy arrays and torch tensors.
 import functools
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -14,7 +13,7 @@ from numpy.polynomial import chebyshev
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
-from metalens.core.executor import usable_cores
+from metalens.core.threads import run_each
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 Intervals = tuple[tuple[float, float], ...]
@@ -145,8 +144,7 @@ def _over_chunks(
     def fill(start: int) -> None:
         out[start : start + chunk] = work(flat[start : start + chunk])
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        list(pool.map(fill, range(0, flat.size, chunk)))
+    run_each(fill, range(0, flat.size, chunk))
     return out.reshape(values.shape)
 
 

@@ -38,7 +38,7 @@ from metalens.rcwa.permittivity import (
     section_modes,
     staircase_layers,
 )
-from metalens.rcwa.smatrix import film_modes, scatter_zero_order
+from metalens.rcwa.smatrix import scatter_zero_order
 
 # The error estimate: the largest change from four (six where a gap, wall or hole is
 # narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
@@ -600,7 +600,8 @@ def solve_problem(
     """
     row: list[Array] = []  # extrapolated amplitudes, of rising order
     for i, steps in enumerate(staircases if problem.cell.sidewall_rad else (1,)):
-        previous, row = row, [_solve_staircase(problem, reach, steps)]
+        sections = stack_sections(problem, steps)
+        previous, row = row, [_solve_sections(problem, reach, sections)]
         for k, coarser in enumerate(previous):
             ratio = (steps / staircases[i - 1 - k]) ** 2
             row.append(row[-1] + (row[-1] - coarser) / (ratio - 1))
@@ -610,20 +611,25 @@ def solve_problem(
     return TruncatedSolution(row[-1][:2], row[-1][2].diagonal().real, error)
 
 
-def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
-    """(3, 2, 2) t, r and the energies on a diagonal, of a pillar whose tilted sections
-    are cut into ``steps`` upright ones, at ``reach`` harmonics.
+def _solve_sections(
+    problem: CellProblem, reach: int, sections: list[tuple[PillarSection, float]]
+) -> Array:
+    """(3, 2, 2) t, r and the energies on a diagonal, of sections that are homogeneous
+    along z.
 
     Each symmetry class is solved by itself: modes of its layers, then the scattering of
     every incident polarisation that it holds.
+
+    Args:
+        problem: cell and light. reach: harmonics.
+        sections: foot first, with heights times k0.
     """
     cell, size_um, light = problem.cell, problem.size_um, problem.light
     amplitudes = np.zeros((3, 2, 2), complex)
     square = problem.columns == (0, 1) and _is_square(problem)
     columns = (0,) if square else problem.columns
-    sections = stack_sections(problem, steps)
     normals = problem.normals or [section.outlines for section, _ in sections]
-    symmetric = cell.outline(size_um).keeps(-1, -1)
+    symmetric = cell.outline(max(size_um, ROUNDING)).keeps(-1, -1)
     for operations in problem.classes:
         space = reduced_orders(reach, cell.lattice, operations)
         waves = plane_waves(space, cell, light)
@@ -650,21 +656,14 @@ def _solve_staircase(problem: CellProblem, reach: int, steps: int) -> Array:
 
 def _film_response(problem: CellProblem) -> TruncatedSolution:
     """Exact t and r with each section replaced by a film of its surroundings."""
-    cell, light = problem.cell, problem.light
-    sized = dataclasses.replace(problem, size_um=problem.size_um or cell.pitch_um / 2)
-    space = reduced_orders(0, cell.lattice, (symmetry_operation(1, 1),))
-    waves = plane_waves(space, cell, light)
+    size_um = problem.size_um or problem.cell.pitch_um / 2
+    sized = dataclasses.replace(problem, size_um=size_um)
     films = [
-        film_modes(waves, complex(np.sqrt(section.outside)), height)
+        (PillarSection((), (), section.outside), height)
         for section, height in stack_sections(sized, 1)
     ]
-    both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
-    for column in problem.columns:
-        incident, _ = waves.zero[column]
-        scattered = scatter_zero_order(waves, problem.indices, films, incident)
-        both[:, column, column] = scattered.t[incident], scattered.r[incident]
-        energy[column] = scattered.energy
-    return TruncatedSolution(both, energy)
+    solution = _solve_sections(problem, 0, films)
+    return TruncatedSolution(solution[:2], solution[2].diagonal().real)
 
 
 def _is_homogeneous(problem: CellProblem) -> bool:
