@@ -16,6 +16,7 @@ import yaml
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, MaterialError
+from metalens.core.units import nm, um
 
 # possible numbers of coefficients of each formula: whole terms
 _PAIRS = range(3, 100, 2)
@@ -26,9 +27,8 @@ _COUNTS = {
     8: range(3, 5),
     9: range(3, 7),
 }
-_NOISE = 1e-3  # k of a measured table may lie below 0 by this; it counts as 0
 _COLUMNS = "wavelength_um (or wavelength_nm), n and, where it absorbs, k"
-_SCALES = {"wavelength_um": 1.0, "wl": 1.0, "wavelength_nm": 1e-3}
+_SCALES = {"wavelength_um": um, "wl": um, "wavelength_nm": nm}
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +189,18 @@ def tabulate(
     }
 
 
-def _row_problem(row: list[float], columns: str) -> str:
-    """What is wrong with a row of wavelength and values; empty where nothing is."""
+def _row_problem(row: list[float], columns: str, noise: float = 1e-3) -> str:
+    """What is wrong with a row of wavelength and values; empty where nothing is.
+
+    Args:
+        row, columns: of a table, as for :func:`tabulate`.
+        noise: k of a measured table may lie below 0 by this; it counts as 0.
+    """
     if len(row) != len(columns) + 1 or not all(map(math.isfinite, row)) or row[0] <= 0:
         return f"; need {len(columns) + 1} finite numbers, wavelength in um above 0"
     if "n" in columns and row[1] <= 0:
         return f": n = {row[1]:g}; need n above 0"
-    if "k" in columns and row[-1] < -_NOISE:
+    if "k" in columns and row[-1] < -noise:
         return f": k = {row[-1]:g}; need k of 0 or above (exp(-iwt))"
     return ""
 

@@ -12,7 +12,6 @@ from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, LensError
 
-_LARGEST = 1 << 31  # bytes that the arrays of one file may take
 _COMPRESSED = 15  # type of a compressed element of level 5
 _COMPLEX = 0x800  # flag of a complex matrix of level 5
 _STORED = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
@@ -20,7 +19,7 @@ _CLASSES = dict(zip(range(6, 16), "dfbBhHiIqQ", strict=True))
 _REFUSED = (*DAMAGE, EOFError, IndexError, zlib.error, zipfile.BadZipFile)
 
 
-def read_matlab(path: Path) -> dict[str, Array]:
+def read_matlab(path: Path, most_bytes: int = 1 << 31) -> dict[str, Array]:
     """Numeric arrays of a MATLAB file by name; text, cells and structures are left out.
 
     scipy.io.loadmat ends the process on some damaged files of level 5. Here
@@ -29,9 +28,10 @@ def read_matlab(path: Path) -> dict[str, Array]:
 
     Args:
         path: of the file.
+        most_bytes: that an array may take when unpacked.
 
     Raises:
-        LensError: damaged, no such file, or larger than 2 GB when unpacked.
+        LensError: damaged, no such file, or larger than that.
     """
     try:
         content = path.read_bytes()
@@ -41,7 +41,7 @@ def read_matlab(path: Path) -> dict[str, Array]:
         order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
         if order is None:
             raise ValueError("need level 5 or 7.3 (save -v7)")
-        return dict(_level_5(content[128:], order))
+        return dict(_level_5(content[128:], order, most_bytes))
     except _REFUSED as error:
         raise LensError(f"{path}: not a MATLAB file: {error}") from error
 
@@ -94,20 +94,23 @@ def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         yield kind, content[start : start + size]
 
 
-def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
+def _level_5(
+    content: bytes, order: str, most_bytes: int
+) -> Iterator[tuple[str, Array]]:
     """Name and array of every numeric matrix of a MATLAB file of level 5.
 
     Args:
         content: of the file after its head of 128 bytes.
         order: byte order, "<" or ">".
+        most_bytes: that an array may take.
     """
     for kind, data in _elements(content, order):
         if kind == _COMPRESSED:
             stream = zlib.decompressobj()
             tag = stream.decompress(data, 8)
             size = int(np.frombuffer(tag, f"{order}u4")[1])
-            if size > _LARGEST:
-                raise ValueError(f"holds {size:,} bytes, need at most {_LARGEST:,}")
+            if size > most_bytes:
+                raise ValueError(f"holds {size:,} bytes, need at most {most_bytes:,}")
             data = stream.decompress(stream.unconsumed_tail, size + 1)
             if not stream.eof or len(data) != size:
                 raise ValueError("cut short")

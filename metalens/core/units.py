@@ -2,5 +2,5 @@
 
 import math
 
-um, nm, mm = 1.0, 1e-3, 1e3
-deg = math.pi / 180
+um, nm, mm, m = 1.0, 1e-3, 1e3, 1e6
+rad, deg = 1.0, math.pi / 180

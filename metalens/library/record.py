@@ -26,11 +26,8 @@ from metalens.library.proxy import MOST_ERROR, Proxy
 # 0.8 before half a turn.
 PLAIN = Index(3.6)
 DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
-MOST_ALONG = 1000  # samples along a size, where there are two
 # default tolerances: round pillars, others (corners converge slowly), two sizes
 USUAL = {"modal": 1e-3, "rcwa": 0.02, "axes": 0.05}
-# least gap of a default sweep: a printable gap of 60 nm, less 10 nm of bias
-EDGE_GAP_UM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +92,14 @@ class Sweep:
         if self.lengths_um is not None:
             self._check_lengths(self.lengths_um)
 
-    def _check_lengths(self, lengths: tuple[float, float]) -> None:
+    def _check_lengths(
+        self, lengths: tuple[float, float], most_samples: int = 1000
+    ) -> None:
         """Refuse ranges of two sizes, and settings that do not apply to them.
 
         Args:
             lengths: (least, largest) size along y, um.
+            most_samples: along a size: a million Jones matrices per wavelength.
 
         Raises:
             ConfigError: naming the setting.
@@ -117,10 +117,10 @@ class Sweep:
             and self.light == "linear"
             and self.engine != "modal"
         )
-        if not supported or self.samples > MOST_ALONG:
+        if not supported or self.samples > most_samples:
             raise ConfigError(
                 f"lengths_um = {list(lengths)}: a library over two sizes is for normal incidence (angles_deg = [0.0]), "
-                f'light = "linear", engine auto or rcwa, and at most {MOST_ALONG} samples'
+                f'light = "linear", engine auto or rcwa, and at most {most_samples} samples'
             )
 
     @property
@@ -148,15 +148,20 @@ class Sweep:
             kind = "axes"
         return dataclasses.replace(self, tolerance=USUAL[kind])
 
-    def span_um(self, cell: Cell) -> tuple[float, float]:
+    def span_um(self, cell: Cell, edge_gap_um: float = 0.05) -> tuple[float, float]:
         """(least, largest) diameter of the sweep, um; the default range where none is
         stated.
+
+        Args:
+            cell: unit cell with its materials, shape and lattice.
+            edge_gap_um: least gap of the default range: a printable gap of 60 nm, less
+                10 nm of bias.
 
         Raises:
             CellError: the diameters do not fit into the cell.
         """
         thinnest = max(min(0.06, cell.pitch_um / 5), cell.size_um(0.0))
-        low, high = self.diameters_um or (thinnest, cell.widest_um(EDGE_GAP_UM))
+        low, high = self.diameters_um or (thinnest, cell.widest_um(edge_gap_um))
         if not 0 < low < high:
             raise CellError(
                 f"diameters_um = ({low:g}, {high:g}): need 0 < least < largest"

@@ -15,18 +15,18 @@ from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 from metalens.core.foreign_arrays import read_matlab, read_npz
 from metalens.core.reading import read_text
-from metalens.core.units import deg
+from metalens.core.units import deg, m, mm, nm, rad, um
 from metalens.library.fit import LEAST_ENTRIES
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PillarLibrary, Sweep
 
-LENGTHS = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6}
-ANGLES = {"deg": deg, "degrees": deg, "rad": 1.0}
+LENGTHS = {"nm": nm, "um": um, "mm": mm, "m": m}
+ANGLES = {"deg": deg, "degrees": deg, "rad": rad}
 PHASES = ANGLES | dict.fromkeys(("turns", "waves", "cycles"), math.tau)
 KINDS: tuple[tuple[str, dict[str, float], str], ...] = (
     # quantity; its units in um, THz or rad; names of its column without unit
     ("size", LENGTHS, "diameter d size width"),
-    ("size", {unit: 2 * um for unit, um in LENGTHS.items()}, "radius r"),
+    ("size", {unit: 2 * length for unit, length in LENGTHS.items()}, "radius r"),
     ("wavelength", LENGTHS, "wavelength lambda wl"),
     ("frequency", {"thz": 1.0, "ghz": 1e-3, "hz": 1e-12}, "frequency freq f"),
     ("angle", ANGLES, "angle theta incidence angle_of_incidence"),

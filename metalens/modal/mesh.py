@@ -149,7 +149,7 @@ def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
     )
 
 
-class Wall(enum.IntFlag):
+class CellWall(enum.IntFlag):
     """Walls of the quarter cell: x = 0, x = 1, y = 0, y = 1."""
 
     X0 = enum.auto()
@@ -158,7 +158,7 @@ class Wall(enum.IntFlag):
     Y1 = enum.auto()
 
 
-X0, X1, Y0, Y1 = Wall
+X0, X1, Y0, Y1 = CellWall
 # of vertices at the centre, on the x axis (a), on the y axis (b) and on the diagonal;
 # and in addition at the edge of the cell
 WALLS = {"centre": X0 | Y0, "a": Y0, "b": X0, "diagonal": X0 & Y0}
