@@ -7,6 +7,7 @@ import json
 import math
 import re
 import reprlib
+import sys
 import tomllib
 import types
 import typing
@@ -25,8 +26,7 @@ _BACKSLASH = (
     "quotes ('C:\\maps\\a.npy') or with /"
 )
 _EITHER_SIGN = ("_rad", "_deg", "_offset")  # endings of keys that may be negative
-# largest seed; largest magnitude of any other number, in the unit of its key
-_MOST, _LARGE = (1 << 63) - 1, 1e9
+_MOST = sys.maxsize  # largest whole number of TOML
 
 
 def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Record:
@@ -199,7 +199,7 @@ def is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _check_range(
-    field: dataclasses.Field[Any], value: Any, where: str, key: str
+    field: dataclasses.Field[Any], value: Any, where: str, key: str, most: float = 1e9
 ) -> None:
     """Refuse an empty list or name, and a number that is not finite or too large;
     limits as for :func:`load`.
@@ -209,6 +209,7 @@ def _check_range(
         value: number, text, path or tuple.
         where: file or place that errors name.
         key: its full name in errors.
+        most: largest magnitude of any number but a seed, in the unit of its key.
     """
     limits = field.metadata
     nameless = isinstance(value, Path) and not value.name
@@ -216,7 +217,7 @@ def _check_range(
         raise ConfigError(
             f"{where}: {key} is empty, need {'entries' if value == () else 'a name'}"
         )
-    largest = _MOST if field.name == "seed" else limits.get("most", _LARGE)
+    largest = _MOST if field.name == "seed" else limits.get("most", most)
     for number in _numbers(value):
         if number == math.inf and (
             limits.get("may_be_inf") or field.default == math.inf

@@ -42,12 +42,9 @@ from metalens.rcwa.smatrix import scatter_zero_order
 
 # The error estimate: the largest change from four (six where a gap, wall or hole is
 # narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
-_FIRST = 3  # harmonics of the first truncation where four are compared
 _LAST = {4: 15, 2: 11, 1: 9}  # by the number of symmetry operations: about a second
 _LAST_TILTED = {4: 10, 2: 7, 1: 6}  # some thirty layers in place of one
 _COMPARED, MOST_COMPARED = 4, 6
-_OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow width
-_TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
 SAFETY = 7.0
 
 
@@ -431,13 +428,23 @@ class TruncationSequence:
 
 
 def truncation_sequence(
-    problem: CellProblem, harmonics: int | None
+    problem: CellProblem,
+    harmonics: int | None,
+    *,
+    first: int = 3,
+    oscillation: float = 0.75,
+    thin: float = 1.0,
+    touching: float = 5.0,
 ) -> TruncationSequence:
     """Truncations of one cell and light.
 
     Args:
         problem: cell and light.
         harmonics: the largest truncation; None: one that takes about a second.
+        first: harmonics of the first truncation where four are compared.
+        oscillation: errors oscillate once while so many orders fit a narrow width.
+        thin, touching: what is added to the factor of the estimate for walls and for
+            gaps of no width.
 
     Raises:
         CellError: less than one harmonic.
@@ -456,17 +463,16 @@ def truncation_sequence(
         spans = np.array(cell.outline(size_um).spans_um) / pitch
     # errors oscillate once in 1 / width orders; below NARROWEST_SHARE a factor stands for it
     widths = np.array([gap / pitch, *np.maximum(spans, NARROWEST_SHARE)])
-    oscillation = _OSCILLATION / widths[widths >= NARROWEST_SHARE].min()
-    compared = int(np.clip(math.ceil(oscillation), _COMPARED, MOST_COMPARED))
+    period = oscillation / widths[widths >= NARROWEST_SHARE].min()
+    compared = int(np.clip(math.ceil(period), _COMPARED, MOST_COMPARED))
     last = (
         _largest_truncation(cell, problem.classes) if harmonics is None else harmonics
     )
-    first = _FIRST + _COMPARED if harmonics is None else harmonics
-    thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST_SHARE)
-    touching = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST_SHARE * pitch))
-    return TruncationSequence(
-        range(max(1, first - compared), last + 1), compared, max(thin, touching)
-    )
+    start = (first + _COMPARED if harmonics is None else harmonics) - compared
+    unresolved_wall = max(0.0, 1 - float(spans.min()) / NARROWEST_SHARE)
+    unresolved_gap = max(0.0, 1 - gap / (NARROWEST_SHARE * pitch))
+    factor = 1 + max(thin * unresolved_wall, touching * unresolved_gap)
+    return TruncationSequence(range(max(1, start), last + 1), compared, factor)
 
 
 def safety_factor(reach: int) -> float:
