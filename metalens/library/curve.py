@@ -66,6 +66,14 @@ class RationalFunction:
         poles = scipy.linalg.eigvals(pencil, mass)
         return np.asarray(poles[np.isfinite(poles)])
 
+    def poles_near(self, low: float, high: float, half_width: float) -> Array:
+        """Poles over the interval from ``low`` to ``high`` whose imaginary part is less
+        than ``half_width``.
+        """
+        z = self.poles()
+        over_interval = (z.real > low) & (z.real < high)
+        return np.asarray(z[over_interval & (np.abs(z.imag) < half_width)])
+
 
 def fit_rational_aaa(
     x: Array, y: Array, *, tolerance: float, terms: int | None = None
@@ -267,12 +275,7 @@ class ResponseCurve:
         """
         low = self.nodes.diameter_um.min()
         high = self.nodes.diameter_um.max()
-        poles = self.best.poles()
-        poles = poles[
-            (poles.real > low)
-            & (poles.real < high)
-            & (np.abs(poles.imag) < half_width_um)
-        ]
+        poles = self.best.poles_near(low, high, half_width_um)
         for rival in self.rivals:
             others = rival.poles()
             if len(poles) and len(others):
@@ -388,12 +391,7 @@ def _most_doubtful(
     """
     x = nodes.diameter_um
     low, high = x.min(), x.max()
-    poles = fit.poles()
-    poles = poles[
-        (poles.real > low)
-        & (poles.real < high)
-        & (np.abs(poles.imag) < 0.1 * (high - low))
-    ]
+    poles = fit.poles_near(low, high, 0.1 * (high - low))
     offsets = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
     even = np.linspace(low, high, 1201)
     near_poles = np.concatenate(offsets)

@@ -58,7 +58,7 @@ def solve_to_tolerance(
         light: plane wave that comes.
         engine: auto, rcwa or modal.
     """
-    return functools.partial(_solve, engine, cell, light, {"tolerance": tolerance})
+    return functools.partial(_solve, engine, cell, light, tolerance=tolerance)
 
 
 def solver_at_common_discretization(
@@ -141,21 +141,12 @@ def _rcwa_levels(
             cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
         )
         truncations = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
-    settings = {"tolerance": tolerance}
-    return [
-        functools.partial(
-            _solve, "rcwa", cell, light, settings | {"harmonics": harmonics}
-        )
-        for harmonics in truncations
-    ]
+    solve = functools.partial(_solve, "rcwa", cell, light, tolerance=tolerance)
+    return [functools.partial(solve, harmonics=harmonics) for harmonics in truncations]
 
 
 def _solve(
-    engine: str,
-    cell: Cell,
-    light: Incidence,
-    settings: dict[str, Any],
-    diameter_um: float,
+    engine: str, cell: Cell, light: Incidence, diameter_um: float, **settings: float
 ) -> Response:
     """Response of one pillar by ``modal`` or ``rcwa``, imported on use.
 
@@ -163,8 +154,8 @@ def _solve(
         engine: modal or rcwa.
         cell: unit cell.
         light: plane wave that comes.
-        settings: keywords of the solver.
         diameter_um: of the pillar.
+        settings: keywords of the solver.
     """
     solver = importlib.import_module(f"metalens.{engine}")
     response: Response = solver.solve(

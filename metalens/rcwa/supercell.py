@@ -21,8 +21,8 @@ from metalens.rcwa.basis import (
     symmetry_operation,
     tangential_wave,
 )
-from metalens.rcwa.permittivity import PillarSection, section_operators
-from metalens.rcwa.smatrix import scatter_zero_order, solve_eigenmodes
+from metalens.rcwa.permittivity import PillarSection, section_modes
+from metalens.rcwa.smatrix import scatter_zero_order
 from metalens.rcwa.solver import half_space_indices
 
 
@@ -142,16 +142,12 @@ def solve_row(
         operations,
     )
     waves = plane_waves(space, supercell, light)
-    operators = section_operators(space, waves, slab, supercell)
     height = 2 * math.pi / wavelength_um * cell.height_um
+    modes = section_modes(space, waves, slab, supercell, height)
     substrate, cover = half_space_indices(cell, light)
     zero, sign = waves.zero["xy".index(polarization)]
     scattered = scatter_zero_order(
-        waves,
-        (substrate, cover),
-        [solve_eigenmodes(*operators, height)],
-        zero,
-        symmetric=False,
+        waves, (substrate, cover), [modes], zero, symmetric=False
     )
     # in the plane of the row, light along x is p and light along y is s
     along_row = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
