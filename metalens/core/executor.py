@@ -30,11 +30,7 @@ _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"
 
 def usable_cores() -> int:
     """Number of cores that this process may use."""
-    return (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
+    return len(os.sched_getaffinity(0))
 
 
 @contextlib.contextmanager

@@ -24,6 +24,8 @@ from metalens.library.record import PillarLibrary
 LEAST_ENTRIES = 12  # diameters in a domain
 REACH = 2.0  # half-widths on either side of a narrow resonance that are excluded
 UNKNOWN = 0.5  # largest error bar of a usable entry, as a share of |t|
+# default tolerances: an absolute deviation, and a share of the entries' error bars
+FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +49,6 @@ class ProxyTolerances:
     least_transmission: float = 0.7
     least_half_width_um: float = 0.005
     within_um: tuple[float, float] | None = None
-
-    def deviations(
-        self, entry_error: float, least: float = 1e-3, share: float = 0.5
-    ) -> tuple[float, float]:
-        """(phase in rad, |T|) largest deviations, with the defaults where none is
-        stated.
-
-        Args:
-            entry_error: of the library, as a share of |t|.
-            least: default where the entries are more accurate.
-            share: of the entries' error, else.
-        """
-        default = max(least, share * entry_error)
-        return (
-            self.phase_tolerance_rad or default,
-            self.transmission_tolerance or default,
-        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -399,7 +384,9 @@ def _fit_branch(
         limits: tolerances and limits of the fit.
         branch: of the library.
     """
-    phase, level = limits.deviations(_entry_error(library, branch.diameter_um))
+    default = max(FOLLOWED, KNOWN_SHARE * _entry_error(library, branch.diameter_um))
+    phase = limits.phase_tolerance_rad or default
+    level = limits.transmission_tolerance or default
     domain, proxy = _choose_domain(branch, limits.coefficients // 2, (phase, level))
     low, high = proxy.domain_um
     proxy = dataclasses.replace(

@@ -2,7 +2,6 @@
 matrices with every wall natural.
 """
 
-import enum
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -149,19 +148,11 @@ def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
     )
 
 
-class CellWall(enum.IntFlag):
-    """Walls of the quarter cell: x = 0, x = 1, y = 0, y = 1."""
-
-    X0 = enum.auto()
-    X1 = enum.auto()
-    Y0 = enum.auto()
-    Y1 = enum.auto()
-
-
-X0, X1, Y0, Y1 = CellWall
+# walls of the quarter cell, as bits: x = 0, x = 1, y = 0, y = 1
+X0, X1, Y0, Y1 = 1, 2, 4, 8
 # of vertices at the centre, on the x axis (a), on the y axis (b) and on the diagonal;
 # and in addition at the edge of the cell
-WALLS = {"centre": X0 | Y0, "a": Y0, "b": X0, "diagonal": X0 & Y0}
+WALLS = {"centre": X0 | Y0, "a": Y0, "b": X0, "diagonal": 0}
 EDGE_WALLS = {"a": X1, "b": Y1, "diagonal": X1 | Y1}
 
 

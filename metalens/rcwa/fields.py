@@ -384,16 +384,13 @@ def _solve_class(
 def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
     """Amplitudes of the incident wave along (x, y) at normal incidence, else of (s, p)."""
     c, s = math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
-    polarization = light.polarization
+    directions = {"x": (1.0, 0.0), "y": (0.0, 1.0), "p": (c, s), "s": (-s, c)}
+    x, y = directions[light.polarization]
     if light.angle_rad == 0:
-        amplitudes = {"x": (1.0, 0.0), "y": (0.0, 1.0), "p": (c, s), "s": (-s, c)}
-        return amplitudes[polarization]
-    column = polarization_column(light)
-    amplitude = 1.0
-    if polarization in ("x", "y"):  # the field along +x or +y, not against it
-        directions = {"x": (-s, c), "y": (c, s)}  # of the unit vectors of s and p
-        amplitude = math.copysign(1.0, directions[polarization][column])
-    return (0.0, amplitude) if column else (amplitude, 0.0)
+        return x, y
+    along_s, along_p = c * y - s * x, c * x + s * y
+    # one of them is 0 but for rounding
+    return (0.0, along_p) if polarization_column(light) else (along_s, 0.0)
 
 
 def _point_sums(

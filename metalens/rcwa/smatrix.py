@@ -12,7 +12,7 @@ from metalens.core.arrays import Array
 from metalens.rcwa.basis import PlaneWaves, half_space, normal_component
 
 Pair = tuple[Array, Array]
-# a mode exactly at its cut-off, where q² is rounding: up and down waves may not coincide
+# q of a mode exactly at its cut-off, where q² is rounding: up and down waves differ
 _TINY = math.sqrt(sys.float_info.epsilon)
 
 
@@ -182,7 +182,8 @@ def _layer_reflection(
         symmetric: as in :func:`match_layers`.
     """
     exponent = modes.q * modes.height
-    reaching = int(np.count_nonzero(np.exp(-exponent.imag) > sys.float_info.epsilon))
+    remains = np.exp(-exponent.imag)
+    reaching = int(np.count_nonzero(remains > sys.float_info.epsilon))
     fade = np.exp(1j * exponent[:reaching])
     U, V = pair
     if not symmetric:

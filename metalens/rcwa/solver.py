@@ -4,8 +4,8 @@ truncations until the error estimate meets a tolerance.
 
 import dataclasses
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -77,7 +77,7 @@ class JonesResponse:
     orders: int
     converged: bool
     reason: str
-    earlier: Array = field(default_factory=lambda: np.empty((0, 2, 2), complex))
+    earlier: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -524,10 +524,7 @@ def _refine(
     )
     before = [both[0] for both in history[-1 - sequence.compared : -1]]
     earlier = before[:1] * (MOST_COMPARED - sequence.compared) + before
-    response = _response(problem, reach, truncation, error, met, reason)
-    return dataclasses.replace(
-        response, earlier=np.array(earlier, complex).reshape(-1, 2, 2)
-    )
+    return _response(problem, reach, truncation, error, met, reason, earlier)
 
 
 def estimate_error(history: list[Array], reach: int, compared: int) -> float:
@@ -695,10 +692,19 @@ def _response(
     error: float,
     converged: bool,
     reason: str,
+    earlier: Sequence[Array] = (),
 ) -> JonesResponse:
     """Jones response of a truncation, with its basis and number of orders."""
     basis = ("x", "y") if problem.light.normal else ("s", "p")
     t, r = truncation.both
     return JonesResponse(
-        basis, t, r, error, truncation.energy, count_orders(reach), converged, reason
+        basis,
+        t,
+        r,
+        error,
+        truncation.energy,
+        count_orders(reach),
+        converged,
+        reason,
+        np.array(earlier, complex).reshape(-1, 2, 2),
     )
