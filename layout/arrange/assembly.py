@@ -8,18 +8,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.arrange.parts import UNIT_NM, DieComponent, moved_cell
+from layout.arrange.parts import DieComponent, moved_cell
 from layout.arrange.record import PartInstances
-from layout.formats import job_files
+from layout.formats import gdsii_write, job_files
 from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
+from layout.mask.build import UNIT_NM
 from layout.mask.fields import FieldPlan
 from layout.process.process import LayerNumber
 from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
-MARGIN_UM = 10.0  # around the marks of a wafer
 _SAME = 5e-7  # difference of doses that are written as the same number
-_MOST_DATATYPE = 32767
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ class JobLayers:
         for other, other_dose in sorted(self.doses.items()):
             if other[0] == layer[0] and abs(other_dose - dose) < _SAME:
                 return other
-        for datatype in range(_MOST_DATATYPE + 1):
+        for datatype in range(gdsii_write.MAX_NUMBER + 1):
             if (layer[0], datatype) not in self.doses and (
                 layer[0],
                 datatype,

@@ -19,15 +19,14 @@ from layout.formats.library import (
     flatten_stacks,
     library_of,
 )
-from layout.mask.plan import MaskPlan, PillarArray
+from layout.mask.build import UNIT_NM
+from layout.mask.plan import FARTHEST, MaskPlan, PillarArray
 from layout.process.process import LayerNumber, Process
 from layout.shapes import region
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
-UNIT_NM = 1.0
 PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
-_TILES = 64  # squares of a lattice, each way
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +195,7 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
         whole = np.rint(in_new_unit)
         rounding = np.abs(in_new_unit - whole).max(initial=0)
         largest = np.abs(whole).max(initial=0)
-        if rounding > 1e-6 or largest > 2**31 - 1:
+        if rounding > 1e-6 or largest > FARTHEST:
             raise MaskFileError(
                 f"{where}: its database unit is {library.unit_nm:g} nm, and its "
                 f"coordinates are no whole multiples of {unit_nm:g} nm within 32 bits; "
@@ -250,19 +249,20 @@ def moved_cell(
     )
 
 
-def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> Array:
-    """Boxes around the pillars of tiles of a lattice, at most 64 by 64 tiles.
+def _lattice_boxes(plan: MaskPlan, lattice: PillarArray, tiles: int = 64) -> Array:
+    """Boxes around the pillars of tiles of a lattice.
 
     Args:
         plan: outlines of the classes.
         lattice: of the plan.
+        tiles: at most so many along each axis.
 
     Returns:
         (n, 4) left, bottom, right, top of each tile that holds pillars, database units.
     """
     reach = max(int(np.abs(pillar.outline).max()) for pillar in plan.classes)
-    rows_per_tile = -(-lattice.rows // _TILES)
-    columns_per_tile = -(-lattice.columns // _TILES)
+    rows_per_tile = -(-lattice.rows // tiles)
+    columns_per_tile = -(-lattice.columns // tiles)
     boxes = []
     for first, block in lattice.blocks(rows_per_tile):
         for left in range(0, lattice.columns, columns_per_tile):
@@ -270,12 +270,8 @@ def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> Array:
             if occupied.any():
                 rows = np.flatnonzero(occupied.any(1))[[-1, 0]] + first
                 columns = np.flatnonzero(occupied.any(0))[[0, -1]] + left
-                x = lattice.x0 + columns * lattice.pitch
-                y = lattice.y0 - rows * lattice.down
-                low, high_corner = (x[0], y[0]), (x[1], y[1])
-                boxes.append(
-                    np.add([*low, *high_corner], np.array([-1, -1, 1, 1]) * reach)
-                )
+                corners = np.column_stack(lattice.positions(rows, columns))
+                boxes.append(corners.ravel() + np.array([-1, -1, 1, 1]) * reach)
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 

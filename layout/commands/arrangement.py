@@ -18,6 +18,7 @@ from layout.formats.files import placement_limit
 from layout.formats.library import MaskLibrary, library_of
 from layout.formats.reading import read_mask
 from layout.mask import build
+from layout.mask.marks import CLEAR_UM
 from layout.mask.plan import MaskPlan
 from layout.process import process as processes
 from layout.process.process import LayerNumber
@@ -261,7 +262,7 @@ def _stepped(
                 f"need {need:.4g}"
             )
     left, bottom, right, top = separation.extent_um(work.placed).tolist()
-    margin = max(scatter_um, assembly.MARGIN_UM)
+    margin = max(scatter_um, CLEAR_UM)
     die_um = left, bottom, right, top
     work.dies = wafer.usable_dies(size, die_um, around_marks_um=margin)
     steps = wafer.step_and_repeat(die.name, work.dies, units_per_um=assembly.PER_UM)

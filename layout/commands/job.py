@@ -57,16 +57,6 @@ class Options(DistributedOptions):
     dose: bool = True
     study: bool = False
 
-    @property
-    def writes_oasis(self) -> bool:
-        """Whether OASIS is written: asked for, or the default."""
-        return self.oasis or not self.gds
-
-    @property
-    def writes_gds(self) -> bool:
-        """Whether GDSII is written: asked for, or the default."""
-        return self.gds or not self.oasis
-
 
 @dataclass(eq=False)
 class LayoutJob:

@@ -133,15 +133,15 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
 def mask_writers(
     options: Options,
 ) -> dict[str, Callable[[MaskPlan | MaskLibrary, Path], None]]:
-    """{file name: writer} of the mask files that are asked for.
+    """{file name: writer} of the mask files that are asked for; of none: both.
 
     Args:
         options: of the command.
     """
     writers: dict[str, Callable[[MaskPlan | MaskLibrary, Path], None]] = {}
-    if options.writes_oasis:
+    if options.oasis or not options.gds:
         writers["mask.oas"] = oasis_write.write_oasis
-    if options.writes_gds:
+    if options.gds or not options.oasis:
         writers["mask.gds"] = gdsii_write.write_gdsii
     return writers
 

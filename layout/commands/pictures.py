@@ -37,9 +37,7 @@ def plot_die(plan: MaskPlan, drc_report: DrcReport) -> bytes:
     figure, axes = report.make_figure(size=(7.2, 6.6))
     scale = plan.unit_nm * 1e-3
     drawn: dict[str, list[Array]] = {
-        "pillars": [
-            rectilinear.box_corners(np.array(lattice.box)) for lattice in plan.lattices
-        ]
+        "pillars": [rectilinear.box_corners(lattice.box) for lattice in plan.lattices]
     }
     for cell in plan.figures:
         for layer, polygons in sorted(cell.polygons.items()):

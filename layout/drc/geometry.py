@@ -254,20 +254,35 @@ def _fill_bands(
     height = max(height, (top_end - low) / len(which))
     offsets = np.zeros(int((top_end - low) // height) + 2, np.int64)
     for copy in range(len(which)):
-        lower = boxes[which[copy], 1] + shift[copy, 1] - low
-        upper = boxes[which[copy], 3] + shift[copy, 1] + distance - low
-        for band in range(int(lower // height), int(upper // height) + 1):
+        up = shift[copy, 1] - low
+        lowest, highest = _band_range(boxes[which[copy]], up, height, distance)
+        for band in range(lowest, highest + 1):
             offsets[band + 1] += 1
     offsets = np.cumsum(offsets)
     member = np.empty(offsets[-1], np.int32)
     next_free = offsets.copy()
     for copy in order:
-        lower = boxes[which[copy], 1] + shift[copy, 1] - low
-        upper = boxes[which[copy], 3] + shift[copy, 1] + distance - low
-        for band in range(int(lower // height), int(upper // height) + 1):
+        up = shift[copy, 1] - low
+        lowest, highest = _band_range(boxes[which[copy]], up, height, distance)
+        for band in range(lowest, highest + 1):
             member[next_free[band]] = copy
             next_free[band] += 1
     return low, height, offsets, member
+
+
+@compile_loop
+def _band_range(
+    box: Array, up: float, height: float, distance: float
+) -> tuple[int, int]:
+    """Lowest and highest band that a box meets.
+
+    Args:
+        box: left, bottom, right, top.
+        up: its displacement along y from the bottom of the lowest band.
+        height: of the bands.
+        distance: added to the top of the box.
+    """
+    return int((box[1] + up) // height), int((box[3] + up + distance) // height)
 
 
 @compile_loop

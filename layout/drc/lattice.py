@@ -260,9 +260,9 @@ class _LatticeCheck:
                 hits = is_listed[vector][
                     outline_of_class[below], outline_of_class[above]
                 ]
-                for row, column in np.argwhere(hits)[:MAX_LISTED].tolist():
+                for row, column in np.argwhere(hits)[:MAX_LISTED]:
                     numbers = int(below[row, column]), int(above[row, column])
-                    x, y = self._place(top + low + row, left + column)
+                    x, y = self.lattice.positions(top + low + row, left + column)
                     shapes = [self.plan.classes[number - 1] for number in numbers]
                     step = right * self.lattice.pitch, up * self.lattice.down
                     moved = [shapes[0].outline + np.array([x, y])]
@@ -293,9 +293,8 @@ class _LatticeCheck:
         self.report.minimum_foot_space_nm = min(
             self.report.minimum_foot_space_nm, smallest
         )
-        corners = np.array(
-            [self._place(0, 0), self._place(lattice.rows, lattice.columns)]
-        )
+        ends = np.array([0, lattice.rows]), np.array([0, lattice.columns])
+        corners = np.column_stack(lattice.positions(*ends))
         self.report.add_equal(
             "foot",
             smallest,
@@ -309,15 +308,8 @@ class _LatticeCheck:
     def _sites_of(self, class_number: int) -> Iterator[Array]:
         """(2,) x and y of all sites of a class."""
         for top, block in self.lattice.blocks():
-            for row, column in np.argwhere(block == class_number).tolist():
-                yield np.array(self._place(top + row, column))
-
-    def _place(self, row: int, column: int) -> tuple[int, int]:
-        """(x, y) of a site, database units."""
-        return (
-            self.lattice.x0 + column * self.lattice.pitch,
-            self.lattice.y0 - row * self.lattice.down,
-        )
+            row, column = np.nonzero(block == class_number)
+            yield from np.column_stack(self.lattice.positions(top + row, column))
 
     def _blocks(self, vectors: Array) -> Iterator[tuple[Array, int, int]]:
         """Blocks of rows, each preceded by the last rows of the block before.

@@ -23,18 +23,17 @@ from layout.drc.geometry import (
 )
 from layout.drc.lattice import check_plan
 from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, RuleViolation
-from layout.formats.library import QUARTERS, MaskLibrary, Orientation, group_equal
+from layout.formats.library import UPRIGHT, MaskLibrary, Orientation, group_equal
 from layout.formats.reading import read_mask
 from layout.mask.plan import MaskPlan
 from layout.process.process import DesignRules, LayerNumber
 from layout.shapes import region
-from layout.shapes.rectilinear import IntBox
+from layout.shapes.rectilinear import IntBox, box_corners
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
 # database units: two corners, each rounded by up to half a unit along x and along y
 GRID_TOLERANCE = 2**0.5
-UPRIGHT = QUARTERS[0]
 Metric = Literal["projection", "euclidean"]
 LayerChoice = tuple[int, int | None]  # layer number; datatype, None: all together
 
@@ -321,8 +320,7 @@ class _LayerCheck:
         """Number of the element of a cell reference."""
         key = (cell, None, turn)
         if key not in self.numbers:
-            left, bottom, right, top = _turned_box(self.bounding_box(cell), turn)
-            box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+            box = box_corners(_turned_box(self.bounding_box(cell), turn))
             self.numbers[key] = self._add_element(
                 _Element(cell, turn, (box,), (), False)
             )
@@ -697,8 +695,7 @@ def _turned_box(box: IntBox | None, turn: Orientation) -> IntBox:
     """Box around the box of a cell that draws, in some orientation."""
     if box is None:
         raise ValueError("a cell that draws nothing has no box")
-    left, bottom, right, top = box
-    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    corners = box_corners(box)
     return contour_box([np.column_stack(turn.apply(*corners.T))])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from layout.formats.digest import RunningDigest
 from layout.formats.library import (
     QUARTERS,
+    UPRIGHT,
     MaskCell,
     MaskLibrary,
     Orientation,
@@ -167,7 +168,7 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
     zero = np.zeros(1, np.int64)
     sums = {who: tuple(digest.of(zero)[0].tolist()) for who, digest in digests.items()}
     if cell.pillars is not None:
-        key = None if merged else QUARTERS[0]
+        key = None if merged else UPRIGHT
         sums |= {(child, key): v for child, v in cell.pillars.sums().items()}
     return sums
 

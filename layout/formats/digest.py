@@ -13,7 +13,6 @@ _FIRST, _SECOND, _THIRD = (
     np.uint64(0xBF58476D1CE4E5B9),
     np.uint64(0x94D049BB133111EB),
 )
-_ROOM = 256
 _MOST = 1 << 24  # children
 _OTHER = 8  # turns from here on are no quarter turns: equal in the hash
 
@@ -22,29 +21,18 @@ class RunningDigest:
     """Running sums over placements; children are numbered from any integer."""
 
     def __init__(self) -> None:
-        self._sums = np.zeros((_ROOM, 4), np.int64)
-        self._hashes = np.zeros(_ROOM, np.uint64)
+        self._sums = np.zeros((0, 4), np.int64)
+        self._hashes = np.zeros(0, np.uint64)
 
     def take(self, child: Array, x: Array, y: Array, turn: Array) -> None:
         """Add placements: (n,) numbers, places and turns (0: as it is)."""
         if not len(child):
             return
-        slot = np.where(
-            child >= 0, 2 * child.astype(np.int64), -2 * child.astype(np.int64) - 1
-        )
+        slot = _slots(child.astype(np.int64))
         self._grow(int(slot.max()) + 1)
         _take(
             slot, x.astype(np.int64), y.astype(np.int64), turn, self._sums, self._hashes
         )
-
-    def sites(self, block: Array, x0: int, y0: int, pitch: tuple[int, int]) -> None:
-        """Add the sites of a block of class numbers (0: none), its first site at (x0,
-        y0), rows towards -y.
-
-        pitch: of columns and of rows.
-        """
-        self._grow(2 * int(block.max(initial=0)) + 1)
-        _sites(np.ascontiguousarray(block), x0, y0, *pitch, self._sums, self._hashes)
 
     @property
     def children(self) -> Array:
@@ -54,7 +42,7 @@ class RunningDigest:
 
     def of(self, children: Array) -> Array:
         """(children, 5) count, sums of x and y, number turned, and hash, by number."""
-        slot = np.where(children >= 0, 2 * children, -2 * children - 1)
+        slot = _slots(children)
         self._grow(int(slot.max(initial=0)) + 1)
         return np.column_stack([self._sums[slot], self._hashes[slot].view(np.int64)])
 
@@ -68,6 +56,11 @@ class RunningDigest:
             more = 2 * size - len(self._hashes)
             self._sums = np.concatenate([self._sums, np.zeros((more, 4), np.int64)])
             self._hashes = np.concatenate([self._hashes, np.zeros(more, np.uint64)])
+
+
+def _slots(child: Array) -> Array:
+    """Slot of each child: even from number 0 on, odd below."""
+    return np.where(child >= 0, 2 * child, -2 * child - 1)
 
 
 @compile_loop
@@ -100,29 +93,3 @@ def _take(
         sums[number, 2] += y[n]
         sums[number, 3] += turn[n] != 0
         hashes[number] += _mixed(x[n], y[n]) * np.uint64(2 * min(turn[n], _OTHER) + 1)
-
-
-@compile_loop
-def _sites(
-    block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array
-) -> None:
-    """Add the sites of a block of class numbers to the sums of their slots, in place.
-
-    Args:
-        block: (rows, columns) class numbers; 0: no pillar.
-        x0, y0: first site; rows run towards -y.
-        pitch: from column to column.
-        down: from row to row.
-        sums: (slots, 4) count, sum of x, sum of y, number turned.
-        hashes: (slots,) sum of the hashes of the places.
-    """
-    for row in range(block.shape[0]):
-        y = y0 - row * down
-        for column in range(block.shape[1]):
-            if block[row, column]:
-                number = 2 * block[row, column]
-                x = x0 + column * pitch
-                sums[number, 0] += 1
-                sums[number, 1] += x
-                sums[number, 2] += y
-                hashes[number] += _mixed(x, y)

@@ -27,6 +27,7 @@ def map_bytes(path: str | Path) -> Array:
         )
 
 
+MOST_PLACEMENTS = 2**29  # that are read from bytes of unknown origin
 CONTEXT_CELL = "$$$CONTEXT_INFO$$$"  # KLayout's record of library cells: no drawing
 
 

@@ -7,24 +7,38 @@ import numpy as np
 
 from layout.formats import gdsii_records as gds
 from layout.formats import paths
-from layout.formats.files import CONTEXT_CELL, decode_name, map_bytes, release_bytes
+from layout.formats.files import (
+    CONTEXT_CELL,
+    MOST_PLACEMENTS,
+    decode_name,
+    map_bytes,
+    release_bytes,
+)
+from layout.formats.gdsii_records import GdsiiRecord
 from layout.formats.library import MaskCell, MaskLibrary, Orientation
 from layout.formats.open_cell import OpenCell, has_area
-from layout.formats.read_loops import FARTHEST, sref_run
+from layout.formats.read_loops import sref_run
+from layout.mask.plan import BLOCK_SITES, FARTHEST
 from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
 # records that libraries may have before UNITS
 _HEADS = {0x00, 0x05, 0x1F, 0x20, 0x22, 0x23, 0x36, 0x37, 0x38, 0x39, 0x3A, 0x3B}
-_PATHS = (gds.PATH, gds.MBMSPATH)
-_SHAPES = {gds.BOUNDARY, gds.BOX, gds.TEXT, gds.NODE, gds.SREF, gds.AREF, *_PATHS}
-LIMIT = 2**29
-_AT_ONCE = 1 << 20  # copies of an array
+_PATHS = (GdsiiRecord.PATH, GdsiiRecord.MBMSPATH)
+_SHAPES = {
+    GdsiiRecord.BOUNDARY,
+    GdsiiRecord.BOX,
+    GdsiiRecord.TEXT,
+    GdsiiRecord.NODE,
+    GdsiiRecord.SREF,
+    GdsiiRecord.AREF,
+    *_PATHS,
+}
 
 
 def read_gdsii(
-    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+    path: str | Path, *, limit: int = MOST_PLACEMENTS, keep: int | None = None
 ) -> MaskLibrary:
     """Read a GDSII file.
 
@@ -44,7 +58,11 @@ def read_gdsii(
 
 
 def parse_gdsii(
-    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+    data: Array,
+    *,
+    limit: int = MOST_PLACEMENTS,
+    keep: int | None = None,
+    where: str = "data",
 ) -> MaskLibrary:
     """Read a GDSII stream from its bytes, as :func:`read_gdsii`.
 
@@ -93,36 +111,37 @@ class _GdsiiReader:
             raise self.fail(
                 f"record of {length} bytes, {left} left in the file; need an even length from 4 on"
             )
-        if kind in gds.DATA and gds.DATA[kind] != data_type:
+        expected = gds.DATA.get(kind, data_type)
+        if data_type != expected:
             raise self.fail(
-                f"{gds.NAMES[kind]} with data type {data_type}, need {gds.DATA[kind]}"
+                f"{gds.record_name(kind)} with data type {data_type}, need {expected}"
             )
         if wanted and kind not in wanted:
-            needed = " or ".join(gds.NAMES[k] for k in wanted)
-            raise self.fail(
-                f"found {gds.NAMES.get(kind, f'record 0x{kind:02x}')}, need {needed}"
-            )
+            needed = " or ".join(map(gds.record_name, wanted))
+            raise self.fail(f"found {gds.record_name(kind)}, need {needed}")
         self.at += length
         return kind, self.data[self.begin + 4 : self.at].tobytes()
 
     def library(self) -> MaskLibrary:
         """Read the whole stream, from HEADER to ENDLIB."""
-        self.next(gds.HEADER)
-        self.next(gds.BGNLIB)
-        while self.next()[0] != gds.LIBNAME:
+        self.next(GdsiiRecord.HEADER)
+        self.next(GdsiiRecord.BGNLIB)
+        while self.next()[0] != GdsiiRecord.LIBNAME:
             if int(self.data[self.begin + 2]) not in _HEADS:
                 raise self.fail("LIBNAME is missing")
         kind, data = self.next()
-        while kind in _HEADS and kind != gds.BGNSTR:
+        while kind in _HEADS and kind != GdsiiRecord.BGNSTR:
             kind, data = self.next()
-        if kind != gds.UNITS or len(data) != 16:
+        if kind != GdsiiRecord.UNITS or len(data) != 16:
             raise self.fail("UNITS of two numbers is missing")
         user = gds.to_float(data[:8])
         meters = gds.to_float(data[8:])
         if not (1e-15 < meters < 1 and user > 0):
             raise self.fail(f"database unit of {meters} m")
         cells: dict[str, MaskCell] = {}
-        while self.next(gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+        while (
+            self.next(GdsiiRecord.BGNSTR, GdsiiRecord.ENDLIB)[0] == GdsiiRecord.BGNSTR
+        ):
             cell = self.structure()
             if cell.name in cells:
                 raise self.fail(f"structure {cell.name!r} comes twice")
@@ -148,31 +167,40 @@ class _GdsiiReader:
 
     def structure(self) -> MaskCell:
         """Read a structure, from STRNAME to ENDSTR."""
-        name = self.name(self.next(gds.STRNAME)[1])
+        name = self.name(self.next(GdsiiRecord.STRNAME)[1])
         cell = OpenCell(name, self.keep)
         while True:
             self.references(cell)
-            kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
-            if kind == gds.ENDSTR:
+            kind, _ = self.next(*_SHAPES, GdsiiRecord.ENDSTR, GdsiiRecord.STRCLASS)
+            if kind == GdsiiRecord.ENDSTR:
                 return cell.close(name, self.names)
-            if kind in (gds.SREF, gds.AREF):
+            if kind in (GdsiiRecord.SREF, GdsiiRecord.AREF):
                 self.reference(cell, kind)
-            elif kind in (gds.BOUNDARY, gds.BOX, *_PATHS):
+            elif kind in (GdsiiRecord.BOUNDARY, GdsiiRecord.BOX, *_PATHS):
                 layer, points = self.line() if kind in _PATHS else self.boundary(kind)
                 if has_area(points):
                     cell.polygons.setdefault(layer, []).append(points)
                 else:
-                    cell.skipped[f"{gds.NAMES[kind]} without area"] += 1
-            elif kind != gds.STRCLASS:  # TEXT, NODE
-                cell.skipped["text" if kind == gds.TEXT else gds.NAMES[kind]] += 1
-                while self.next()[0] != gds.ENDEL:
+                    cell.skipped[f"{gds.record_name(kind)} without area"] += 1
+            elif kind != GdsiiRecord.STRCLASS:  # TEXT, NODE
+                cell.skipped[
+                    "text" if kind == GdsiiRecord.TEXT else gds.record_name(kind)
+                ] += 1
+                while self.next()[0] != GdsiiRecord.ENDEL:
                     self.refuse_outside_element()
 
     def refuse_outside_element(self) -> None:
         """Refuse a record that cannot be within an element."""
         kind = int(self.data[self.begin + 2])
-        if kind in _SHAPES or kind in (gds.BGNSTR, gds.ENDSTR, gds.ENDLIB, gds.HEADER):
-            raise self.fail(f"{gds.NAMES[kind]} within an element; ENDEL is missing")
+        if kind in _SHAPES or kind in (
+            GdsiiRecord.BGNSTR,
+            GdsiiRecord.ENDSTR,
+            GdsiiRecord.ENDLIB,
+            GdsiiRecord.HEADER,
+        ):
+            raise self.fail(
+                f"{gds.record_name(kind)} within an element; ENDEL is missing"
+            )
 
     def references(self, cell: OpenCell) -> None:
         """Plain references in a row, by the compiled loop."""
@@ -200,34 +228,38 @@ class _GdsiiReader:
         records: dict[int, bytes] = {}
         while True:
             kind, data = self.next()
-            if kind == gds.ENDEL:
+            if kind == GdsiiRecord.ENDEL:
                 return records
             self.refuse_outside_element()
-            if kind == gds.XY:  # writers split long outlines over several records
+            if (
+                kind == GdsiiRecord.XY
+            ):  # writers split long outlines over several records
                 records[kind] = records.get(kind, b"") + data
                 continue
-            if kind in records and kind not in (gds.PROPATTR, gds.PROPVALUE):
-                raise self.fail(
-                    f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice"
-                )
+            if kind in records and kind not in (
+                GdsiiRecord.PROPATTR,
+                GdsiiRecord.PROPVALUE,
+            ):
+                raise self.fail(f"element with {gds.record_name(kind)} twice")
             records[kind] = data
 
     def numbers(self, records: dict[int, bytes], kind: int, count: int | None) -> Array:
         """Integers of a record that an element needs."""
-        size = 4 if kind == gds.XY else 2
+        size = 4 if kind == GdsiiRecord.XY else 2
         data = records.get(kind)
         if (
             data is None
             or len(data) % size
             or (count is not None and len(data) != count * size)
         ):
-            raise self.fail(f"element with a wrong or missing {gds.NAMES[kind]}")
+            raise self.fail(f"element with a wrong or missing {gds.record_name(kind)}")
         return np.frombuffer(data, f">i{size}").astype(np.int64)
 
     def layer(self, records: dict[int, bytes], kind: int) -> LayerNumber:
         """Layer and datatype of an element, unsigned 16 bits each."""
         number, datatype = (
-            int(self.numbers(records, k, 1)[0]) & 0xFFFF for k in (gds.LAYER, kind)
+            int(self.numbers(records, k, 1)[0]) & 0xFFFF
+            for k in (GdsiiRecord.LAYER, kind)
         )
         return number, datatype
 
@@ -235,7 +267,10 @@ class _GdsiiReader:
         """Layer and corners of an outline, closed where the file leaves it open."""
         records = self.fields()
         layer = self.layer(
-            records, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE
+            records,
+            GdsiiRecord.DATATYPE
+            if kind == GdsiiRecord.BOUNDARY
+            else GdsiiRecord.BOXTYPE,
         )
         points = self.points(records)
         closed = len(points) > 1 and (points[0] == points[-1]).all()
@@ -243,7 +278,7 @@ class _GdsiiReader:
 
     def points(self, records: dict[int, bytes]) -> Array:
         """(n, 2) points of an element, n >= 1."""
-        numbers = self.numbers(records, gds.XY, None)
+        numbers = self.numbers(records, GdsiiRecord.XY, None)
         if len(numbers) % 2 or not len(numbers):
             raise self.fail(f"element with {len(numbers)} coordinates, need pairs")
         return numbers.reshape(-1, 2)
@@ -252,10 +287,10 @@ class _GdsiiReader:
         """Read SREF or AREF, and place its copies in the cell."""
         start = self.begin
         records = self.fields()
-        number = self.number(self.name(records.get(gds.SNAME, b"")))
+        number = self.number(self.name(records.get(GdsiiRecord.SNAME, b"")))
         turn = self.turn(records, start)
-        xy = self.numbers(records, gds.XY, 2 if kind == gds.SREF else 6)
-        if kind == gds.SREF:
+        xy = self.numbers(records, GdsiiRecord.XY, 2 if kind == GdsiiRecord.SREF else 6)
+        if kind == GdsiiRecord.SREF:
             cell.place(number, xy[:1], xy[1:], turn)
             return
         for x, y in self.array(records, xy, start):
@@ -277,7 +312,9 @@ class _GdsiiReader:
         Yields:
             (n,) x and (n,) y.
         """
-        columns, rows = (int(size) for size in self.numbers(records, gds.COLROW, 2))
+        columns, rows = (
+            int(size) for size in self.numbers(records, GdsiiRecord.COLROW, 2)
+        )
         if columns < 1 or rows < 1:
             raise self.fail(f"array of {columns} x {rows}", start)
         self.count(columns * rows)
@@ -291,7 +328,7 @@ class _GdsiiReader:
             raise self.fail("array that reaches beyond 32 bits", start)
         i = np.arange(columns)
         for part_rows in np.array_split(
-            np.arange(rows), -(-columns * rows // _AT_ONCE)
+            np.arange(rows), -(-columns * rows // BLOCK_SITES)
         ):
             offsets = (
                 part_rows[:, None] * up[axis] / rows + i * across[axis] / columns
@@ -305,11 +342,9 @@ class _GdsiiReader:
 
     def turn(self, records: dict[int, bytes], start: int) -> Orientation:
         """Orientation of a reference: mirror, scale and angle."""
-        flags = records.get(gds.STRANS, b"\0\0")
-        angle, scale = (
-            gds.to_float(records[kind]) if len(records.get(kind, b"")) == 8 else default
-            for kind, default in _DEFAULTS
-        )
+        flags = records.get(GdsiiRecord.STRANS, b"\0\0")
+        angle = self.real(records, GdsiiRecord.ANGLE, 0.0)
+        scale = self.real(records, GdsiiRecord.MAG, 1.0)
         if len(flags) != 2 or not 0 < scale < 1e9:
             raise self.fail(
                 f"reference scaled by {scale}, or with broken STRANS; need a scale above 0",
@@ -318,19 +353,25 @@ class _GdsiiReader:
         # absolute angle and size (bits 13, 14) are ignored, as other readers do
         return Orientation(angle % 360, bool(flags[0] & 128), scale)
 
+    def real(self, records: dict[int, bytes], kind: int, default: float) -> float:
+        """Number of a record; the default where it is missing or of another length."""
+        data = records.get(kind, b"")
+        return gds.to_float(data) if len(data) == 8 else default
+
     def line(self) -> tuple[LayerNumber, Array]:
         """Layer and outline of a path; a negative width does not scale with references,
         which is ignored.
         """
         records = self.fields()
-        layer = self.layer(records, gds.DATATYPE)
+        layer = self.layer(records, GdsiiRecord.DATATYPE)
         points = self.points(records)
         width, begin, end = (
-            self.whole(records, kind) for kind in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
+            self.whole(records, kind)
+            for kind in (GdsiiRecord.WIDTH, GdsiiRecord.BGNEXTN, GdsiiRecord.ENDEXTN)
         )
         path_type = 0
-        if gds.PATHTYPE in records:
-            path_type = int(self.numbers(records, gds.PATHTYPE, 1)[0])
+        if GdsiiRecord.PATHTYPE in records:
+            path_type = int(self.numbers(records, GdsiiRecord.PATHTYPE, 1)[0])
         half = abs(width) / 2
         if not half:
             return layer, points[:1]
@@ -349,8 +390,5 @@ class _GdsiiReader:
         """A 32-bit number that an element may have; 0 without."""
         data = records.get(kind, bytes(4))
         if len(data) != 4:
-            raise self.fail(f"element with a wrong {gds.NAMES[kind]}")
+            raise self.fail(f"element with a wrong {gds.record_name(kind)}")
         return int.from_bytes(data, "big", signed=True)
-
-
-_DEFAULTS = ((gds.ANGLE, 0.0), (gds.MAG, 1.0))

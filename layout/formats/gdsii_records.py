@@ -1,54 +1,77 @@
 """Records of the GDSII stream format: numbers, kinds, and what data each kind carries."""
 
+import enum
 import struct
 
 from metalens.core.arrays import Array
 
-HEADER, BGNLIB, LIBNAME, UNITS, ENDLIB, BGNSTR, STRNAME, ENDSTR = range(8)
-BOUNDARY, PATH, SREF, AREF, TEXT, LAYER, DATATYPE, WIDTH, XY, ENDEL, SNAME = range(
-    8, 19
-)
-COLROW, NODE, TEXTTYPE, PRESENTATION, STRING, STRANS, MAG, ANGLE = (
-    0x13,
-    0x15,
-    0x16,
-    0x17,
-    0x19,
-    0x1A,
-    0x1B,
-    0x1C,
-)
-BGNEXTN, ENDEXTN, STRCLASS, MBMSPATH = 0x30, 0x31, 0x34, 0x56
-PATHTYPE, ELFLAGS, NODETYPE, PROPATTR, PROPVALUE, BOX, BOXTYPE, PLEX = (
-    0x21,
-    0x26,
-    0x2A,
-    0x2B,
-    0x2C,
-    0x2D,
-    0x2E,
-    0x2F,
-)
-
 NO_DATA, BITS, INT2, INT4, REAL8, ASCII = 0, 1, 2, 3, 5, 6
-# fmt: off
-_KINDS = {
-    NO_DATA: (ENDLIB, ENDSTR, BOUNDARY, PATH, SREF, AREF, TEXT, ENDEL, BOX, NODE,
-              MBMSPATH),
-    BITS: (PRESENTATION, STRANS, ELFLAGS, STRCLASS),
-    INT2: (HEADER, BGNLIB, BGNSTR, LAYER, DATATYPE, COLROW, TEXTTYPE, PATHTYPE,
-           PROPATTR, BOXTYPE, NODETYPE),
-    INT4: (WIDTH, XY, BGNEXTN, ENDEXTN, PLEX),
-    REAL8: (UNITS, MAG, ANGLE),
-    ASCII: (LIBNAME, STRNAME, SNAME, STRING, PROPVALUE),
-}
-# fmt: on
-DATA = {kind: data for data, kinds in _KINDS.items() for kind in kinds}
-NAMES = {
-    value: name
-    for name, value in list(globals().items())
-    if name.isupper() and isinstance(value, int)
-}
+
+
+class GdsiiRecord(enum.IntEnum):
+    """Kinds of records, each with the type of its data."""
+
+    data: int
+
+    def __new__(cls, kind: int, data: int) -> "GdsiiRecord":
+        """A kind with its number in the file, and the number of its data type."""
+        record = int.__new__(cls, kind)
+        record._value_ = kind
+        record.data = data
+        return record
+
+    HEADER = 0x00, INT2
+    BGNLIB = 0x01, INT2
+    LIBNAME = 0x02, ASCII
+    UNITS = 0x03, REAL8
+    ENDLIB = 0x04, NO_DATA
+    BGNSTR = 0x05, INT2
+    STRNAME = 0x06, ASCII
+    ENDSTR = 0x07, NO_DATA
+    BOUNDARY = 0x08, NO_DATA
+    PATH = 0x09, NO_DATA
+    SREF = 0x0A, NO_DATA
+    AREF = 0x0B, NO_DATA
+    TEXT = 0x0C, NO_DATA
+    LAYER = 0x0D, INT2
+    DATATYPE = 0x0E, INT2
+    WIDTH = 0x0F, INT4
+    XY = 0x10, INT4
+    ENDEL = 0x11, NO_DATA
+    SNAME = 0x12, ASCII
+    COLROW = 0x13, INT2
+    NODE = 0x15, NO_DATA
+    TEXTTYPE = 0x16, INT2
+    PRESENTATION = 0x17, BITS
+    STRING = 0x19, ASCII
+    STRANS = 0x1A, BITS
+    MAG = 0x1B, REAL8
+    ANGLE = 0x1C, REAL8
+    PATHTYPE = 0x21, INT2
+    ELFLAGS = 0x26, BITS
+    NODETYPE = 0x2A, INT2
+    PROPATTR = 0x2B, INT2
+    PROPVALUE = 0x2C, ASCII
+    BOX = 0x2D, NO_DATA
+    BOXTYPE = 0x2E, INT2
+    PLEX = 0x2F, INT4
+    BGNEXTN = 0x30, INT4
+    ENDEXTN = 0x31, INT4
+    STRCLASS = 0x34, BITS
+    MBMSPATH = 0x56, NO_DATA
+
+
+DATA: dict[int, int] = {record: record.data for record in GdsiiRecord}
+
+
+def record_name(kind: int) -> str:
+    """Name of a kind of record, or its number where the format has no such kind.
+
+    Args:
+        kind: number in the file.
+    """
+    return GdsiiRecord(kind).name if kind in DATA else f"record 0x{kind:02x}"
+
 
 TIMES = (
     1970,
@@ -119,7 +142,7 @@ def xy_record(xy: Array) -> bytes:
     Args:
         xy: database units.
     """
-    return gdsii_record(XY, xy.astype(">i4").tobytes())
+    return gdsii_record(GdsiiRecord.XY, xy.astype(">i4").tobytes())
 
 
 def library_head(name: str, unit_nm: float) -> bytes:
@@ -130,10 +153,10 @@ def library_head(name: str, unit_nm: float) -> bytes:
         unit_nm: database unit.
     """
     head = (
-        integer_record(HEADER, 600)
-        + integer_record(BGNLIB, *TIMES)
-        + text_record(LIBNAME, name)
+        integer_record(GdsiiRecord.HEADER, 600)
+        + integer_record(GdsiiRecord.BGNLIB, *TIMES)
+        + text_record(GdsiiRecord.LIBNAME, name)
     )
     return head + gdsii_record(
-        UNITS, gdsii_real(unit_nm * 1e-3) + gdsii_real(unit_nm * 1e-9)
+        GdsiiRecord.UNITS, gdsii_real(unit_nm * 1e-3) + gdsii_real(unit_nm * 1e-9)
     )

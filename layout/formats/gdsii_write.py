@@ -13,8 +13,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from layout.formats import gdsii_records as gds
+from layout.formats.gdsii_records import GdsiiRecord
 from layout.formats.library import (
-    QUARTERS,
+    UPRIGHT,
     CellPlacements,
     CellReference,
     MaskLibrary,
@@ -22,7 +23,7 @@ from layout.formats.library import (
     PillarSites,
     library_of,
 )
-from layout.mask.plan import MaskPlan, PillarArray
+from layout.mask.plan import BLOCK_SITES, FARTHEST, MaskPlan, PillarArray
 from layout.process.jit import compile_loop
 from layout.process.process import LayerNumber
 from metalens.core import store
@@ -32,8 +33,7 @@ from metalens.core.errors import ProcessError
 # bytes of references filled before they are written: within the processor's cache
 _BLOCK = 1 << 19
 _FLUSHED = 16  # pieces after which the disk is given what was written
-_AT_ONCE = 1 << 18  # references
-MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
+MAX_NUMBER = np.iinfo(np.int16).max  # of layers, columns and rows
 
 
 def write_gdsii(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
@@ -88,8 +88,8 @@ def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
     """Bytes of a GDSII file, piece by piece."""
     yield gds.library_head(library.name, library.unit_nm)
     for name, cell in library.cells.items():
-        head = gds.integer_record(gds.BGNSTR, *gds.TIMES) + gds.text_record(
-            gds.STRNAME, name
+        head = gds.integer_record(GdsiiRecord.BGNSTR, *gds.TIMES) + gds.text_record(
+            GdsiiRecord.STRNAME, name
         )
         shapes = [
             boundary_element(layer, points)
@@ -104,8 +104,8 @@ def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
                 yield from _placements(one)
         if cell.pillars is not None:
             yield from _pillars(cell.pillars)
-        yield gds.gdsii_record(gds.ENDSTR)
-    yield gds.gdsii_record(gds.ENDLIB)
+        yield gds.gdsii_record(GdsiiRecord.ENDSTR)
+    yield gds.gdsii_record(GdsiiRecord.ENDLIB)
 
 
 def boundary_element(layer: LayerNumber, polygon: Array) -> bytes:
@@ -124,28 +124,32 @@ def boundary_element(layer: LayerNumber, polygon: Array) -> bytes:
             f"layer {layer[0]}/{layer[1]}: GDSII holds numbers to {MAX_NUMBER}; change "
             "the layer map"
         )
-    head = gds.gdsii_record(gds.BOUNDARY) + gds.integer_record(gds.LAYER, layer[0])
+    head = gds.gdsii_record(GdsiiRecord.BOUNDARY) + gds.integer_record(
+        GdsiiRecord.LAYER, layer[0]
+    )
     closed = np.concatenate([polygon, polygon[:1]])
     return (
         head
-        + gds.integer_record(gds.DATATYPE, layer[1])
+        + gds.integer_record(GdsiiRecord.DATATYPE, layer[1])
         + gds.xy_record(closed)
-        + gds.gdsii_record(gds.ENDEL)
+        + gds.gdsii_record(GdsiiRecord.ENDEL)
     )
 
 
-def _head(name: str, turn: Orientation = QUARTERS[0], *, array: bool = False) -> bytes:
+def _head(name: str, turn: Orientation = UPRIGHT, *, array: bool = False) -> bytes:
     """A reference up to its places."""
-    head = gds.gdsii_record(gds.AREF if array else gds.SREF) + gds.text_record(
-        gds.SNAME, name
-    )
-    if turn == QUARTERS[0]:
+    head = gds.gdsii_record(
+        GdsiiRecord.AREF if array else GdsiiRecord.SREF
+    ) + gds.text_record(GdsiiRecord.SNAME, name)
+    if turn == UPRIGHT:
         return head
-    head += gds.gdsii_record(gds.STRANS, bytes([128 if turn.mirrored else 0, 0]))
+    head += gds.gdsii_record(
+        GdsiiRecord.STRANS, bytes([128 if turn.mirrored else 0, 0])
+    )
     if turn.scale != 1:
-        head += gds.gdsii_record(gds.MAG, gds.gdsii_real(turn.scale))
+        head += gds.gdsii_record(GdsiiRecord.MAG, gds.gdsii_real(turn.scale))
     if turn.angle_deg:
-        head += gds.gdsii_record(gds.ANGLE, gds.gdsii_real(turn.angle_deg))
+        head += gds.gdsii_record(GdsiiRecord.ANGLE, gds.gdsii_real(turn.angle_deg))
     return head
 
 
@@ -153,7 +157,7 @@ def _copies(one: CellReference) -> bytes:
     """A reference, or an array of them."""
     if one.count == 1:
         place = gds.xy_record(np.array([[one.x, one.y]]))
-        return _head(one.child, one.turn) + place + gds.gdsii_record(gds.ENDEL)
+        return _head(one.child, one.turn) + place + gds.gdsii_record(GdsiiRecord.ENDEL)
     if max(one.columns, one.rows) > MAX_NUMBER:
         raise ProcessError(
             f"an array of {one.columns} x {one.rows} copies of {one.child}: GDSII holds "
@@ -161,16 +165,16 @@ def _copies(one: CellReference) -> bytes:
         )
     ends = np.array([(0, 0), (one.columns, 0), (0, one.rows)])
     corners = ends @ np.array([one.across, one.up]) + (one.x, one.y)
-    if np.abs(corners).max() > 2**31 - 1:
+    if np.abs(corners).max() > FARTHEST:
         raise ProcessError(
             f"an array of {one.child} reaches beyond 32 bits; GDSII cannot hold it, "
             "write OASIS"
         )
     return (
         _head(one.child, one.turn, array=True)
-        + gds.integer_record(gds.COLROW, one.columns, one.rows)
+        + gds.integer_record(GdsiiRecord.COLROW, one.columns, one.rows)
         + gds.xy_record(corners)
-        + gds.gdsii_record(gds.ENDEL)
+        + gds.gdsii_record(GdsiiRecord.ENDEL)
     )
 
 
@@ -178,9 +182,9 @@ def _placements(placed: CellPlacements) -> Iterator[bytes]:
     """References to a cell in one orientation."""
     start = _head(placed.child, placed.turn)
     head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
-    tail = np.frombuffer(gds.gdsii_record(gds.ENDEL), np.uint8)
-    for first in range(0, placed.count, _AT_ONCE):
-        x, y = (v[first : first + _AT_ONCE] for v in placed.places())
+    tail = np.frombuffer(gds.gdsii_record(GdsiiRecord.ENDEL), np.uint8)
+    for first in range(0, placed.count, BLOCK_SITES):
+        x, y = (v[first : first + BLOCK_SITES] for v in placed.places())
         block = np.tile(np.r_[head, tail], (len(x), 1))
         xy = np.column_stack([x, y]).astype(">i4")
         block[:, len(head) - 8 : len(head)] = xy.view(np.uint8).reshape(-1, 8)
@@ -198,7 +202,9 @@ def _pillars(some: PillarSites) -> Iterator[memoryview]:
 def _references(children: Sequence[str], lattice: PillarArray) -> Iterator[memoryview]:
     """References of a lattice to cells, in two buffers filled in turn."""
     records = [
-        _head(name) + gds.xy_record(np.zeros((1, 2))) + gds.gdsii_record(gds.ENDEL)
+        _head(name)
+        + gds.xy_record(np.zeros((1, 2)))
+        + gds.gdsii_record(GdsiiRecord.ENDEL)
         for name in children
     ]
     dtype = np.dtype(np.uint16 if len(records[0]) % 4 else np.uint32)
@@ -260,14 +266,11 @@ def _fill(
             if kind:
                 if used == buffer.shape[0]:
                     return row, column, used
-                for i in range(coordinates_at):
+                for i in range(size):
                     buffer[used, i] = templates[kind - 1, i]
                 for i in range(words):
                     buffer[used, coordinates_at + i] = xs[column, i]
                     buffer[used, coordinates_at + words + i] = ys[row, i]
-                    buffer[used, coordinates_at + 2 * words + i] = templates[
-                        kind - 1, coordinates_at + 2 * words + i
-                    ]
                 used += 1
             column += 1
         row, column = row + 1, 0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from layout.formats.digest import RunningDigest
-from layout.mask.plan import MaskPlan, PillarArray
+from layout.mask.plan import FARTHEST, MaskPlan, PillarArray
 from layout.process.process import LayerNumber
 from layout.shapes import polygon
 from metalens.core.arrays import Array
@@ -68,6 +68,7 @@ class Orientation:
         )
 
 
+UPRIGHT = Orientation()
 QUARTERS = tuple(Orientation(90.0 * (k & 3), bool(k & 4)) for k in range(8))
 
 
@@ -109,7 +110,7 @@ class CellReference:
     child: str
     x: int
     y: int
-    turn: Orientation = QUARTERS[0]
+    turn: Orientation = UPRIGHT
     columns: int = 1
     rows: int = 1
     across: tuple[int, int] = (0, 0)
@@ -157,23 +158,23 @@ class PillarSites:
             self.lattice, source=lambda a, b: lookup[source(a, b)]
         )
 
+    def sites(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Class number, x and y (n,) of the pillars, some rows at a time."""
+        for first, block in self.lattice.blocks():
+            row, column = np.nonzero(block)
+            yield block[row, column], *self.lattice.positions(first + row, column)
+
     def places(self) -> Iterator[tuple[str, Array, Array]]:
         """Cell, x and y (n,) of the pillars, some rows at a time."""
-        array = self.lattice
-        for first, block in array.blocks():
-            row, column = np.nonzero(block)
-            x = array.x0 + column * array.pitch
-            y = array.y0 - (first + row) * array.down
-            for number, members in group_equal(block[row, column]):
+        for numbers, x, y in self.sites():
+            for number, members in group_equal(numbers):
                 yield self.children[number - 1], x[members], y[members]
 
     def sums(self) -> dict[str, tuple[int, ...]]:
         """{cell: count, sums of x and y, turned, hash} of those that occur."""
-        array = self.lattice
         digest = RunningDigest()
-        for first, block in array.blocks():
-            y = array.y0 - first * array.down
-            digest.sites(block, array.x0, y, (array.pitch, array.down))
+        for numbers, x, y in self.sites():
+            digest.take(numbers, x, y, np.zeros(len(x), np.uint8))
         rows = digest.of(np.arange(1, len(self.children) + 1)).tolist()
         pairs = zip(self.children, map(tuple, rows), strict=True)
         return {child: sums for child, sums in pairs if sums[0]}
@@ -209,7 +210,7 @@ class MaskCell:
         """How often each cell is placed in each orientation; of sums all together."""
         counts: Counter[tuple[str, Orientation]] = Counter()
         for child, (count, *_) in self.sums.items():
-            counts[child, QUARTERS[0]] += count
+            counts[child, UPRIGHT] += count
         for reference in self.references:
             counts[reference.child, reference.turn] += reference.count
         if self.pillars is not None:
@@ -217,7 +218,7 @@ class MaskCell:
             for child, count in zip(
                 self.pillars.children, pillar_counts[1:].tolist(), strict=True
             ):
-                counts[child, QUARTERS[0]] += count
+                counts[child, UPRIGHT] += count
         return {key: count for key, count in counts.items() if count}
 
     def instances(self) -> Iterator[tuple[str, Orientation, Array, Array]]:
@@ -235,7 +236,7 @@ class MaskCell:
             yield reference.child, reference.turn, *reference.places()
         if self.pillars is not None:
             for name, x, y in self.pillars.places():
-                yield name, QUARTERS[0], x, y
+                yield name, UPRIGHT, x, y
 
     @property
     def layers(self) -> set[LayerNumber]:
@@ -328,8 +329,8 @@ class MaskLibrary:
                 bits.
         """
         zero = np.zeros(1, np.int32)
-        yield top, QUARTERS[0], zero, zero
-        yield from self._walk(top, QUARTERS[0], 0, 0, ())
+        yield top, UPRIGHT, zero, zero
+        yield from self._walk(top, UPRIGHT, 0, 0, ())
 
     def _walk(
         self, name: str, turn: Orientation, x: int, y: int, above: tuple[str, ...]
@@ -351,7 +352,7 @@ class MaskLibrary:
             inner = turn.after(child_turn)
             px, py = turn.apply(px.astype(np.int64), py.astype(np.int64))
             px, py = px + x, py + y
-            if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
+            if max(np.abs(px).max(), np.abs(py).max()) > FARTHEST:
                 raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
             yield child, inner, px.astype(np.int32), py.astype(np.int32)
             if self.cell(child).children:

@@ -8,20 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from layout.formats import oasis_records as oasis
 from layout.formats import oasis_trapezoids as trapezoids
 from layout.formats import paths
 from layout.formats.library import QUARTERS, Orientation
 from layout.formats.oasis_cursor import ByteCursor
+from layout.formats.oasis_records import OasisRecord
 from layout.formats.open_cell import OpenCell, has_area
 from layout.formats.read_loops import scan_placements
+from layout.mask.plan import BLOCK_SITES
 from layout.process.process import LayerNumber
 from layout.shapes import polygon
 from metalens.core.arrays import Array
 
-_BATCH = 1 << 18
 _DRAWN = 8  # placements that take as much memory as a polygon without its corners
-_CIRCLE_CORNERS = 64  # of the polygon that stands for a true circle
 _POSITIONS = ("placement_x", "placement_y", "x", "y", "text_x", "text_y")
 
 
@@ -64,7 +63,7 @@ class CellReader:
         number = child if isinstance(child, int) else -1
         state = np.array([m["placement_x"], m["placement_y"], self.relative, number])
         while True:
-            room = min(_BATCH, c.left // 2 + 1)
+            room = min(BLOCK_SITES, c.left // 2 + 1)
             out = np.empty((4, room), np.int32)
             at, count = scan_placements(c.data, c.at, c.end, state, out)
             has_moved, c.at = at > c.at, int(at)
@@ -107,7 +106,7 @@ class CellReader:
 
     def _xy_mode(self, c: ByteCursor, kind: int) -> None:
         """Read XYABSOLUTE or XYRELATIVE."""
-        self.relative = kind == oasis.XYRELATIVE
+        self.relative = kind == OasisRecord.XYRELATIVE
 
     def _places(
         self, c: ByteCursor, info: int, bits: tuple[int, int, int], kind: str = ""
@@ -146,7 +145,7 @@ class CellReader:
             c.extent if info & 0x40 else lambda: c.string(name=True),
         )
         turn = QUARTERS[info >> 1 & 3 | (info & 1) << 2]
-        if kind == oasis.PLACEMENT_ANY:
+        if kind == OasisRecord.PLACEMENT_ANY:
             size = c.real() if info & 4 else 1.0
             angle = c.real() if info & 2 else 0.0
             if not 0 < size < 1e9 or not abs(angle) < 1e9:
@@ -176,8 +175,8 @@ class CellReader:
         x, y = self._places(c, info, (0x10, 8, 4))
         self._count(c, len(x) * (_DRAWN + len(points)))
         if not has_area(points):
-            reason = "" if kind == oasis.XGEOMETRY else " without area"
-            self.cell.skipped[oasis.NAMES[kind] + reason] += len(x)
+            reason = "" if kind == OasisRecord.XGEOMETRY else " without area"
+            self.cell.skipped[OasisRecord(kind).name + reason] += len(x)
             return
         farthest = max(abs(self.modal["x"]), abs(self.modal["y"]))
         c.within(int(np.abs(points).max()) + farthest)
@@ -231,8 +230,8 @@ class CellReader:
         info = c.byte()
         layer = self._layer(c, info)
         w, h = self._size(c, info)
-        a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
-        b = c.coordinate() if kind != oasis.TRAPEZOID_A else 0
+        a = c.coordinate() if kind != OasisRecord.TRAPEZOID_B else 0
+        b = c.coordinate() if kind != OasisRecord.TRAPEZOID_A else 0
         is_upright = bool(info & 0x80)
         if max(abs(a), abs(b), abs(a - b)) > (h if is_upright else w):
             raise c.fail(
@@ -267,7 +266,7 @@ class CellReader:
         info = c.byte()
         layer = self._layer(c, info)
         radius = self._value(c, "radius", info & 0x20, c.extent)
-        points = polygon.disc_polygon(radius, (0, 0), _CIRCLE_CORNERS)
+        points = polygon.disc_polygon(radius, (0, 0))
         self._draw(c, info, layer, points, kind)
 
     def _element(self, c: ByteCursor, kind: int) -> None:
@@ -298,19 +297,19 @@ class CellReader:
 
 
 _READERS: dict[int, Callable[[CellReader, ByteCursor, int], None]] = {
-    oasis.XYABSOLUTE: CellReader._xy_mode,
-    oasis.XYRELATIVE: CellReader._xy_mode,
-    oasis.PLACEMENT: CellReader._placement,
-    oasis.PLACEMENT_ANY: CellReader._placement,
-    oasis.TEXT: CellReader._text,
-    oasis.RECTANGLE: CellReader._rectangle,
-    oasis.POLYGON: CellReader._polygon,
-    oasis.PATH: CellReader._path,
-    oasis.TRAPEZOID: CellReader._trapezoid,
-    oasis.TRAPEZOID_A: CellReader._trapezoid,
-    oasis.TRAPEZOID_B: CellReader._trapezoid,
-    oasis.CTRAPEZOID: CellReader._compact,
-    oasis.CIRCLE: CellReader._circle,
-    oasis.XELEMENT: CellReader._element,
-    oasis.XGEOMETRY: CellReader._geometry,
+    OasisRecord.XYABSOLUTE: CellReader._xy_mode,
+    OasisRecord.XYRELATIVE: CellReader._xy_mode,
+    OasisRecord.PLACEMENT: CellReader._placement,
+    OasisRecord.PLACEMENT_ANY: CellReader._placement,
+    OasisRecord.TEXT: CellReader._text,
+    OasisRecord.RECTANGLE: CellReader._rectangle,
+    OasisRecord.POLYGON: CellReader._polygon,
+    OasisRecord.PATH: CellReader._path,
+    OasisRecord.TRAPEZOID: CellReader._trapezoid,
+    OasisRecord.TRAPEZOID_A: CellReader._trapezoid,
+    OasisRecord.TRAPEZOID_B: CellReader._trapezoid,
+    OasisRecord.CTRAPEZOID: CellReader._compact,
+    OasisRecord.CIRCLE: CellReader._circle,
+    OasisRecord.XELEMENT: CellReader._element,
+    OasisRecord.XGEOMETRY: CellReader._geometry,
 }

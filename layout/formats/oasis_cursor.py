@@ -7,7 +7,8 @@ import struct
 import numpy as np
 
 from layout.formats.files import decode_name
-from layout.formats.read_loops import FARTHEST, sum_deltas
+from layout.formats.read_loops import sum_deltas
+from layout.mask.plan import FARTHEST
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 

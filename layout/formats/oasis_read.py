@@ -9,26 +9,25 @@ from pathlib import Path
 import numpy as np
 
 from layout.formats import oasis_records as oasis
-from layout.formats.files import CONTEXT_CELL, map_bytes
+from layout.formats.files import CONTEXT_CELL, MOST_PLACEMENTS, map_bytes
 from layout.formats.library import MaskCell, MaskLibrary
 from layout.formats.oasis_cells import CellReader, ReadBudget
 from layout.formats.oasis_cursor import ByteCursor
+from layout.formats.oasis_records import OasisRecord
 from layout.formats.open_cell import OpenCell
 from metalens.core.arrays import Array
 
-LIMIT = 2**29
 _NUMBERED_NAMES = (
-    oasis.TEXTSTRING_REF,
-    oasis.PROPNAME_REF,
-    oasis.PROPSTRING_REF,
-    oasis.XNAME_REF,
+    OasisRecord.TEXTSTRING_REF,
+    OasisRecord.PROPNAME_REF,
+    OasisRecord.PROPSTRING_REF,
+    OasisRecord.XNAME_REF,
 )
 _BYTES_EACH = 16  # of a compressed block, for each placement that may be read
-_LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 
 def read_oasis(
-    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+    path: str | Path, *, limit: int = MOST_PLACEMENTS, keep: int | None = None
 ) -> MaskLibrary:
     """Read an OASIS file.
 
@@ -49,7 +48,11 @@ def read_oasis(
 
 
 def parse_oasis(
-    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+    data: Array,
+    *,
+    limit: int = MOST_PLACEMENTS,
+    keep: int | None = None,
+    where: str = "data",
 ) -> MaskLibrary:
     """Read an OASIS file from its bytes, as :func:`read_oasis`.
 
@@ -94,7 +97,7 @@ class _OasisReader:
         """Read START: database unit, and whether the table offsets are in it."""
         c = self.file
         c.begin = c.at
-        if c.byte() != oasis.START:
+        if c.byte() != OasisRecord.START:
             raise c.fail("START is missing")
         version = c.string()
         if version != "1.0":
@@ -126,32 +129,32 @@ class _OasisReader:
 
     def _record(self, c: ByteCursor, kind: int) -> None:
         """Read one record of the file level, or pass it to the open cell."""
-        if kind in (oasis.CELL_REF, oasis.CELL):
-            is_named = kind == oasis.CELL
+        if kind in (OasisRecord.CELL_REF, OasisRecord.CELL):
+            is_named = kind == OasisRecord.CELL
             key = c.string(name=True) if is_named else c.within(c.unsigned())
             self.cells.append(OpenCell(key, self.keep))
             self.cell = CellReader(self.cells[-1], self.budget)
-        elif kind == oasis.CBLOCK:
+        elif kind == OasisRecord.CBLOCK:
             self._block(c)
-        elif kind in (oasis.PROPERTY, oasis.PROPERTY_REPEAT):
+        elif kind in (OasisRecord.PROPERTY, OasisRecord.PROPERTY_REPEAT):
             self._property(c, kind)
         elif self.cell is not None and self.cell.read_record(c, kind):
             return
-        elif kind in (oasis.CELLNAME, oasis.CELLNAME_REF):
-            self._cell_name(c, kind == oasis.CELLNAME_REF)
-        elif kind in (oasis.LAYERNAME, oasis.LAYERNAME_TEXT):
+        elif kind in (OasisRecord.CELLNAME, OasisRecord.CELLNAME_REF):
+            self._cell_name(c, kind == OasisRecord.CELLNAME_REF)
+        elif kind in (OasisRecord.LAYERNAME, OasisRecord.LAYERNAME_TEXT):
             self._layer_name(c, kind)
-        elif oasis.TEXTSTRING <= kind <= oasis.PROPSTRING_REF:
+        elif OasisRecord.TEXTSTRING <= kind <= OasisRecord.PROPSTRING_REF:
             self._other_name(c, kind)
-        elif kind in (oasis.XNAME, oasis.XNAME_REF):
+        elif kind in (OasisRecord.XNAME, OasisRecord.XNAME_REF):
             c.unsigned()
             self._other_name(c, kind)
-        elif kind == oasis.XELEMENT and self.cell is None:
+        elif kind == OasisRecord.XELEMENT and self.cell is None:
             c.unsigned()
             c.string()
-        elif kind == oasis.END and c is self.file:
+        elif kind == OasisRecord.END and c is self.file:
             self.end_at = c.begin
-        elif kind != oasis.PAD:
+        elif kind != OasisRecord.PAD:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
 
     def _block(self, c: ByteCursor) -> None:
@@ -162,7 +165,7 @@ class _OasisReader:
             raise c.fail("a compressed block of an unknown method, need deflate")
         size = c.unsigned()
         packed = c.unsigned()
-        if packed > c.left or size > packed * _LARGEST_RATIO + 64:
+        if packed > c.left:
             raise c.fail(
                 f"compressed block of {packed} bytes for {size}, with {c.left} left in the file"
             )
@@ -200,7 +203,7 @@ class _OasisReader:
         """Read LAYERNAME; kept for a single layer and datatype."""
         name = c.string(name=True)
         first = [self._interval(c) for _ in range(2)]
-        if kind == oasis.LAYERNAME and None not in first:
+        if kind == OasisRecord.LAYERNAME and None not in first:
             self.layer_names[first[0] or 0, first[1] or 0] = name
         self.cell = None
 
@@ -221,7 +224,7 @@ class _OasisReader:
 
     def _property(self, c: ByteCursor, kind: int) -> None:
         """Properties are passed over."""
-        if kind == oasis.PROPERTY_REPEAT:
+        if kind == OasisRecord.PROPERTY_REPEAT:
             return
         info = c.byte()
         if info & 4:

@@ -2,60 +2,52 @@
 start and end.
 """
 
+import enum
 import struct
 import zlib
 
 MAGIC = b"%SEMI-OASIS\r\n"
-(
-    PAD,
-    START,
-    END,
-    CELLNAME,
-    CELLNAME_REF,
-    TEXTSTRING,
-    TEXTSTRING_REF,
-    PROPNAME,
-    PROPNAME_REF,
-) = range(9)
-(
-    PROPSTRING,
-    PROPSTRING_REF,
-    LAYERNAME,
-    LAYERNAME_TEXT,
-    CELL_REF,
-    CELL,
-    XYABSOLUTE,
-    XYRELATIVE,
-) = range(9, 17)
-(
-    PLACEMENT,
-    PLACEMENT_ANY,
-    TEXT,
-    RECTANGLE,
-    POLYGON,
-    PATH,
-    TRAPEZOID,
-    TRAPEZOID_A,
-    TRAPEZOID_B,
-) = range(17, 26)
-(
-    CTRAPEZOID,
-    CIRCLE,
-    PROPERTY,
-    PROPERTY_REPEAT,
-    XNAME,
-    XNAME_REF,
-    XELEMENT,
-    XGEOMETRY,
-    CBLOCK,
-) = range(26, 35)
-
-NAMES = {
-    value: name
-    for name, value in list(globals().items())
-    if name.isupper() and isinstance(value, int)
-}
 END_SIZE = 256
+
+
+class OasisRecord(enum.IntEnum):
+    """Kinds of records (SEMI P39)."""
+
+    PAD = 0
+    START = 1
+    END = 2
+    CELLNAME = 3
+    CELLNAME_REF = 4
+    TEXTSTRING = 5
+    TEXTSTRING_REF = 6
+    PROPNAME = 7
+    PROPNAME_REF = 8
+    PROPSTRING = 9
+    PROPSTRING_REF = 10
+    LAYERNAME = 11
+    LAYERNAME_TEXT = 12
+    CELL_REF = 13
+    CELL = 14
+    XYABSOLUTE = 15
+    XYRELATIVE = 16
+    PLACEMENT = 17
+    PLACEMENT_ANY = 18
+    TEXT = 19
+    RECTANGLE = 20
+    POLYGON = 21
+    PATH = 22
+    TRAPEZOID = 23
+    TRAPEZOID_A = 24
+    TRAPEZOID_B = 25
+    CTRAPEZOID = 26
+    CIRCLE = 27
+    PROPERTY = 28
+    PROPERTY_REPEAT = 29
+    XNAME = 30
+    XNAME_REF = 31
+    XELEMENT = 32
+    XGEOMETRY = 33
+    CBLOCK = 34
 
 
 def unsigned_integer(value: int) -> bytes:
@@ -114,7 +106,7 @@ def compressed_block(raw: bytes | memoryview, level: int) -> bytes:
     packer = zlib.compressobj(level, zlib.DEFLATED, -15)
     packed = packer.compress(raw) + packer.flush()
     block = (
-        bytes([CBLOCK, 0])
+        bytes([OasisRecord.CBLOCK, 0])
         + unsigned_integer(len(raw))
         + unsigned_integer(len(packed))
         + packed
@@ -131,7 +123,7 @@ def start_record(unit_nm: float) -> bytes:
     """
     return (
         MAGIC
-        + bytes([START])
+        + bytes([OasisRecord.START])
         + oasis_string("1.0")
         + oasis_real(1e3 / unit_nm)
         + unsigned_integer(1)
@@ -146,7 +138,7 @@ def end_record(offsets: tuple[int, int, int, int, int, int], checksum: int) -> b
     strings, layer names, XNAMEs.
     checksum: CRC-32 of the file so far.
     """
-    head = bytes([END]) + b"".join(
+    head = bytes([OasisRecord.END]) + b"".join(
         unsigned_integer(1) + unsigned_integer(offset) for offset in offsets
     )
     fill = END_SIZE - len(head) - 5

@@ -35,7 +35,7 @@ h,0 0,h w-h,h w,0
 0,0 0,h w,h w,0
 0,0 0,w w,w w,0
 """
-_CORNERS = _TABLE.split("\n")[1:-1]
+_CORNERS = _TABLE.strip().splitlines()
 KINDS = len(_CORNERS)
 
 

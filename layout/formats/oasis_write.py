@@ -23,6 +23,7 @@ from layout.formats.library import (
     Orientation,
     library_of,
 )
+from layout.formats.oasis_records import OasisRecord
 from layout.mask.plan import MaskPlan, PillarArray
 from layout.process.jit import compile_loop
 from layout.process.process import LayerNumber
@@ -36,7 +37,6 @@ _LARGE = 10**8  # sites from which a lattice takes the fast level: half the time
 _TILE_COLUMNS, _TILE_ROWS = 96, 512
 LARGEST_RECORD = 18  # bytes of one placement
 _AT_ONCE = 1 << 16  # placements of a compressed block
-_REPEATED = 8  # bit of a placement that says that a repetition follows
 _THREADS = 2
 
 
@@ -54,7 +54,7 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     number = {name: k for k, name in enumerate(library.cells)}
     head = oasis.start_record(library.unit_nm)
     layers = b"".join(
-        bytes([oasis.LAYERNAME])
+        bytes([OasisRecord.LAYERNAME])
         + oasis.oasis_string(name)
         + b"".join(b"\x03" + oasis.unsigned_integer(n) for n in layer)  # exactly n
         for layer, name in sorted(library.layer_names.items())
@@ -69,7 +69,7 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
             checksum = zlib.crc32(piece, checksum)
             written = written + len(piece)
         table = b"".join(
-            bytes([oasis.CELLNAME_REF])
+            bytes([OasisRecord.CELLNAME_REF])
             + oasis.oasis_string(name)
             + oasis.unsigned_integer(k)
             for name, k in number.items()
@@ -82,7 +82,7 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
 def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
     """Records of all cells, piece by piece."""
     for name, cell in library.cells.items():
-        yield bytes([oasis.CELL_REF]) + oasis.unsigned_integer(number[name])
+        yield bytes([OasisRecord.CELL_REF]) + oasis.unsigned_integer(number[name])
         for layer, polygons in cell.polygons.items():
             shapes = b"".join(polygon_element(layer, points) for points in polygons)
             yield oasis.compressed_block(shapes, _LEVEL)
@@ -107,7 +107,7 @@ def polygon_element(layer: LayerNumber, points: Array) -> bytes:
     x, y = (oasis.signed_integer(int(v)) for v in points[0])
     return b"".join(
         [
-            bytes([oasis.POLYGON, 0b00111011]),
+            bytes([OasisRecord.POLYGON, 0b00111011]),
             oasis.unsigned_integer(layer[0]) + oasis.unsigned_integer(layer[1]),
             b"\x04" + oasis.unsigned_integer(len(steps)),
             *(g_delta(dx, dy) for dx, dy in steps),
@@ -155,13 +155,13 @@ def _placement(
     number: int, turn: Orientation, x: int, y: int, *, repeated: bool = False
 ) -> bytes:
     """A placement at an absolute place, in any orientation."""
-    info = 0xF0 | (_REPEATED if repeated else 0)
+    info = 0xF8 if repeated else 0xF0  # bit 8: a repetition follows
     place = oasis.signed_integer(x) + oasis.signed_integer(y)
     if turn in QUARTERS:
         k = QUARTERS.index(turn)
-        head = bytes([oasis.PLACEMENT, info | (k & 3) << 1 | k >> 2])
+        head = bytes([OasisRecord.PLACEMENT, info | (k & 3) << 1 | k >> 2])
         return head + oasis.unsigned_integer(number) + place
-    head = bytes([oasis.PLACEMENT_ANY, info | 6 | turn.mirrored])
+    head = bytes([OasisRecord.PLACEMENT_ANY, info | 6 | turn.mirrored])
     double = struct.Struct("<Bd")
     size = double.pack(7, turn.scale) + double.pack(7, turn.angle_deg)
     return head + oasis.unsigned_integer(number) + size + place
@@ -213,8 +213,7 @@ def _tile(
     row, column = np.nonzero(tile)
     if not len(row):
         return b""
-    x = lattice.x0 + (left + column) * lattice.pitch
-    y = lattice.y0 - (first + row) * lattice.down
+    x, y = lattice.positions(first + row, left + column)
     return _block(tile[row, column].astype(np.int64) - 1, x, y, 0 * row, level)
 
 

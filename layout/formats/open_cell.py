@@ -10,6 +10,7 @@ import numpy as np
 from layout.formats.digest import RunningDigest
 from layout.formats.library import (
     QUARTERS,
+    UPRIGHT,
     CellPlacements,
     MaskCell,
     Orientation,
@@ -63,7 +64,7 @@ class OpenCell:
         return self.names.setdefault(name, -2 - len(self.names))
 
     def place(
-        self, child: int | Array, x: Array, y: Array, turn: Orientation = QUARTERS[0]
+        self, child: int | Array, x: Array, y: Array, turn: Orientation = UPRIGHT
     ) -> None:
         """Add placements of a cell, or of (n,) cells, in one orientation.
 

@@ -4,12 +4,9 @@ bytes they are given.
 
 import numpy as np
 
+from layout.mask.plan import BLOCK_SITES, FARTHEST, MOST_CLASSES
 from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
-
-FARTHEST = 2**31 - 1
-_RUN = 1 << 20
-_MOST_NAMES = 65536
 
 
 def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, int]:
@@ -33,37 +30,37 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
         or record[-4:] != b"\0\4\x11\0"
     ):
         return [], nothing, nothing, nothing, at
-    most = min(_RUN, (len(data) - at) // size)
-    out = np.empty((3, most), np.int32)
-    first = np.empty(min(_MOST_NAMES, most), np.int64)
+    most = min(BLOCK_SITES, (len(data) - at) // size)
+    child = np.empty(most, np.int32)
+    first = np.empty(min(MOST_CLASSES, most), np.int64)
     slots = np.full(4 << len(first).bit_length(), -1, np.int32)
-    count, names = _srefs(data, at, size, out, slots, first)
+    count, names = _number_names(data, at, size, child, slots, first)
+    records = data[at : at + count * size].reshape(count, size)
+    x, y = records[:, -12:-4].copy().view(">i4").astype(np.int32).T
     name_bytes = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
-    child, x, y = out[:, :count]
-    return name_bytes, child, x, y, at + count * size
+    return name_bytes, child[:count], x, y, at + count * size
 
 
 @compile_loop
-def _srefs(
-    data: Array, at: int, size: int, out: Array, slots: Array, first: Array
+def _number_names(
+    data: Array, at: int, size: int, child: Array, slots: Array, first: Array
 ) -> tuple[int, int]:
-    """Read a run of plain SREF records of equal size.
+    """Number the names of a run of plain SREF records of equal size.
 
     Args:
         data: bytes of the file.
         at: first byte of the run, a plain record.
         size: bytes of each record, from SREF to ENDEL.
-        out: (3, n) output: index of the name, x and y of each.
+        child: (n,) output, number of the name of each.
         slots: hash table of the names: index, or -1.
         first: output, byte at which each name stands first.
 
     Returns:
         Number of references and of names; the run ends at any other record.
     """
-    child, x, y = out[0], out[1], out[2]
     names = 0
     mask = slots.shape[0] - 1
-    for n in range(out.shape[1]):
+    for n in range(len(child)):
         start = at + n * size
         coordinates = start + size - 16
         for i in range(size):
@@ -90,18 +87,7 @@ def _srefs(
             slots[slot], first[names] = names, start + 8
             names += 1
         child[n] = slots[slot]
-        x[n] = _big_endian(data, coordinates + 4)
-        y[n] = _big_endian(data, coordinates + 8)
-    return out.shape[1], names
-
-
-@compile_loop
-def _big_endian(data: Array, at: int) -> int:
-    """Signed big-endian 32-bit number."""
-    value = 0
-    for i in range(4):
-        value = value << 8 | (int(data[at + i]) + 0)  # 64 bits wide, compiled or not
-    return value - (1 << 32) if value >= 1 << 31 else value
+    return len(child), names
 
 
 @compile_loop

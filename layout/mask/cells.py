@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.class_store import hold_on_disk
-from layout.mask.plan import BLOCK_SITES, MOST_CLASSES, RowSource
+from layout.mask.plan import MOST_CLASSES, RowSource, row_blocks
 from layout.process import isolation
 from layout.process.process import Process
 from metalens.core.arrays import Array
@@ -143,24 +143,18 @@ def with_isolation(
     """
     design = diameters.diameter_um
     bias = process.bias
-    halo = (
-        isolation.isolation_halo(diameters.steps_um[1], bias.range_um)
-        if bias.isolated_nm
-        else 0
-    )
-    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * halo)
-    for first in range(0, design.shape[0], size):
-        end = min(first + size, design.shape[0])
-        extended_first = max(0, first - halo)
-        extended = np.asarray(design[extended_first : end + halo])
-        own_rows = slice(first - extended_first, end - extended_first)
+    for first, block in row_blocks(lambda low, end: design[low:end], design.shape):
         alone = None
-        if halo:
-            lattice = diameters.lattice.centred
-            alone = isolation.isolation_map(
-                extended > 0, diameters.steps_um, bias.range_um, centred=lattice
-            )[own_rows]
-        yield first, extended[own_rows], alone
+        if bias.isolated_nm:
+            alone = isolation.isolation_rows(
+                lambda low, end: np.asarray(design[low:end]) > 0,
+                first,
+                first + len(block),
+                diameters.steps_um,
+                bias.range_um,
+                centred=diameters.lattice.centred,
+            )
+        yield first, block, alone
 
 
 def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) -> None:

@@ -17,18 +17,31 @@ from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-DOSES = tuple(
-    0.8 + 0.05 * k for k in range(9)
-)  # of the test array, relative to dose-to-size
-_BLOCK = 16  # pillars along a block of the dose array
-_WITNESS = 40  # pillars along a witness block
-_SPACE = 8  # empty sites between blocks
-_TESTED, _WITNESSED = (
-    6,
-    8,
-)  # diameters that are repeated in the dose array and in the witness cells
 _LETTERS = {"dose": "T", "witness": "W"}  # of the names of test classes
-_ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
+
+
+@dataclasses.dataclass(frozen=True)
+class TestBlocks:
+    """Blocks of equal pillars: dose test, and witness cells of dose 1.
+
+    doses: of the dose test, relative to dose to size.
+    dose_sizes, witness_sizes, wafer_sizes: diameters of the lens that are repeated in
+        the dose test, in the witness cells, and at a mark of the wafer.
+    dose_side, witness_side, wafer_side: pillars along a block of these.
+    space: empty sites between blocks.
+    """
+
+    doses: tuple[float, ...] = tuple(0.8 + 0.05 * k for k in range(9))
+    dose_sizes: int = 6
+    dose_side: int = 16
+    witness_sizes: int = 8
+    witness_side: int = 40
+    wafer_sizes: int = 3
+    wafer_side: int = 16
+    space: int = 8
+
+
+BLOCKS = TestBlocks()
 
 
 def add_die_frame(
@@ -130,9 +143,11 @@ def add_wafer_mark(
     sizes = sorted(plan.classes, key=lambda pillar: pillar.diameter_units)
     witnesses = [
         _variant(pillar, "witness", layers.witness)
-        for pillar in _spread(sizes, _ON_WAFER)
+        for pillar in _spread(sizes, BLOCKS.wafer_sizes)
     ]
-    sites = _blocks(np.arange(len(witnesses))[None] + 1, _BLOCK, plan.lattices[0])
+    sites = _blocks(
+        np.arange(len(witnesses))[None] + 1, BLOCKS.wafer_side, plan.lattices[0]
+    )
     middle = unit(mark_um / 4)
     lattice = _centred("WITNESS", sites, plan, middle)
     lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
@@ -171,8 +186,7 @@ def _tests(
 ) -> tuple[list[PillarClass], list[PillarArray], list[MarkBox]]:
     """Dose array on the left of the lens, witness cells on its right.
 
-    The dose array repeats six diameters at nine doses, in blocks of 16 by 16 pillars.
-    The witness cells repeat eight diameters at dose 1, in blocks of 40 by 40.
+    Sizes, doses and blocks are those of :data:`BLOCKS`.
 
     Args:
         plan: the lens alone.
@@ -192,27 +206,24 @@ def _tests(
     diameters = [class_of_diameter[units] for units in sorted(class_of_diameter)]
     doses = [
         _variant(pillar, "dose", (layers.dose[0], layers.dose[1] + level), dose)
-        for level, dose in enumerate(DOSES)
-        for pillar in _spread(diameters, _TESTED)
+        for level, dose in enumerate(BLOCKS.doses)
+        for pillar in _spread(diameters, BLOCKS.dose_sizes)
     ]
     witnesses = [
         _variant(pillar, "witness", layers.witness)
-        for pillar in _spread(diameters, _WITNESSED)
+        for pillar in _spread(diameters, BLOCKS.witness_sizes)
     ]
     first_number = len(plan.classes) + 1
     lens_lattice = plan.lattices[0]
+    dose_numbers = first_number + np.arange(len(doses))
     dose_map = _blocks(
-        np.arange(first_number, first_number + len(doses)).reshape(len(DOSES), -1),
-        _BLOCK,
-        lens_lattice,
+        dose_numbers.reshape(len(BLOCKS.doses), -1), BLOCKS.dose_side, lens_lattice
     )
     columns = 2 if len(witnesses) > 1 else 1
-    numbers = np.arange(
-        first_number + len(doses), first_number + len(doses) + len(witnesses)
-    )
+    numbers = first_number + len(doses) + np.arange(len(witnesses))
     witness_map = _blocks(
         np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns),
-        _WITNESS,
+        BLOCKS.witness_side,
         lens_lattice,
     )
     least_x = unit(radius_um + CLEAR_UM)
@@ -227,10 +238,8 @@ def _tests(
         lattice = _centred(name, sites, plan, x)
         reach = max(lattice.constant, lattice.down) // 2
         box = MarkBox(*lattice.box).grown(reach)
-        if (
-            min(abs(box.left), abs(box.right)) < least_x
-            or max(abs(box.left), abs(box.right)) > largest_x
-        ):
+        nearest_x, farthest_x = sorted([abs(box.left), abs(box.right)])
+        if nearest_x < least_x or farthest_x > largest_x:
             need = (
                 (box.right - box.left) / unit.per_um
                 + 2 * CLEAR_UM
@@ -326,21 +335,12 @@ def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
     Returns:
         (rows, columns) uint16 class numbers of the sites.
     """
-    step = side + _SPACE
-    columns_per_step = 2 if lattice.centred else 1
-    sites = np.zeros(
-        (
-            numbers.shape[0] * step - _SPACE,
-            columns_per_step * (numbers.shape[1] * step - _SPACE),
-        ),
-        np.uint16,
-    )
-    for (row, column), number in np.ndenumerate(numbers):
-        sites[
-            row * step : row * step + side,
-            columns_per_step * column * step : columns_per_step
-            * (column * step + side),
-        ] = number
+    columns_per_site = 2 if lattice.centred else 1
+    filled = np.pad(np.ones((side, side), np.uint16), (0, BLOCKS.space))
+    blocks = np.kron(numbers.astype(np.uint16), filled)[
+        : -BLOCKS.space, : -BLOCKS.space
+    ]
+    sites = blocks.repeat(columns_per_site, axis=1)
     if lattice.centred:  # every other site, those of neighbouring rows in turn
         sites[np.add.outer(*map(np.arange, sites.shape)) % 2 == 1] = 0
     return sites

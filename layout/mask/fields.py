@@ -172,7 +172,7 @@ def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
     xs = borders(lattice.x0, split.columns, lattice.columns, lattice.pitch)
     ys = borders(bottom, split.rows, lattice.rows, lattice.down)
     boxes = tuple(
-        rectilinear.box_corners(np.array([left, low, right, high]))
+        rectilinear.box_corners([left, low, right, high])
         for (low, high), (left, right) in itertools.product(
             itertools.pairwise(ys), itertools.pairwise(xs)
         )

@@ -14,13 +14,30 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 CLEAR_UM = 10.0  # between the structures on the die, and of the openings around them
-BARS = 10  # of a vernier on each side of the middle one
-_SHARE = 0.375  # of the pitch, width of a bar
-_BAR_UM, _LONG_UM = 12.0, 16.0  # length of a bar, of the middle one
-_INNER_UM, _OUTER_UM = 10.0, 20.0  # sides of the boxes
-_GAP_UM = 2.0  # from the film's edge to the bars of a vernier
 _QUARTER = np.array([[0, 1], [-1, 0]])  # turn, counter-clockwise
-_FINE = 5  # a fine cross has a fifth of the arms and of the width of a coarse one
+
+
+@dataclass(frozen=True)
+class VernierShape:
+    """Bars of a vernier, and the box in a box beside it.
+
+    bars: on each side of the middle one.
+    width_share: width of a bar over the pitch.
+    bar_um, middle_bar_um: length of a bar, and of the middle one.
+    gap_um: from the film's edge to the bars.
+    inner_um, outer_um: sides of the boxes.
+    """
+
+    bars: int = 10
+    width_share: float = 0.375
+    bar_um: float = 12.0
+    middle_bar_um: float = 16.0
+    gap_um: float = 2.0
+    inner_um: float = 10.0
+    outer_um: float = 20.0
+
+
+VERNIER = VernierShape()
 
 
 @dataclass(frozen=True)
@@ -35,9 +52,7 @@ class MarkBox:
     @property
     def polygon(self) -> Array:
         """Its corners."""
-        return rectilinear.box_corners(
-            np.array([self.left, self.bottom, self.right, self.top])
-        )
+        return rectilinear.box_corners([self.left, self.bottom, self.right, self.top])
 
     def grown(self, by: int) -> "MarkBox":
         """A rectangle that is larger by ``by`` on each side."""
@@ -64,6 +79,13 @@ class DatabaseUnits:
 
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid
+
+    def fifth(self, length: int) -> int:
+        """A fifth of a length, down to the grid and at least one step of it.
+
+        A fine cross has arms and lines of a fifth of the coarse one.
+        """
+        return max(self.grid, length // 5 // self.grid * self.grid)
 
     def snapped(self, box: MarkBox) -> MarkBox:
         """The box on the grid, no smaller."""
@@ -95,8 +117,8 @@ def alignment_crosses(
     arm = unit(process.die.mark_um / 2)
     width = unit(process.die.mark_width_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM) + arm
-    fine = max(unit.grid, arm // _FINE // unit.grid * unit.grid)
-    thin = _thin(width, unit)
+    fine = unit.fifth(arm)
+    thin = unit.fifth(width)
     shapes: list[Array] = []
     boxes = []
     for sign_x, sign_y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
@@ -139,16 +161,10 @@ def wafer_cross(
     """
     arm = unit(mark_um / 2)
     half = unit(width_um / 2)
-    inner = arm // _FINE // unit.grid * unit.grid * 2
-    thin = _thin(half, unit)
+    inner = 2 * unit.fifth(arm)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
     bars = [upright @ np.linalg.matrix_power(_QUARTER, k) for k in range(4)]
-    return (*bars, cross_polygon(0, 0, inner // 2, thin))
-
-
-def _thin(half: int, unit: DatabaseUnits) -> int:
-    """Half the line width of a fine cross, from that of the coarse cross."""
-    return max(unit.grid, half // _FINE // unit.grid * unit.grid)
+    return (*bars, cross_polygon(0, 0, inner // 2, unit.fifth(half)))
 
 
 def vernier_scales(
@@ -174,37 +190,27 @@ def vernier_scales(
         raise ProcessError(
             f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
         )
-    half_length = BARS * (pitch + step) + pitch // 2
+    half_length = VERNIER.bars * (pitch + step) + pitch // 2
     clear = unit(CLEAR_UM)
     arm = unit(process.die.mark_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM)
-    bar_height = unit(_LONG_UM + 2 * _GAP_UM)
+    bar_height = unit(VERNIER.middle_bar_um + 2 * VERNIER.gap_um)
     top = die.top - inset - bar_height
     right = die.right - inset - 2 * arm - 2 * clear
     vertical = right - bar_height, die.top - inset - half_length
-    half_outer = unit(_OUTER_UM / 2)
+    half_outer = unit(VERNIER.outer_um / 2)
     box_centre = (
         vertical[0] - bar_height - clear - half_outer,
         die.top - inset - half_outer,
     )
     horizontal = box_centre[0] - half_outer - clear - half_length, top
-    square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
-    if (
-        horizontal[0] - half_length
-        < die.left + inset + 2 * arm + 2 * clear + 5 * square
-    ):
-        need_um = (
-            die.right
-            - horizontal[0]
-            + half_length
-            + inset
-            + 2 * arm
-            + 2 * clear
-            + 5 * square
-        ) / unit.per_um
+    square = unit.fifth(arm)
+    right_of_cross = die.right - horizontal[0] + half_length
+    need = right_of_cross + inset + 2 * arm + 2 * clear + 5 * square
+    if need > die.right - die.left:
         raise ProcessError(
-            f"the die is too narrow for VERNIERS: {need_um:.0f} um are needed; raise die.margin_um or die.size_um, or set "
-            "die.verniers = false"
+            f"the die is too narrow for VERNIERS: {need / unit.per_um:.0f} um are "
+            "needed; raise die.margin_um or die.size_um, or set die.verniers = false"
         )
     drawn: list[Array] = []
     openings: list[Array] = []
@@ -212,7 +218,7 @@ def vernier_scales(
         bars, windows = _vernier(unit, pitch, step)
         drawn += [bar @ turn + np.array(centre) for bar in bars]
         openings += [bar @ turn + np.array(centre) for bar in windows]
-    for shapes, half in ((drawn, unit(_INNER_UM / 2)), (openings, half_outer)):
+    for shapes, half in ((drawn, unit(VERNIER.inner_um / 2)), (openings, half_outer)):
         shapes.append(MarkBox(*box_centre, *box_centre).grown(half).polygon)
     return tuple(drawn), tuple(openings)
 
@@ -229,15 +235,17 @@ def _vernier(
     Returns:
         Drawn bars; openings, the last of which is the window around the drawn bars.
     """
-    half = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid)
-    gap = unit(_GAP_UM)
+    half = max(
+        unit.grid, round(pitch * VERNIER.width_share / 2 / unit.grid) * unit.grid
+    )
+    gap = unit(VERNIER.gap_um)
     drawn = []
     openings = []
-    for n in range(-BARS, BARS + 1):
-        end = gap + unit(_BAR_UM if n else _LONG_UM)
+    for n in range(-VERNIER.bars, VERNIER.bars + 1):
+        end = gap + unit(VERNIER.bar_um if n else VERNIER.middle_bar_um)
         x, opened_x = n * pitch, n * (pitch + step)
         drawn.append(MarkBox(x - half, gap, x + half, end).polygon)
         openings.append(MarkBox(opened_x - half, -end, opened_x + half, -gap).polygon)
-    reach = BARS * pitch + pitch // 2
-    window = MarkBox(-reach, 0, reach, 2 * gap + unit(_LONG_UM))
+    reach = VERNIER.bars * pitch + pitch // 2
+    window = MarkBox(-reach, 0, reach, 2 * gap + unit(VERNIER.middle_bar_um))
     return drawn, [*openings, unit.snapped(window).polygon]

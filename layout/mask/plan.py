@@ -17,10 +17,10 @@ from layout.shapes.rectilinear import IntBox
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-MOST_CLASSES = 65535
+MOST_CLASSES = np.iinfo(np.uint16).max
 Role = Literal["pillar", "dose", "witness"]
-FARTHEST = 2**31 - 1
-BLOCK_SITES = 1 << 20  # sites of a lattice that are worked on at once
+FARTHEST = np.iinfo(np.int32).max  # coordinate of any mask file
+BLOCK_SITES = 1 << 20  # sites, or placements, that are worked on at once
 UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
 EXPOSED = (
     "MARKS",
@@ -169,6 +169,24 @@ class PillarArray:
         """All class numbers (rows, columns)."""
         return self.source(0, self.rows)
 
+    def present(self, first: int, end: int) -> Array:
+        """(rows, columns) whether a pillar stands at each site of some rows.
+
+        Args:
+            first: row.
+            end: row after the last; rows beyond the lattice are left out.
+        """
+        return self.source(first, min(end, self.rows)) > 0
+
+    def positions(self, row: Array, column: Array) -> tuple[Array, Array]:
+        """x and y of sites, database units.
+
+        Args:
+            row: numbers of their rows.
+            column: numbers of their columns.
+        """
+        return self.x0 + column * self.pitch, self.y0 - row * self.down
+
     def counts(self, classes: int) -> Array:
         """(classes + 1,) sites of each class number.
 
@@ -253,8 +271,7 @@ class PillarArray:
             return (np.empty(0, np.int64),) * 3
         block = self.source(first, end)[:, left_column:end_column]
         row, column = np.nonzero(block)
-        x = self.x0 + (left_column + column) * self.pitch
-        return block[row, column], x, self.y0 - (first + row) * self.down
+        return block[row, column], *self.positions(first + row, left_column + column)
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,9 +55,7 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
         f.polygons[process.layers.outline] for f in unexposed if f.name == "OUTLINE"
     ]
     die = [*itertools.chain(*outlines)] or [
-        rectilinear.box_corners(
-            np.array([*(box.min(0) - margin), *(box.max(0) + margin)])
-        )
+        rectilinear.box_corners([*(box.min(0) - margin), *(box.max(0) + margin)])
         for box in boxes
     ]
     standing = [
@@ -117,7 +115,7 @@ def _around(pillar: PillarClass, square: IntBox, grid: int) -> PillarClass:
             "widen the pitch"
         )
     remainder = region.subtract_contours(
-        [rectilinear.box_corners(np.array(square))], pillar.contours
+        [rectilinear.box_corners(square)], pillar.contours
     )
     return dataclasses.replace(
         pillar, drawn=tuple(region.without_holes(remainder, grid=grid))

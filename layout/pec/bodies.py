@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.plan import PillarArray
+from layout.pec.nodes import NODES_PER_WIDTH
 from layout.pec.pillar_exposure import DrawnKinds
 from layout.pec.psf import PointExposure
 from metalens.core.arrays import Array
@@ -15,7 +16,6 @@ from metalens.core.errors import ProcessError
 
 _FAINT = 0.02  # least exposure of its own edge at which a pillar can be corrected
 _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
-COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,9 @@ def split_ranges(
 ) -> ScatterRanges:
     """Split the Gaussians of a point exposure by how far they reach among the pillars.
 
-    Far: at least six lattice steps wide. Middle: others that neighbours receive. Near:
-    others. Far and middle are widened by the mean size of the pillars.
+    Far: at least six lattice steps wide, so that nodes may be as coarse as the lattice.
+    Middle: others that neighbours receive. Near: others. Far and middle are widened by
+    the mean size of the pillars.
 
     Args:
         point: exposure of a beam.
@@ -99,7 +100,7 @@ def split_ranges(
             for width in point.widths_um
         ]
     )
-    far = point.widths_um >= COARSE * body.nearest_um
+    far = point.widths_um >= NODES_PER_WIDTH * body.nearest_um
     middle = ~far & (
         (from_neighbours * point.weights > _NEGLIGIBLE)
         | (point.widths_um > body.nearest_um)

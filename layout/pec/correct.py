@@ -13,7 +13,12 @@ from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarC
 from layout.pec import bodies, psf
 from layout.pec.bodies import ExposureTable, ScatterRanges
 from layout.pec.marks import ExposedMarks, cut_marks
-from layout.pec.nodes import RadialConvolution, ScatterBackground, gaussian_convolution
+from layout.pec.nodes import (
+    MOST_NODES,
+    RadialConvolution,
+    ScatterBackground,
+    gaussian_convolution,
+)
 from layout.pec.pillar_exposure import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.process.process import ExposureSettings, LayerNumber
@@ -22,10 +27,9 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 
-_MOST_SITES = 40_000_000  # of a lattice with a middle range
 _ROUNDED = 0.75  # of the tolerance, for doses rounded to the ladder
 _SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
-NONE = 255  # dose class of a site without pillar
+NONE = np.iinfo(np.uint8).max  # dose class of a site without pillar
 
 
 def correct_plans(
@@ -312,11 +316,11 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
     Raises:
         ProcessError: more than 40 million sites.
     """
-    if body.rows * body.columns > _MOST_SITES:
+    if body.rows * body.columns > MOST_NODES:
         raise ProcessError(
             f"a lens of {body.rows} x {body.columns} sites with a point exposure that holds Gaussians of "
             f"{np.array2string(ranges.middle.widths_um, precision=3)} um: such middle ranges are corrected on at most "
-            f"{_MOST_SITES:,} sites; give a point exposure of core and backscatter alone"
+            f"{MOST_NODES:,} sites; give a point exposure of core and backscatter alone"
         )
     return gaussian_convolution(
         (body.rows, body.columns),

@@ -14,7 +14,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 MOST_NODES = 40_000_000
-_PER_WIDTH = 6  # nodes along the 1/e radius of the narrowest Gaussian
+NODES_PER_WIDTH = 6  # nodes along the 1/e radius of the narrowest Gaussian
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class NodeGrid:
             ProcessError: more than 4e7 nodes.
         """
         left, bottom, right, top = box_um
-        step = width_um / _PER_WIDTH
+        step = width_um / NODES_PER_WIDTH
         grid = cls(NodeAxis.over(bottom, top, step), NodeAxis.over(left, right, step))
         if grid.y.count * grid.x.count > MOST_NODES:
             raise ProcessError(

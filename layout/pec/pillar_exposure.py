@@ -23,7 +23,6 @@ _EDGE_POINTS = 48  # points along the edges where exposure by neighbours is eval
 _PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
 _PIXEL = 1 / 6  # of it, of the raster on which the level is sought
 _MOST_PIXELS = 1200  # along a side
-_HALVINGS = 34
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +201,8 @@ def _level(
     """Exposure level whose contour encloses the area of the shape, and its slope.
 
     The exposure of the shape by itself at unit dose is drawn on pixels. The level is
-    sought by bisection. slope = perimeter / (d area / d level): its fall per um that
+    the root of the area above it less the area of the shape (Brent's method). slope =
+    perimeter / (d area / d level): its fall per um that
     the edges move out.
 
     Args:
@@ -210,6 +210,8 @@ def _level(
         area_um2: of the shape.
         point: exposure of a beam.
     """
+    from scipy.optimize import brentq
+
     corners = np.concatenate(list(contours))
     narrowest = float(point.widths_um.min())
     size = float(np.ptp(corners, axis=0).max())
@@ -233,11 +235,10 @@ def _level(
     def area_above(level: float) -> float:
         return float(_above(image, slope_y, slope_x, level)) * pixel**2
 
-    low, high = 0.0, float(image.max())
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if area_above(middle) > area_um2 else (low, middle)
-    level = (low + high) / 2
+    def excess_area(level: float) -> float:
+        return area_above(level) - area_um2
+
+    level = float(brentq(excess_area, 0.0, float(image.max())))
     difference = 0.15 * level  # a few pixels wide, so that their places do not matter
     return level, total_perimeter(contours) / max(
         (area_above(level - difference) - area_above(level + difference))

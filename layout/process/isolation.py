@@ -1,5 +1,7 @@
 """How alone a pillar stands: what is missing of the neighbours that change its bias."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from metalens.core.arrays import Array
@@ -57,6 +59,33 @@ def isolation_map(
     weight = correlate1d(weight, along_x, axis=1, mode="constant")
     isolation = np.clip(1 - (weight - own) / total, 0, 1)
     return np.where(isolation > _ROUNDING, isolation, np.float32(0))
+
+
+def isolation_rows(
+    present: Callable[[int, int], Array],
+    first: int,
+    end: int,
+    steps_um: tuple[float, float],
+    range_um: float,
+    *,
+    centred: bool = False,
+) -> Array:
+    """:func:`isolation_map` of some rows of a lens that is read by rows.
+
+    Args:
+        present: of a first and an end row: (rows, x) true where a pillar stands; an end
+            beyond the last row counts as the last.
+        first: row.
+        end: row after the last.
+        steps_um: (x, y) distance of neighbouring columns and rows.
+        range_um: of the bias of isolated pillars.
+        centred: as of :func:`isolation_map`.
+    """
+    halo = isolation_halo(steps_um[1], range_um)
+    low = max(0, first - halo)
+    around = present(low, end + halo)
+    isolation = isolation_map(around, steps_um, range_um, centred=centred)
+    return isolation[first - low : end - low]
 
 
 def isolation_halo(step_um: float, range_um: float) -> int:

@@ -194,14 +194,15 @@ def eightfold_images(eighth: Array) -> Array:
 
 
 def disc_polygon(
-    radius: float, centre: tuple[float, float], corners: int, grid: int = 1
+    radius: float, centre: tuple[float, float], corners: int = 64, grid: int = 1
 ) -> Array:
     """Regular polygon of the area of a circle, rounded to a grid.
 
     Args:
         radius: of the circle.
         centre: of the circle.
-        corners: their number; the first lies half a step above the x axis.
+        corners: their number; the first lies half a step above the x axis. Of 64 each
+            edge is within 0.12 % of the radius from the circle.
         grid: step of the coordinates.
 
     Returns:

@@ -1,7 +1,7 @@
 """Polygons of horizontal and vertical edges, cut into rectangles, exactly."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def merge_runs(rows: Iterable[Array]) -> Array:
     return np.array(rectangles, np.int64).reshape(-1, 4)
 
 
-def box_corners(box: Array) -> Array:
+def box_corners(box: Array | Sequence[float]) -> Array:
     """(4, 2) corners of left, bottom, right, top, counter-clockwise.
 
     Args:

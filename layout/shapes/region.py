@@ -11,9 +11,6 @@ import numpy as np
 from layout.shapes.rectilinear import box_corners, split_rectilinear
 from metalens.core.arrays import Array
 
-_SLICES = 64  # of a polygon, at most
-_SLICE = 5000  # units
-
 
 def union_contours(polygons: Iterable[Array]) -> list[Array]:
     """Contours of the union: outlines counter-clockwise, holes clockwise.
@@ -53,13 +50,13 @@ def separate_areas(polygons: Iterable[Array]) -> list[list[Array]]:
     return [_contours(part) for part in _section(polygons).decompose()]
 
 
-def covering_rectangles(shape: Array) -> Array:
+def covering_rectangles(shape: Array, *, slices: int = 64, height: int = 5000) -> Array:
     """(n, 4) rectangles of a rectilinear polygon, or boxes around slices of any other.
-
-    Slices are 5 um high or more.
 
     Args:
         shape: (n, 2) corners, nm.
+        slices: at most so many.
+        height: of a slice, at least, nm.
     """
     if not np.diff(shape, axis=0, append=shape[:1]).all(1).any():
         return split_rectilinear(shape)
@@ -67,13 +64,11 @@ def covering_rectangles(shape: Array) -> Array:
     if section.is_empty():
         return np.empty((0, 4), np.int64)
     left, bottom, right, top = section.bounds()
-    slices = min(_SLICES, max(1, int(top - bottom) // _SLICE))
-    ends = np.linspace(bottom, top, slices + 1).tolist()
+    count = min(slices, max(1, int(top - bottom) // height))
+    ends = np.linspace(bottom, top, count + 1).tolist()
     boxes = np.array(
         [
-            (
-                section ^ _section([box_corners(np.array([left, low, right, high]))])
-            ).bounds()
+            (section ^ _section([box_corners([left, low, right, high])])).bounds()
             for low, high in itertools.pairwise(ends)
         ]
     )
@@ -165,7 +160,7 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
             continue
         left, bottom, right, top = part.bounds()
         for low, high in ((left - 1, cut_x), (cut_x, right + 1)):
-            box = box_corners(np.array([low, bottom - 1, high, top + 1]))
+            box = box_corners([low, bottom - 1, high, top + 1])
             yield from _cut(part ^ _section([box]), grid)
 
 

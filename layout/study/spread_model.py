@@ -20,9 +20,6 @@ _BAND, _PARTS = (
     16,
     16,
 )  # rows that are summed at once, by any one worker; parts of a lens that workers take
-_LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss
-_DEGREE = 10  # of the dependence on the local bias
-_SAMPLES = 160
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +29,7 @@ class SpreadModel:
     curve: t of the kinds of pillars (sizes to 0.05 nm). count: (kinds,) pillars of
     each. basis: (rank, kinds) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
+    degree: of the Chebyshev series of the weights of the basis in the local bias.
     """
 
     curve: Curve
@@ -40,6 +38,7 @@ class SpreadModel:
     basis: Array
     moments: Array
     radius_um: float
+    degree: int = 10
 
     def drawn(self, lenses: Sequence[State]) -> Array:
         """(lenses, nodes y, nodes x) moments of lenses that a process makes.
@@ -52,7 +51,7 @@ class SpreadModel:
         """
         x = self.focus.nodes_x_um / self.radius_um
         y = self.focus.nodes_y_um[:, None] / self.radius_um
-        knots = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+        knots = np.cos(np.pi * (np.arange(self.degree + 1) + 0.5) / (self.degree + 1))
         lens_moments = []
         for state in lenses:
             bias = state.bias_um(x, y)
@@ -60,7 +59,7 @@ class SpreadModel:
             half_range = (bias.max() - bias.min()) / 2 + 1e-9
             curves = self.curve(mean_bias + half_range * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
-            coefficients = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
+            coefficients = np.polynomial.chebyshev.chebfit(knots, weights, self.degree)
             at_nodes = np.polynomial.chebyshev.chebval(
                 (bias - mean_bias) / half_range, coefficients
             )
@@ -74,13 +73,19 @@ class SpreadModel:
 
 
 def reduce_spread(
-    lens: Lens, sens: ResponseRates, focus: FocusSums, spread: Spread, *, seed: int
+    lens: Lens,
+    sens: ResponseRates,
+    focus: FocusSums,
+    spread: Spread,
+    *,
+    seed: int,
+    samples: int = 160,
+    tolerance: float = 3e-4,
 ) -> SpreadModel:
     """Reduce a lens to sums over its pillars for a basis of their transmissions.
 
-    The basis are the leading singular vectors of t over the kinds of pillars, for 160
-    random draws at random places of the lens. It misses at most 3e-4 of the variation,
-    in amplitude.
+    The basis are the leading singular vectors of t over the kinds of pillars, for
+    random draws at random places of the lens.
 
     Args:
         lens: as designed.
@@ -88,12 +93,14 @@ def reduce_spread(
         focus: sums of a window.
         spread: of the process.
         seed: of the random draws.
+        samples: number of the random draws.
+        tolerance: share, in amplitude, of the variation that the basis may miss.
     """
     index, count, curve = classify_pillars(lens, sens)
-    states = [draw.state() for draw in draw_lenses(spread, _SAMPLES, seed=seed)]
+    states = [draw.state() for draw in draw_lenses(spread, samples, seed=seed)]
     rng = np.random.default_rng(seed)
-    radius = np.sqrt(rng.uniform(0, 1, _SAMPLES))
-    angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
+    radius = np.sqrt(rng.uniform(0, 1, samples))
+    angle = rng.uniform(0, 2 * np.pi, samples)
     u, v = radius * np.cos(angle), radius * np.sin(angle)
     curves = [
         curve(state.bias_um(x, y), state)[0]
@@ -105,7 +112,7 @@ def reduce_spread(
             np.stack(curves) * weight, full_matrices=False
         )[1:]
     missed_share = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1] / (singular**2).sum())
-    rank = max(1, int((missed_share > _LEFT_OUT).sum()))
+    rank = max(1, int((missed_share > tolerance).sum()))
     basis = directions[:rank] / weight
     columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
     bounds = [len(index) * i // _PARTS for i in range(_PARTS + 1)]

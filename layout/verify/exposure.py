@@ -27,8 +27,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 
-_SAMPLES = 1000  # pillars whose exposure is summed exactly, on masks up to ...
-_PRODUCTS = 4e9  # ... so many products of samples and sites
+_PRODUCTS = 4e9  # of samples and sites that are summed exactly, at most
 _CLOSE = 1e5  # products that the exact exposure by one shape costs
 _FAR = 6.0  # ranges between two shapes at which a Gaussian is below exp(-36)
 
@@ -75,6 +74,7 @@ def verify_exposure(
     process: Process,
     *,
     keep: Callable[[ExposedRows], None] | None = None,
+    samples: int = 1000,
 ) -> ExposureReport:
     """Expose and etch a mask that was read back, in simulation.
 
@@ -84,6 +84,8 @@ def verify_exposure(
         doses: its dose table.
         process: point exposure, bias, etch and layers.
         keep: called with the rows of all lattices, in turn; memory is bounded.
+        samples: pillars whose exposure is summed exactly as well; fewer, down to 16, on
+            large masks.
 
     Accuracy: the field on nodes to some 1e-4 (the result states the difference from
     direct sums); widths by the slope at the drawn edge, 3 % of a shift of 4 nm.
@@ -125,7 +127,7 @@ def verify_exposure(
         ),
         process.exposure.tolerance,
         scene.undosed,
-        *_sampled(scene, field),
+        *_sampled(scene, field, samples),
     )
 
 
@@ -327,23 +329,20 @@ def _develop(
     slope = np.maximum(scene.dose * field.slope, 1e-9)
     is_round = isinstance(scene.kinds, DrawnDiscs)
     for number, body in enumerate(scene.bodies):
-        halo = 0
-        if process.bias.isolated_nm:
-            halo = isolation.isolation_halo(body.down_um, process.bias.range_um)
         for first, block in body.blocks():
             exposure = field.rows(scene, number, first, block)
             shift = 2 * (exposure - THRESHOLD) / slope[block]
             resist = (scene.size_um[block] + shift) / nm
             isolated: Array | float = 0.0
-            if halo:
-                low = max(0, first - halo)
-                stop = min(body.rows, first + len(block) + halo)
-                isolated = isolation.isolation_map(
-                    body.source(low, stop) > 0,
+            if process.bias.isolated_nm:
+                isolated = isolation.isolation_rows(
+                    body.present,
+                    first,
+                    first + len(block),
                     (body.pitch_um, body.down_um),
                     process.bias.range_um,
                     centred=body.centred,
-                )[first - low : first - low + len(block)]
+                )
             etch = process.made_diameter_nm if is_round else process.bias.fabricated_nm
             made = np.where(block > 0, etch(np.maximum(resist, 0), isolated), 0)
             yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
@@ -420,7 +419,7 @@ def verify_polygons(
 # direct sums
 
 
-def _sampled(scene: WrittenMask, field: _Field) -> tuple[float, float]:
+def _sampled(scene: WrittenMask, field: _Field, samples: int) -> tuple[float, float]:
     """Compare the field with direct sums at sample pillars of the first lattice.
 
     Returns:
@@ -433,7 +432,7 @@ def _sampled(scene: WrittenMask, field: _Field) -> tuple[float, float]:
     rows, columns = (1 + int(reach_um / step) for step in (body.down_um, body.pitch_um))
     sites = sum(each.rows * each.columns for each in scene.bodies)
     products = sites + len(field.spots[0]) + _CLOSE * rows * columns
-    places = _some_pillars(scene, int(np.clip(_PRODUCTS / products, 16, _SAMPLES)))
+    places = _some_pillars(scene, int(np.clip(_PRODUCTS / products, 16, samples)))
     exact = _distant_exposure(scene, field, *places)
     by_field = np.empty(len(exact))
     for n, (row, column) in enumerate(

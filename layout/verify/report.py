@@ -15,7 +15,6 @@ MOST_NM = 1.0  # by which a width in the resist may differ from the drawn one
 # Doses step along the edges of marks: this share of the points keeps the tolerance, and
 # all keep so many times it.
 EDGE_SHARE, EDGE_TIMES = 0.99, 2.0
-_SIDE = 160  # points of the map, each way
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +46,9 @@ class VerificationTally:
     count: Array
 
     @classmethod
-    def empty(cls) -> "VerificationTally":
-        """Of nothing."""
-        return cls(np.zeros(2), *np.zeros((2, _SIDE, _SIDE)))
+    def empty(cls, side: int = 160) -> "VerificationTally":
+        """A tally of nothing, with a map of ``side`` points each way."""
+        return cls(np.zeros(2), *np.zeros((2, side, side)))
 
     def take(
         self,
@@ -66,15 +65,16 @@ class VerificationTally:
         difference = resist - drawn
         errors = np.abs(exposure - 1).max(), np.abs(difference).max()
         self.worst = np.maximum(self.worst, errors)
+        side = len(self.count)
         column, row = (
             np.clip(
-                (positions - low) / max(high - low, 1e-9) * _SIDE, 0, _SIDE - 1
+                (positions - low) / max(high - low, 1e-9) * side, 0, side - 1
             ).astype(np.int64)
             for positions, low, high in zip((x, y), box_um[:2], box_um[2:], strict=True)
         )
-        point = row * _SIDE + column
+        point = row * side + column
         for sums, weights in ((self.total, difference), (self.count, None)):
-            sums += np.bincount(point, weights, _SIDE**2).reshape(_SIDE, _SIDE)
+            sums += np.bincount(point, weights, side**2).reshape(side, side)
 
 
 @dataclass(frozen=True, eq=False)

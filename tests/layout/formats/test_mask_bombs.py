@@ -13,6 +13,8 @@ from layout.drc.library import check_library
 from layout.formats import gdsii_read, oasis_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
+from layout.formats.gdsii_records import GdsiiRecord
+from layout.formats.oasis_records import OasisRecord
 from layout.process.process import DesignRules
 from metalens import cli
 from metalens.core.errors import MaskFileError
@@ -21,46 +23,48 @@ MOST_BYTES = 60e6  # of Python and numpy; the limits of the test itself are smal
 
 
 LEAF = (
-    gds.gdsii_record(gds.BOUNDARY)
-    + gds.integer_record(gds.LAYER, 9)
-    + gds.integer_record(gds.DATATYPE, 3)
+    gds.gdsii_record(GdsiiRecord.BOUNDARY)
+    + gds.integer_record(GdsiiRecord.LAYER, 9)
+    + gds.integer_record(GdsiiRecord.DATATYPE, 3)
 )
 LEAF += gds.xy_record(
     np.array([[0, 0], [500, 0], [0, 600], [0, 0]])
-) + gds.gdsii_record(gds.ENDEL)
+) + gds.gdsii_record(GdsiiRecord.ENDEL)
 
 
 def structure(name, *elements):
     return (
-        gds.integer_record(gds.BGNSTR, *[0] * 12)
-        + gds.text_record(gds.STRNAME, name)
+        gds.integer_record(GdsiiRecord.BGNSTR, *[0] * 12)
+        + gds.text_record(GdsiiRecord.STRNAME, name)
         + b"".join(elements)
-        + gds.gdsii_record(gds.ENDSTR)
+        + gds.gdsii_record(GdsiiRecord.ENDSTR)
     )
 
 
 def array(child, columns, rows, step=(1000, 900)):
     corners = np.array([[0, 0], [columns * step[0], 0], [0, rows * step[1]]])
     body = (
-        gds.gdsii_record(gds.AREF)
-        + gds.text_record(gds.SNAME, child)
-        + gds.integer_record(gds.COLROW, columns, rows)
+        gds.gdsii_record(GdsiiRecord.AREF)
+        + gds.text_record(GdsiiRecord.SNAME, child)
+        + gds.integer_record(GdsiiRecord.COLROW, columns, rows)
     )
-    return body + gds.xy_record(corners) + gds.gdsii_record(gds.ENDEL)
+    return body + gds.xy_record(corners) + gds.gdsii_record(GdsiiRecord.ENDEL)
 
 
 def gdsii(*structures):
     head = (
-        gds.integer_record(gds.HEADER, 600)
-        + gds.integer_record(gds.BGNLIB, *[0] * 12)
-        + gds.text_record(gds.LIBNAME, "L")
+        gds.integer_record(GdsiiRecord.HEADER, 600)
+        + gds.integer_record(GdsiiRecord.BGNLIB, *[0] * 12)
+        + gds.text_record(GdsiiRecord.LIBNAME, "L")
     )
-    head += gds.gdsii_record(gds.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9))
+    head += gds.gdsii_record(
+        GdsiiRecord.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9)
+    )
     return (
         head
         + structure("A", LEAF)
         + b"".join(structures)
-        + gds.gdsii_record(gds.ENDLIB)
+        + gds.gdsii_record(GdsiiRecord.ENDLIB)
     )
 
 
@@ -69,12 +73,12 @@ def grid(columns, rows, step):
 
 
 def placement(child, repetition):
-    return bytes([oasis.PLACEMENT, 0xC8, child]) + repetition
+    return bytes([OasisRecord.PLACEMENT, 0xC8, child]) + repetition
 
 
 def rectangle(repetition):
     return (
-        bytes([oasis.RECTANGLE, 0x67, 7, 3])
+        bytes([OasisRecord.RECTANGLE, 0x67, 7, 3])
         + oasis.unsigned_integer(60)
         + oasis.unsigned_integer(50)
         + repetition
@@ -83,10 +87,11 @@ def rectangle(repetition):
 
 def oasis_file(*cells):
     body = oasis.start_record(1.0) + b"".join(
-        bytes([oasis.CELLNAME]) + oasis.oasis_string(f"C{n}") for n in range(len(cells))
+        bytes([OasisRecord.CELLNAME]) + oasis.oasis_string(f"C{n}")
+        for n in range(len(cells))
     )
     body += b"".join(
-        bytes([oasis.CELL_REF, n]) + records for n, records in enumerate(cells)
+        bytes([OasisRecord.CELL_REF, n]) + records for n, records in enumerate(cells)
     )
     return body + oasis.end_record((0,) * 6, zlib.crc32(body))
 

@@ -11,7 +11,9 @@ import layout
 from layout.formats import gdsii_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
+from layout.formats.gdsii_records import GdsiiRecord
 from layout.formats.library import CellReference, MaskCell, flatten_stacks
+from layout.formats.oasis_records import OasisRecord
 from metalens.core.errors import MaskFileError
 from tests.referees.mask_places import places
 
@@ -122,40 +124,48 @@ def test_any_turn_and_magnification_nested_and_in_arrays(tmp_path, suffix):
 
 def gdsii(*elements):
     head = (
-        gds.integer_record(gds.HEADER, 600)
-        + gds.integer_record(gds.BGNLIB, *[0] * 12)
-        + gds.text_record(gds.LIBNAME, "L")
+        gds.integer_record(GdsiiRecord.HEADER, 600)
+        + gds.integer_record(GdsiiRecord.BGNLIB, *[0] * 12)
+        + gds.text_record(GdsiiRecord.LIBNAME, "L")
     )
-    head += gds.gdsii_record(gds.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9))
+    head += gds.gdsii_record(
+        GdsiiRecord.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9)
+    )
     leaf = (
-        gds.integer_record(gds.BGNSTR, *[0] * 12)
-        + gds.text_record(gds.STRNAME, "A")
-        + gds.gdsii_record(gds.BOUNDARY)
+        gds.integer_record(GdsiiRecord.BGNSTR, *[0] * 12)
+        + gds.text_record(GdsiiRecord.STRNAME, "A")
+        + gds.gdsii_record(GdsiiRecord.BOUNDARY)
     )
-    leaf += gds.integer_record(gds.LAYER, 7) + gds.integer_record(gds.DATATYPE, 3)
+    leaf += gds.integer_record(GdsiiRecord.LAYER, 7) + gds.integer_record(
+        GdsiiRecord.DATATYPE, 3
+    )
     leaf += (
         gds.xy_record(np.array([[0, 0], [50, 0], [0, 60], [0, 0]]))
-        + gds.gdsii_record(gds.ENDEL)
-        + gds.gdsii_record(gds.ENDSTR)
+        + gds.gdsii_record(GdsiiRecord.ENDEL)
+        + gds.gdsii_record(GdsiiRecord.ENDSTR)
     )
     top = (
-        gds.integer_record(gds.BGNSTR, *[0] * 12)
-        + gds.text_record(gds.STRNAME, "TOP")
+        gds.integer_record(GdsiiRecord.BGNSTR, *[0] * 12)
+        + gds.text_record(GdsiiRecord.STRNAME, "TOP")
         + b"".join(elements)
     )
     return np.frombuffer(
-        head + leaf + top + gds.gdsii_record(gds.ENDSTR) + gds.gdsii_record(gds.ENDLIB),
+        head
+        + leaf
+        + top
+        + gds.gdsii_record(GdsiiRecord.ENDSTR)
+        + gds.gdsii_record(GdsiiRecord.ENDLIB),
         np.uint8,
     )
 
 
 def aref(columns, rows, *corners):
     body = (
-        gds.gdsii_record(gds.AREF)
-        + gds.text_record(gds.SNAME, "A")
-        + gds.integer_record(gds.COLROW, columns, rows)
+        gds.gdsii_record(GdsiiRecord.AREF)
+        + gds.text_record(GdsiiRecord.SNAME, "A")
+        + gds.integer_record(GdsiiRecord.COLROW, columns, rows)
     )
-    return body + gds.xy_record(np.array(corners)) + gds.gdsii_record(gds.ENDEL)
+    return body + gds.xy_record(np.array(corners)) + gds.gdsii_record(GdsiiRecord.ENDEL)
 
 
 def test_arrays_off_the_grid_stand_next_to_their_places():
@@ -187,11 +197,11 @@ def test_arrays_off_the_grid_stand_next_to_their_places():
 
 def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
     far = (
-        gds.gdsii_record(gds.SREF)
-        + gds.text_record(gds.SNAME, "A")
+        gds.gdsii_record(GdsiiRecord.SREF)
+        + gds.text_record(GdsiiRecord.SNAME, "A")
         + gds.xy_record(np.array([[2**31 - 20, 0]]))
     )
-    content = gdsii_read.parse_gdsii(gdsii(far + gds.gdsii_record(gds.ENDEL)))
+    content = gdsii_read.parse_gdsii(gdsii(far + gds.gdsii_record(GdsiiRecord.ENDEL)))
     nested = CellReference("TOP", 100, 0)
     content.cells["OUTER"] = MaskCell("OUTER", references=(nested,))
     with pytest.raises(MaskFileError, match="32 bits"):
@@ -201,9 +211,12 @@ def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
 
 
 def oasis_file(*records):
-    name = bytes([oasis.CELLNAME]) + oasis.oasis_string("TOP")
+    name = bytes([OasisRecord.CELLNAME]) + oasis.oasis_string("TOP")
     body = (
-        oasis.start_record(1.0) + name + bytes([oasis.CELL_REF, 0]) + b"".join(records)
+        oasis.start_record(1.0)
+        + name
+        + bytes([OasisRecord.CELL_REF, 0])
+        + b"".join(records)
     )
     return body + oasis.end_record((0,) * 6, __import__("zlib").crc32(body))
 
@@ -211,7 +224,7 @@ def oasis_file(*records):
 def compact(kind, w, h):
     size = oasis.unsigned_integer(w) + oasis.unsigned_integer(h)
     return (
-        bytes([oasis.CTRAPEZOID, 0xFB, 7, 3, kind])
+        bytes([OasisRecord.CTRAPEZOID, 0xFB, 7, 3, kind])
         + size
         + oasis.signed_integer(11)
         + oasis.signed_integer(-5)

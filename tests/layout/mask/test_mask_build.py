@@ -219,7 +219,7 @@ def test_the_die_holds_everything_within_its_street_and_apart():
                 <= edge
             )
     doses = {c.dose for c in plan.classes if c.layer[0] == process.layers.dose[0]}
-    assert doses == set(die.DOSES)
+    assert doses == set(die.BLOCKS.doses)
 
 
 def test_the_aperture_opens_the_lens_and_the_test_structures():
