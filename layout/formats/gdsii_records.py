@@ -62,6 +62,7 @@ class GdsiiRecord(enum.IntEnum):
 
 
 DATA: dict[int, int] = {record: record.data for record in GdsiiRecord}
+NAMES: dict[int, str] = {record: record.name for record in GdsiiRecord}
 
 
 def record_name(kind: int) -> str:
@@ -70,7 +71,7 @@ def record_name(kind: int) -> str:
     Args:
         kind: number in the file.
     """
-    return GdsiiRecord(kind).name if kind in DATA else f"record 0x{kind:02x}"
+    return NAMES.get(kind, f"record 0x{kind:02x}")
 
 
 TIMES = (
