@@ -108,3 +108,15 @@ def test_random_bytes_are_refused(tmp_path):
             )
             with pytest.raises(MaskFileError, match="byte"):
                 READ[suffix](path)
+
+
+def test_a_block_that_claims_more_than_is_unpacked_is_refused(tmp_path):
+    from layout.formats import oasis_records as oasis
+
+    sizes = oasis.unsigned_integer(2**45) + oasis.unsigned_integer(3)
+    block = bytes([oasis.OasisRecord.CBLOCK, 0]) + sizes + b"abc"
+    (tmp_path / "z.oas").write_bytes(
+        oasis.start_record(1.0) + block + oasis.end_record((0,) * 6, 0)
+    )
+    with pytest.raises(MaskFileError, match="compressed block of 35,184,372,088,832"):
+        layout.read_oasis(tmp_path / "z.oas")
