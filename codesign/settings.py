@@ -72,7 +72,9 @@ class ExperimentConfig:
     judged.
     people: who calibrated before; their readings give the
     prior of every subject.
-    hidden: neurons of the regressor, of networks that predict no axis.
+    calibrator: of gaze: "mixed-model", learned on these people, or "sphere", the
+    spherical-eye solver with a residual regressor, which also serves networks that
+    predict no axis. The table holds both. hidden: neurons of the regressor.
     fixation_deg: standard deviation of where a subject really looks.
     image: "true", what the device shows, whatever the run was trained on; "trained",
     the image that the run knows.
@@ -90,6 +92,7 @@ class ExperimentConfig:
     lateral_mm: tuple[float, ...] = (-2.5, -5.0)
     share: float = 0.2
     people: int = 32
+    calibrator: Literal["mixed-model", "sphere"] = "mixed-model"
     hidden: int = 10
     fixation_deg: float = 0.3
     pupil_sd: float = 0.05

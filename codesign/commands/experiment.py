@@ -251,6 +251,8 @@ COLUMNS = {
     "finer_gaze_axial_deg": "finer image / deg",
     "finer_ratio": "ratio",
     "gaze_lateral_deg": "gaze, lateral slip / deg",
+    "sphere_gaze_axial_deg": "by sphere, axial / deg",
+    "sphere_gaze_lateral_deg": "by sphere, lateral / deg",
     "slip_mm": "slip / mm",
     "finer_slip_mm": "finer image / mm",
     "slip_axial_mm": "axial slip / mm",
@@ -272,11 +274,16 @@ def _method_text(config: ExperimentConfig) -> str:
         "pixel of the first run behind a lens that images all light; exposure and "
         "background are the same for every run"
     )
+    how = (
+        "Pupil and slippage become gaze by the spherical-eye solver."
+        if config.calibrator == "sphere"
+        else "Axis, pupil and slippage become gaze by a linear mixed model learned from "
+        f"{config.people} other people (of a network that predicts no axis, by sphere)."
+    )
     return (
         f"{config.subjects} subjects whom training never saw, {config.frames} frames. Each is calibrated on "
-        f"{config.share:.0%} of the stimuli, drawn at random, and judged on the rest: what is read (axis, "
-        f"pupil, slippage) becomes gaze by a linear mixed model learned from {config.people} other people, or, of a "
-        "network that predicts no axis, by a sphere and a regressor of one hidden layer. Subjects "
+        f"{config.share:.0%} of the stimuli, drawn at random, and judged on the rest. {how} The columns by sphere "
+        "have the spherical-eye solver with a regressor of one hidden layer. Subjects "
         f"fixate with {config.fixation_deg} degrees of scatter, which counts as error. Intervals are over subjects. "
         f"Frames are the {config.image} image {light}. The finer image is formed at a "
         "quarter of the run's tolerance; a ratio near 1 says that results do not "

@@ -78,6 +78,7 @@ class RunResult:
     slip_mm: (n, 3) slippage read by the network.
     centre: (n, 2) pupil read, fraction of the image. iou: (n,) overlap of the mask.
     gaze_deg: (n,) error of the calibrated gaze, nan for calibration frames.
+    sphere_gaze_deg: the same by the spherical-eye solver with a residual regressor.
     how: calibrator of the subjects.
     above: why the error of the images exceeds the run's tolerance; empty otherwise.
     finer: result on images formed at a quarter of the tolerance, with a calibration of
@@ -91,6 +92,7 @@ class RunResult:
     centre: Array
     iou: Array
     gaze_deg: Array
+    sphere_gaze_deg: Array
     how: PersonCalibrator | None = None
     above: str = ""
     finer: "RunResult | None" = None
@@ -107,12 +109,13 @@ class RunResult:
     def subject_errors(self) -> dict[str, Array]:
         """(subjects,) mean of every error by name, gaze in deg and slippage in mm."""
         slip = np.abs(self.slip_mm - self.trial.slip_mm)
+        axial, lateral = self.trial.group(AXIAL), self.trial.group(LATERAL)
         errors = {
-            "gaze_axial_deg": np.where(
-                self.trial.group(AXIAL), self.gaze_deg, math.nan
-            ),
-            "gaze_lateral_deg": np.where(
-                self.trial.group(LATERAL), self.gaze_deg, math.nan
+            "gaze_axial_deg": np.where(axial, self.gaze_deg, math.nan),
+            "gaze_lateral_deg": np.where(lateral, self.gaze_deg, math.nan),
+            "sphere_gaze_axial_deg": np.where(axial, self.sphere_gaze_deg, math.nan),
+            "sphere_gaze_lateral_deg": np.where(
+                lateral, self.sphere_gaze_deg, math.nan
             ),
             "slip_mm": slip.mean(1),
             "slip_axial_mm": slip[:, 2],
@@ -468,10 +471,10 @@ def _imager_of(source: FinishedRun, settings: OpticsConfig) -> Imager:
 def run_calibrator(
     source: FinishedRun, imager: Imager, config: ExperimentConfig, sensor: Sensor
 ) -> PersonCalibrator:
-    """Calibrator of gaze for a run: a mixed-effects model where the network reads the
-    optic axis, else sphere and regressor.
+    """Calibrator of gaze for a run: the configured one, or sphere and regressor where
+    the network predicts no optic axis.
 
-    The model is learned from ``config.people`` further subjects at the same stimuli,
+    The mixed-effects model is learned from ``config.people`` further subjects at the same stimuli,
     with slippage drawn uniformly between the ends of the experiment's. ``EACH`` random
     frames of each pass the run's lens, light and noise.
 
@@ -482,6 +485,9 @@ def run_calibrator(
         sensor: the run's sensor at the exposure of the experiment.
     """
     scenes = source.run.scenes(EXPERIMENT)
+    sphere = SphereCalibrator(scenes.rig, config.hidden, config.seed)
+    if config.calibrator == "sphere":
+        return sphere
     predictions = []
     stimuli_deg = []
     for person in range(config.people):
@@ -504,7 +510,7 @@ def run_calibrator(
         )
         stimuli_deg.append(trial.stimulus_deg[rows])
         if predictions[0].axis is None:
-            return SphereCalibrator(scenes.rig, config.hidden, config.seed)
+            return sphere
     person_of_frame = np.repeat(np.arange(config.people), list(map(len, stimuli_deg)))
     return shared.learn_population(
         collect_readings(predictions, source),
@@ -550,8 +556,13 @@ def _result(
     Gaze errors are nan for calibration frames.
     """
     readings = collect_readings(predictions, source)
-    predicted, judged = calibrated_gaze(readings, trial, config, calibrator)
-    error = np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
+    rig = source.run.scenes(EXPERIMENT).rig
+    sphere = SphereCalibrator(rig, config.hidden, config.seed)
+
+    def gaze_error_deg(how: PersonCalibrator) -> Array:
+        predicted, judged = calibrated_gaze(readings, trial, config, how)
+        return np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
+
     return RunResult(
         name,
         float(source.row["mmacs"]),
@@ -559,7 +570,8 @@ def _result(
         readings.slip_mm,
         _joined(predictions, "centre"),
         _joined(predictions, "iou"),
-        error,
+        gaze_error_deg(calibrator),
+        gaze_error_deg(sphere),
         calibrator,
     )
 

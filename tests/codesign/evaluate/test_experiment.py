@@ -169,6 +169,11 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     }
     one, two = (shared.load_people(out / f"people_{n}.h5") for n in (1, 2))
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
+    sphere = [*words[:3], "-o", f"{folder}/sphere", *words[6:]]
+    assert call(*sphere, "--calibrator", "sphere", "--json") == 0
+    (by_sphere,) = json.loads(capsys.readouterr().out)["runs"]
+    assert by_sphere["gaze_axial_deg"] == told["runs"][0]["sphere_gaze_axial_deg"]
+    assert by_sphere["gaze_axial_deg"] != told["runs"][0]["gaze_axial_deg"]
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
     assert call(*words[:4], f"-o {folder}/twins --names a a") == 2
