@@ -53,6 +53,7 @@ class ReaderConfig:
     pixel of 9 um.
     fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs
     cover.
+    angle_deg: field angle, towards +x, of the middle of the frame.
     tolerance: of the true image.
     """
 
