@@ -13,7 +13,7 @@ from benchmarks import Row, fastest
 from metalens import library, rcwa
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
-from metalens.core import executor
+from metalens.core import threads
 from metalens.library import curve as reduced
 from metalens.library import fit as proxy_fit
 from metalens.library.proxy import Proxy
@@ -84,7 +84,7 @@ def _sweep(case: str, sweep: Sweep) -> tuple[Row, PillarLibrary]:
         seconds,
         float(made.t_error.max()),
         against,
-        threads=executor.usable_cores(),
+        threads=threads.usable_cores(),
     ), made
 
 
@@ -165,7 +165,7 @@ def _evaluations(proxy: Proxy) -> list[Row]:
                     seconds,
                     off,
                     against,
-                    executor.usable_cores(),
+                    threads.usable_cores(),
                     goal=told,
                 )
             )

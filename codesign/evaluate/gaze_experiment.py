@@ -556,13 +556,16 @@ def _result(
     Gaze errors are nan for calibration frames.
     """
     readings = collect_readings(predictions, source)
-    rig = source.run.scenes(EXPERIMENT).rig
-    sphere = SphereCalibrator(rig, config.hidden, config.seed)
 
     def gaze_error_deg(how: PersonCalibrator) -> Array:
         predicted, judged = calibrated_gaze(readings, trial, config, how)
         return np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
 
+    error_deg = sphere_error_deg = gaze_error_deg(calibrator)
+    if not isinstance(calibrator, SphereCalibrator):
+        rig = source.run.scenes(EXPERIMENT).rig
+        sphere = SphereCalibrator(rig, config.hidden, config.seed)
+        sphere_error_deg = gaze_error_deg(sphere)
     return RunResult(
         name,
         float(source.row["mmacs"]),
@@ -570,8 +573,8 @@ def _result(
         readings.slip_mm,
         _joined(predictions, "centre"),
         _joined(predictions, "iou"),
-        gaze_error_deg(calibrator),
-        gaze_error_deg(sphere),
+        error_deg,
+        sphere_error_deg,
         calibrator,
     )
 

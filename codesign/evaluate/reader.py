@@ -120,10 +120,6 @@ class TrainedReader:
     trainer: Trainer
     stack: PixelPsfStack
 
-    def scenes(self, stream: int) -> EyeScenes:
-        """Frames of one stream of the random generator."""
-        return _scenes_of(self.lens, self.config, stream)
-
     def frames(self, stream: int, tolerance: float) -> assess.SensorFrames:
         """Test frames of a stream, on images of a tolerance.
 
@@ -132,9 +128,10 @@ class TrainedReader:
             tolerance: relative L2 error of the image of a texture.
         """
         optics = replace(self.trainer.optics, image_tolerance=tolerance)
+        scenes = _scenes_of(self.lens, self.config, stream)
         count = self.config.test // BATCH
         return assess.sensor_frames(
-            self.trainer, self.scenes(stream), count, stack=self.stack, optics=optics
+            self.trainer, scenes, count, stack=self.stack, optics=optics
         )
 
 

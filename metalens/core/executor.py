@@ -28,11 +28,6 @@ _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
 _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"
 
 
-def usable_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 @contextlib.contextmanager
 def run_on(processes: int | None = None) -> Iterator[None]:
     """Context whose tasks run in a given number of processes of this machine.
@@ -75,7 +70,7 @@ def run_parallel(
     if pool is not None:
         yield from _run_in_pool(pool, work, tasks)
         return
-    with _worker_pool(min(usable_cores(), len(tasks))) as pool:
+    with _worker_pool(min(threads.usable_cores(), len(tasks))) as pool:
         yield from _run_in_pool(pool, work, tasks)
 
 

@@ -104,6 +104,13 @@ def _run_parts(count: int, parts: int, work: Callable[[int, int], object]) -> No
         job.result()
 
 
+def usable_cores() -> int:
+    """Number of cores that this process may use; macOS and Windows state all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def thread_count() -> int:
     """Threads for parallel loops: torch's where it is loaded, else OMP_NUM_THREADS,
     else the cores of this process; one within :func:`run_each`.
@@ -114,7 +121,7 @@ def thread_count() -> int:
     if torch is not None:
         return int(torch.get_num_threads())
     stated = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, int(stated)) if stated.isdigit() else len(os.sched_getaffinity(0))
+    return int(stated) or 1 if stated.isdigit() else usable_cores()
 
 
 @functools.lru_cache(maxsize=2)

@@ -305,7 +305,7 @@ def _put(scratch: Path, finished: Path, target: Path) -> None:
 
 def _exchange_names(one: Path, other: Path) -> bool:
     """Exchange two names in one step (Linux renameat2); False where that fails."""
-    renameat2 = getattr(ctypes.CDLL(None), "renameat2", None)
+    renameat2 = getattr(ctypes.pythonapi, "renameat2", None)
     current_folder, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
     first = os.fsencode(one.absolute())
     second = os.fsencode(other.absolute())
